@@ -12,12 +12,10 @@ from typing import Annotated, Any, cast
 import typer
 from typer.core import TyperGroup
 
-import brushloop.calibrate.cli
-import brushloop.calibrate.validate.cli
 import brushloop.collect.cli
 import brushloop.sessions.cli
-import brushloop.twin
-from brushloop.calibrate.cli import PathOrCommand
+from brushloop.calibrate import commands
+from brushloop.calibrate.commands import PathOrCommand, command
 from brushloop.sessions.terminal import plain, say
 
 EXIT_CODES = {
@@ -100,33 +98,46 @@ def options(
 app.add_typer(brushloop.collect.cli.app, name="collect")
 app.command("doctor")(brushloop.collect.cli.doctor)
 app.add_typer(brushloop.collect.cli.rig_app, name="rig")
-app.command("calibrate")(brushloop.calibrate.cli.calibrate)
-app.add_typer(brushloop.calibrate.cli.camera, name="camera")
-app.add_typer(brushloop.calibrate.validate.cli.app, name="validate", cls=PathOrCommand)
-app.command("fit")(brushloop.calibrate.cli.fit)
-app.command("twin")(brushloop.twin.twin)
-app.command("invert")(brushloop.calibrate.cli.invert)
+app.command("calibrate")(command(commands.CalibrateRequest, "calibrate.calibrated:calibrate_session"))
+camera = typer.Typer(help="Print a board, and calibrate the lens by photographs of it.", no_args_is_help=True)
+camera.command("board")(command(commands.PrintRequest, "calibrate.board.spec:print_board"))
+camera.command("intrinsics")(command(commands.LensRequest, "calibrate.calibrated:calibrate_lens"))
+app.add_typer(camera, name="camera")
+validate = typer.Typer(
+    cls=PathOrCommand,
+    help="Compare every stroke model with every captured stroke (`brushloop validate SESSION...`).",
+)
+validate.command("sessions")(command(commands.ValidateRequest, "calibrate.validate.command:validate"))
+validate.command("diff")(command(commands.DiffRequest, "calibrate.validate.diff:compare"))
+validate.command("captures")(command(commands.CapturesRequest, "calibrate.validate.tuning:captures"))
+app.add_typer(validate, name="validate")
+app.command("fit")(command(commands.FitRequest, "calibrate.fit.fit:fit"))
+app.command("twin")(command(commands.TwinRequest, "twin.run:twin"))
+app.command("invert")(command(commands.RecoverRequest, "calibrate.invert:recover"))
 loop = typer.Typer(
     cls=PathOrCommand,
     help="Recover the presses of a SESSION, press them again and compare (`brushloop loop SESSION`), or only compare.",
 )
 loop.command("session")(brushloop.collect.cli.loop)
-loop.command("compare")(brushloop.calibrate.cli.compare_loop)
+loop.command("compare")(command(commands.CompareLoopRequest, "calibrate.loop:compare"))
 app.add_typer(loop, name="loop")
-brushloop.sessions.cli.app.command("export")(brushloop.calibrate.cli.export)
+brushloop.sessions.cli.app.command("export")(command(commands.ExportRequest, "calibrate.export:export"))
 app.add_typer(brushloop.sessions.cli.app, name="sessions")
 write = typer.Typer(
     cls=PathOrCommand,
     help="Write characters on the rig and compare them (`brushloop write 字 --config ...`), or only plan or compare.",
 )
 write.command("characters")(brushloop.collect.cli.write)
-write.command("plan")(brushloop.calibrate.cli.write_plan)
-write.command("compare")(brushloop.calibrate.cli.write_compare)
-write.command("learn")(brushloop.calibrate.cli.write_learn)
-write.command("practice")(brushloop.calibrate.cli.write_practice)
-write.command("fit")(brushloop.calibrate.cli.write_fit)
+write.command("plan")(command(commands.PlanRequest, "calibrate.writing.plan:plan"))
+write.command("compare")(command(commands.CompareWrittenRequest, "calibrate.writing.compare:compare"))
+write.command("learn")(command(commands.LearnRequest, "calibrate.writing.learn:learn"))
+write.command("practice")(command(commands.PracticeRequest, "calibrate.writing.learn:practice"))
+write.command("fit")(command(commands.FitFootprintRequest, "calibrate.writing.learn:fit"))
 app.add_typer(write, name="write")
-app.add_typer(brushloop.calibrate.cli.train, name="train")
+train = typer.Typer(cls=PathOrCommand, help="Train the neural stroke generator, or tune it on captures.")
+train.command("generator")(command(commands.TrainRequest, "calibrate.training:train"))
+train.command("tune")(command(commands.TuneRequest, "calibrate.training:tune"))
+app.add_typer(train, name="train")
 
 
 @app.command()

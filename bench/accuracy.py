@@ -34,7 +34,7 @@ from bench.brushes import (
 )
 from bench.harness import BenchError, Result, at_most, brushloop, machine, rounds_of
 from bench.prior import BRISTLE
-from brushloop.calibrate.compare.place import TABLE_2, Field
+from brushloop.calibrate.compare import TABLE_2, Field
 from brushloop.calibrate.fit.captures import Captures, by_cell, read_presses
 from brushloop.calibrate.fit.descent import Prior, fit_presses, learned
 from brushloop.calibrate.fit.heldout import BEZIER, FITTED, Refit, held_out_scores, image_of, leave_cell_out, refit
@@ -289,7 +289,7 @@ def _drag_session(out: Path, photos: Path, rows: Iterable[int] | None = None) ->
 
 
 def _drag_fit(session: Path, *words: str | Path) -> Path:
-    brushloop("fit", session, "--drags", *words)
+    brushloop("fit", session, *words)
     return max((session / "dragfit").glob("*.json"), key=lambda path: path.stat().st_mtime_ns)
 
 

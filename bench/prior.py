@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.brushes import BRISTLE_SETS, CELLS, bristle_session
-from brushloop.calibrate.compare.place import Field
+from brushloop.calibrate.compare import Field
 from brushloop.calibrate.fit.captures import Grid, Pressed, read_presses
 from brushloop.calibrate.fit.descent import FILE, KnownBrush, about, fit_presses
 from brushloop.model.fitted import chance_within, published

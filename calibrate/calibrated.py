@@ -1,4 +1,4 @@
-"""`brushloop calibrate SESSION` as a function: the calibration of a session, and its page.
+"""`brushloop calibrate SESSION` as a function: the calibration of a session, and its page; and that of a lens.
 
 The page shows the corners over the photograph with residual arrows, and the scale across the photograph.
 """
@@ -18,10 +18,12 @@ import numpy as np
 
 from brushloop.calibrate.artefact import made_by, put_to_use
 from brushloop.calibrate.board.detect import find_board
-from brushloop.calibrate.board.lens import FITTED, RMS_LIMIT_PX, Floats, Gray, read_lens, rms
+from brushloop.calibrate.board.lens import FITTED, RMS_LIMIT_PX, Floats, Gray, fit_lens, read_lens, rms
 from brushloop.calibrate.board.pix2len import local_scale, paper_mm, see_board_and_lens
-from brushloop.calibrate.board.spec import BoardView, describe
+from brushloop.calibrate.board.spec import BoardView, describe, named_board
+from brushloop.calibrate.commands import CalibrateRequest, LensRequest
 from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import Written, read_gray
 from brushloop.calibrate.report import (
     BLUE,
     Point,
@@ -35,6 +37,7 @@ from brushloop.calibrate.report import (
 )
 from brushloop.calibrate.session import Calibration, board_of, rig_of
 from brushloop.calibrate.stroke import Params
+from brushloop.sessions.disk import file_sha256
 from brushloop.sessions.messages import decode_gray
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.terminal import Progress, counted, unseen
@@ -49,15 +52,6 @@ ARROW_SHARE = 0.4
 """Length of a typical arrow, as a share of the distance between corners."""
 SIDE_POINTS = 9
 SCALE_GRID = (17, 13)
-
-
-@dataclass(frozen=True, slots=True)
-class CalibrateRequest:
-    """What is calibrated."""
-
-    session: Path
-    lens: Path | None = None
-    """Lens file; None is the session's own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +113,22 @@ def calibrate_session(request: CalibrateRequest, progress: Progress = unseen) ->
     moved = tuple(filter(None, compared))
     path = put_to_use(calibration, recording.path.parent)
     return Calibrated(calibration, path, _write_page(recording, calibration, path, image, view, moved), moved)
+
+
+def calibrate_lens(request: LensRequest, progress: Progress = unseen) -> Written:
+    """Fit a lens to photographs of one board, and write its file. Raises `CalibrationError`."""
+    board, paths = named_board(request), request.photographs
+    seen, unusable, digests = list[BoardView](), dict[str, str](), dict[str, str]()
+    for path in counted(paths, "photographs searched for the board", len(paths), progress):
+        image = read_gray(path)
+        digests[str(path)] = file_sha256(path)
+        try:
+            seen.append(find_board(image, board, str(path)))
+        except CalibrationError as error:
+            unusable[str(path)] = error.what
+    lens = fit_lens(seen, describe(board), digests, unusable)
+    path = lens.save(request.out)
+    return Written(path, (*lens.lines(), str(path)))
 
 
 def _moved(calibration: Calibration, still: bytes, minutes: float, where: str) -> str:

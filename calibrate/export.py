@@ -10,9 +10,12 @@ from __future__ import annotations
 
 import importlib
 import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+from brushloop.calibrate.commands import ExportRequest
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.notebook import SAMPLE_COLUMNS, RecordedPress, Session
 from brushloop.calibrate.presses import Refused
@@ -29,17 +32,42 @@ PATCH_COLUMNS = ("cell_x_mm", "cell_y_mm", "cell_width_mm", "cell_height_mm")
 Row = dict[str, Any]
 
 
-def export(source: Path, out: Path, kind: str, progress: Progress = unseen, *, crops: bool = False) -> list[Refused]:
-    """Export a session into the new or empty folder `out`, with tables as `csv` or `parquet`.
+class StrokesLeftOut(Exception):
+    """Strokes could not be cropped; everything else is exported."""
 
-    With `crops`, every photograph is replaced by a crop and its mask, by the calibration in use; returns the
-    strokes that could not be cropped. Raises `InputError` for an unknown format, a folder that is not empty, or a
-    session of which no stroke can be cropped, `CalibrationError` for crops of a session that was not calibrated, and
-    `SessionDamaged` for a recording that cannot be read; nothing is left behind then.
+    exit_code: ClassVar[int] = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Exported:
+    """The folder of an export, and the strokes that could not be cropped."""
+
+    out: Path
+    left_out: Sequence[Refused]
+
+    def lines(self) -> Iterator[str]:
+        """What the command prints."""
+        yield f"Exported into {self.out}"
+        yield from (f"left out: {stroke_id}: {reason}" for stroke_id, reason in self.left_out)
+
+    def check(self) -> None:
+        """Raises `StrokesLeftOut` if any stroke is."""
+        if self.left_out:
+            raise StrokesLeftOut(f"{len(self.left_out)} strokes could not be cropped and are left out")
+
+
+def export(request: ExportRequest, progress: Progress = unseen) -> Exported:
+    """Export a session into a new or empty folder, with tables as `csv` or `parquet`.
+
+    With `crops`, every photograph is replaced by a crop and its mask, by the calibration in use. Raises `InputError`
+    for an unknown format, a folder that is not empty, or a session of which no stroke can be cropped,
+    `CalibrationError` for crops of a session that was not calibrated, and `SessionDamaged` for a recording that cannot
+    be read; nothing is left behind then.
     """
+    out, kind, crops = request.out, request.kind, request.crops
     if kind not in FORMATS:
         raise InputError("--format", f"{kind!r}, allowed: {', '.join(FORMATS)}")
-    session = Session(source)
+    session = Session(request.session)
     recording = session.recording
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(out, "exists and is not an empty folder; nothing is ever overwritten")
@@ -68,7 +96,7 @@ def export(source: Path, out: Path, kind: str, progress: Progress = unseen, *, c
             (stage / "header.json").write_text(json.dumps(header, indent=2, ensure_ascii=False) + "\n", "utf-8")
     except OSError as error:
         raise disk_error(out, "cannot write", error) from error
-    return left_out
+    return Exported(out, left_out)
 
 
 def _write_pictures(

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,6 +21,18 @@ if TYPE_CHECKING:
 MAX_BYTES = 1024 * 1024
 """Largest file that people or this software write: a table, an artefact."""
 MAX_PHOTOGRAPH_BYTES = 256 * 1024 * 1024
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """The file that a command has written, and what the command prints."""
+
+    path: Path
+    said: Sequence[object]
+
+    def lines(self) -> Sequence[object]:
+        """What the command prints: lines and tables."""
+        return self.said
 
 
 def check_target(path: Path, ending: str, *inputs: Path | None) -> None:

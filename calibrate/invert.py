@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.compare.place import Field
+from brushloop.calibrate.commands import RecoverRequest
+from brushloop.calibrate.compare import Field
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import check_target, write_whole
 from brushloop.calibrate.fit.fit import BrushFit
@@ -49,25 +50,6 @@ LEAST_CONDITIONS = 3
 """With fewer other conditions, the model error is unknown."""
 NORMAL_95 = 1.96
 ROUNDS = 100
-
-
-@dataclass(frozen=True, slots=True)
-class RecoverRequest:
-    """Whose presses are recovered, and how."""
-
-    session: Path
-    out: Path
-    """CSV to write; the protocol goes beside it."""
-    fit: Path | None = None
-    """A brush fitted to captures, instead of CCD-BSM as published."""
-    depth_range_mm: tuple[float, float] = (2.0, 30.0)
-    tilt_range_deg: tuple[float, float] = (0.0, 30.0)
-    presses: int | None = None
-    """Only this many, spread evenly over the session."""
-    repeats: int = 1
-    """How often the protocol presses each stroke."""
-    seed: int = 1
-    """Seed of the order in which it does."""
 
 
 @dataclass(frozen=True, slots=True)

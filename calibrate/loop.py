@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from brushloop.calibrate.artefact import made_by
-from brushloop.calibrate.compare import MM_PER_PX
-from brushloop.calibrate.compare.place import (
+from brushloop.calibrate.commands import CompareLoopRequest
+from brushloop.calibrate.compare import (
     KEYS,
     ROBOT_WRITING,
     TABLE_1,
@@ -29,12 +29,12 @@ from brushloop.calibrate.compare.place import (
     simulated,
 )
 from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import Written
 from brushloop.calibrate.fit.fit import BrushFit
 from brushloop.calibrate.presses import Press, Refused, read_presses, too_thin, uncommanded
 from brushloop.calibrate.report import (
     Point,
     Sealed,
-    Written,
     about,
     ink_uri,
     load_sealed,
@@ -65,21 +65,6 @@ GOAL_POINTS = 1.0
 """Points by which re-pressed strokes may score below the originals' own repeatability."""
 NOT_AGAIN = "was not pressed again"
 HEADLINE = (Alignment.MM, Tone.BINARY)
-
-
-@dataclass(frozen=True, slots=True)
-class CompareRequest:
-    """Which sessions are compared, and where the report goes."""
-
-    original: Path
-    again: Path
-    """The session of the replay protocol."""
-    out: Path
-    command: str
-    """Named by the report as what made it."""
-    fit: Path | None = None
-    """Brush fit that recovered depth and tilt; None is CCD-BSM as published."""
-    mm_per_px: float = MM_PER_PX
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +160,7 @@ def read_loop(folder: Path) -> LoopRecord:
     return load_sealed(folder / FILE, LoopRecord, MAX_BYTES)
 
 
-def compare(request: CompareRequest, progress: Progress = unseen) -> Written:
+def compare(request: CompareLoopRequest, progress: Progress = unseen) -> Written:
     """Compare presses with those that repeat them, pair by pair, and write the report.
 
     Raises `CalibrationError` where the two sessions do not belong together, and OSError.

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from brushloop.calibrate.artefact import current, load_artefact
-from brushloop.calibrate.compare.place import GRAY_MM, Field, brush_of, simulated
+from brushloop.calibrate.commands import CalibrateRequest, FitRequest, RecoverRequest, ValidateRequest
+from brushloop.calibrate.compare import GRAY_MM, Field, brush_of, simulated
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.presses import Refused, crop, read_presses
 from brushloop.calibrate.remote import local_path
@@ -313,12 +314,12 @@ def calibrate_session(session: Place, *, lens: Path | None = None) -> Calibrated
     """Fit scale and paper plane of a session from the board in view, as `brushloop calibrate` does."""
     from brushloop.calibrate import calibrated
 
-    return calibrated.calibrate_session(calibrated.CalibrateRequest(_path(session), lens))
+    return calibrated.calibrate_session(CalibrateRequest(_path(session), lens))
 
 
 def fit(session: Place, **options: Any) -> FitResult:
     """Fit the brush to the presses of a session, as `brushloop fit` does; `options` are fields of `FitRequest`."""
-    from brushloop.calibrate.fit.fit import FitRequest, fit_presses
+    from brushloop.calibrate.fit.fit import fit_presses
 
     return fit_presses(FitRequest(_path(session), **options))
 
@@ -332,20 +333,19 @@ def recover(session: Place, out: Path | None = None, **options: Any) -> Recovere
     from brushloop.calibrate import invert
 
     path = _path(session)
-    return invert.recover(invert.RecoverRequest(session=path, out=out or path.parent / "recovered.csv", **options))
+    return invert.recover(RecoverRequest(path, out or path.parent / "recovered.csv", **options))
 
 
 def validate(*sessions: Place, **options: Any) -> ValidationOutput:
-    """Compare every model with every press, as `brushloop validate` does; `options` are fields of its `Request`.
+    """Compare every model with every press, as `brushloop validate` does; `options` are fields of `ValidateRequest`.
 
     Raises `GateMissed` if a gate is missed, once the report is written.
     """
     from brushloop.calibrate.validate import command
 
     places = tuple(str(place.recording.path) if isinstance(place, Session) else str(place) for place in sessions)
-    request = command.Request(places=places, command=f"brushloop.validate{places}", **options)
-    output = command.validate(request)
-    command.check(output, request)
+    output = command.validate(ValidateRequest(places, command=f"brushloop.validate{places}", **options))
+    output.check()
     return output
 
 

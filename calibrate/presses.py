@@ -13,7 +13,7 @@ from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
-from brushloop.calibrate.compare.place import (
+from brushloop.calibrate.compare import (
     KEYS,
     Field,
     Image,

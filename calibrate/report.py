@@ -46,18 +46,6 @@ REMARK = re.compile(r"\(([^()]+)\)(?:, R = [^()]*)?$")
 """Finds the remark in brackets that ends the name of a described brush; the brush's size may follow it."""
 
 
-@dataclass(frozen=True, slots=True)
-class Written:
-    """The file that a command has written, and what the command prints."""
-
-    path: Path
-    said: tuple[str, ...]
-
-    def lines(self) -> tuple[str, ...]:
-        """What the command prints."""
-        return self.said
-
-
 def render(template: str, **values: Any) -> str:
     """Render `calibrate/templates/<template>`; an undefined name is an error.
 

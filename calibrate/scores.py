@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from brushloop.calibrate.artefact import Frozen
-from brushloop.calibrate.compare.place import KEYS, Alignment, Key, Pixels, Tone, similarity
+from brushloop.calibrate.compare import KEYS, Alignment, Key, Pixels, Tone, similarity
 from brushloop.calibrate.files import replacing
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.stats import CEILING, Cell, Floats, Integers, Summary, average, summarise

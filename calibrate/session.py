@@ -25,8 +25,8 @@ Kind = Literal["press", "drag"]
 EFFECTIVE = "rig.effective.json"
 """The configuration in effect: rig.toml, with the changes that the environment made."""
 OTHER_KIND = {
-    "press": "holds drags, which `fit --drags` and `validate` take: this needs presses",
-    "drag": "holds presses, which `fit` takes without --drags: this needs drags",
+    "press": "holds drags, which `fit` and `validate` take: this needs presses",
+    "drag": "holds presses: this needs drags",
 }
 
 

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.files import write_whole
+from brushloop.calibrate.commands import TrainRequest, TuneRequest
+from brushloop.calibrate.files import Written, write_whole
 from brushloop.calibrate.report import (
     BLUE,
     ORANGE,
@@ -25,10 +26,11 @@ from brushloop.calibrate.report import (
     overlay_uri,
     write_page,
 )
-from brushloop.model.generator.config import INPUTS
+from brushloop.model.generator.config import INPUTS, TrainConfig, load_config, preset
 from brushloop.model.generator.data import TuningFiles, sets, sha256
 from brushloop.model.generator.stroke import GeneratorFile, read_generator
 from brushloop.model.similarity import csim
+from brushloop.sessions.terminal import Progress, unseen
 
 PAGE = "training.html"
 SAMPLES = 12
@@ -40,6 +42,30 @@ MUCH_ABOVE = 1.5
 NUMBERS = (("MSE", "mse", ".3g"), ("PSNR, dB", "psnr_db", ".2f"), ("IoU", "iou", ".5f"), ("CSIM", "csim", ".5f"),
            ("SSIM, mean", "ssim", ".5f"), ("SSIM, least", "ssim_min", ".5f"))  # fmt: skip
 """Label, name and format of the numbers of a report."""
+
+
+def train(request: TrainRequest, progress: Progress = unseen) -> Written:
+    """Train a generator in a folder. Raises `TrainError`."""
+    config = preset(request.target) if request.config is None else load_config(request.config)
+    return _trained(config, request.out, progress)
+
+
+def tune(request: TuneRequest, progress: Progress = unseen) -> Written:
+    """Fine-tune a generator on captured strokes. Raises `TrainError`."""
+    files, steps = TuningFiles(request.generator, request.captures), request.steps
+    every = max(1, steps // 20)
+    config = files.config(request.held_out, steps=steps, learning_rate=request.learning_rate, validate_every=every)
+    return _trained(config, request.out, progress, files)
+
+
+def _trained(config: TrainConfig, folder: Path, progress: Progress, tuning: TuningFiles | None = None) -> Written:
+    """Train in the folder, and write the generator's card and the page."""
+    from brushloop.model.generator.train import run_training  # loads torch
+
+    progress("training", 0, config.steps)
+    path = run_training(config, folder, lambda step: progress("training", step, config.steps), tuning)
+    page = write_training(path, tuning)
+    return Written(path, (f"Generator: {path}, its card: {path.with_suffix('.md')}", f"Page: {page}"))
 
 
 def write_training(path: Path, tuning: TuningFiles | None = None) -> Path:

@@ -1,6 +1,6 @@
 """`brushloop sessions ...`: inspect, check, repair, import and merge recordings.
 
-`export` needs calibrations for its crops: the front door adds it from `calibrate/cli.py`.
+`export` needs calibrations for its crops: the front door adds it from `calibrate/commands.py`.
 
 Heavy imports wait until a command runs. Additional exit codes: 3 repaired, but something is lost; 6 damaged.
 """

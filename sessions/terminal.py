@@ -9,7 +9,7 @@ import re
 import sys
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import typer
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 Progress = Callable[[str, int, int], None]
 """Called with a description of the work, the number done and the total."""
 T = TypeVar("T")
-Request = TypeVar("Request")
 _ACTED_ON = re.compile(
     # Control characters of ASCII and Latin-1 (an escape sequence begins with one), except the tab.
     "[\x00-\x08\x0a-\x1f\x7f-\x9f"
@@ -117,22 +116,3 @@ def shown() -> Generator[Progress]:
             bar.update(tasks[what], completed=done)
 
         yield update
-
-
-class Printable(Protocol):
-    """The result of a command."""
-
-    def lines(self) -> Iterable[object]:
-        """What the command prints: lines and tables."""
-        ...
-
-
-Result = TypeVar("Result", bound=Printable)
-
-
-def show_work(work: Callable[[Request, Progress], Result], request: Request) -> Result:
-    """Do the work of a command, show its progress, and print and return its result."""
-    with shown() as progress:
-        result = work(request, progress)
-    say(*result.lines())
-    return result

@@ -19,7 +19,7 @@ import typer
 
 import brushloop.__main__
 from bench import pictures
-from brushloop.calibrate.cli import PathOrCommand
+from brushloop.calibrate.commands import PathOrCommand
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.drivers.sim.brush.spec import load_brush
 from tests.blocks import DOCUMENTS, ROOT, Block, blocks_of
@@ -58,6 +58,8 @@ def test_commands_that_a_document_shows_exist_with_their_options(document: Path)
         while words:
             word = words.pop(0)
             further = getattr(command, "commands", {})
+            if isinstance(command, PathOrCommand) and word not in further:
+                command, further = next(iter(further.values())), {}
             if word.startswith("--"):
                 options = {name: option for option in command.params for name in (*option.opts, *option.secondary_opts)}
                 assert word in options or word == "--help", line
@@ -65,8 +67,6 @@ def test_commands_that_a_document_shows_exist_with_their_options(document: Path)
                     words = words[options[word].nargs :]
             elif set(word.split("|")) <= further.keys():
                 command = further[word.split("|")[0]]
-            elif isinstance(command, PathOrCommand):
-                command = next(iter(further.values()))
             else:
                 assert not further, line
 

@@ -90,7 +90,6 @@ COMMANDS = [
     "validate diff fit.json fit.json",
     "calibrate closed",
     "fit closed",
-    "fit closed --drags",
     "invert closed",
     "loop compare closed closed",
     "write compare closed --plan fit.json",

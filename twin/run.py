@@ -14,6 +14,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import count, pairwise
+from shlex import quote
 from typing import ClassVar
 
 import cv2
@@ -21,8 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.artefact import made_by
-from brushloop.calibrate.fit.captures import Cell, Grid, Pressed, by_cell
+from brushloop.calibrate.commands import TwinRequest
+from brushloop.calibrate.compare import Field
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import Written, check_target, write_whole
+from brushloop.calibrate.fit.captures import Cell, Grid, Pressed, by_cell, near_ink, read_presses
 from brushloop.calibrate.fit.heldout import BEZIER, HeldOut, Predicted, held_out_scores, image_of, refit_bezier
+from brushloop.calibrate.report import source_note
 from brushloop.calibrate.work import Store, key_of
 from brushloop.drivers.sim.brush.spec import BrushSpec, SoundHead
 from brushloop.sessions.errors import SessionDamaged
@@ -105,6 +111,29 @@ class Twin:
     """Empty where the cells cannot be divided."""
     head: SoundHead | None = None
     """Where its marks begin; None if it leaves no ink."""
+
+
+def twin(request: TwinRequest, progress: Progress = unseen) -> Written:
+    """Fit a twin to the presses of a session, and write its file. Raises `CalibrationError`."""
+    recording = Recording(request.session)
+    target = request.out or recording.path.parent / "twin.toml"
+    check_target(target, ".toml")
+    if target.exists() and not request.replace:
+        raise CalibrationError(str(target), "exists: give --out FILE or --replace")
+    captures = read_presses(request.session, Field(), progress)
+    header, store = captures.session.header, captures.session.store
+    strokes, grid = near_ink(captures.strokes, captures.grid)
+    with workers() as pool:
+        try:
+            fitted = fit_twin(strokes, grid, captures.radius_mm, captures.length_mm, pool, progress, store)
+        except ValueError as error:
+            raise CalibrationError(str(recording.path), str(error)) from None
+    text = twin_toml(fitted, header.session_id, noise_gray(recording))
+    write_whole(target, text)
+    said = [f"{source_note(header.source, header.brush)}; twin of {len(captures.strokes)} presses"]
+    said += (f"left out: {name}: {why}" for name, why in captures.refused)
+    said += (*text.splitlines(), f"Twin: {target}", f"next: brushloop sim --brush {quote(str(target))}")
+    return Written(target, said)
 
 
 class TwinStopped(Exception):

@@ -9,11 +9,13 @@ from typing import Annotated, Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from brushloop.calibrate.artefact import Frozen
-from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.files import check_target
+from brushloop.calibrate.commands import BoardOptions, PrintRequest
+from brushloop.calibrate.errors import CalibrationError, invalid
+from brushloop.calibrate.files import Written, check_target
+from brushloop.sessions.terminal import Progress, unseen
 
 Corners = Annotated[int, Field(ge=3, le=60)]
 Place = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
@@ -99,6 +101,30 @@ def charuco_board(spec: BoardSpec, where: str) -> cv2.aruco.CharucoBoard:
         return cv2.aruco.CharucoBoard(spec.squares, spec.square_mm, spec.marker_mm, dictionary)
     except cv2.error as error:
         raise CalibrationError(where, f"the board cannot be made: {error}") from None
+
+
+def named_board(options: BoardOptions) -> Board:
+    """The board that a command names. Raises `CalibrationError`."""
+    checkerboard, charuco = options.checkerboard, options.charuco
+    if bool(checkerboard) == bool(charuco):
+        what = "give one of --checkerboard (inner corners) and --charuco (squares), such as 9x6"
+        raise CalibrationError("board", what)
+    size, square_mm = (checkerboard or charuco).lower().split("x"), options.square_mm
+    try:
+        if checkerboard:
+            return Checkerboard.model_validate({"inner_corners": size, "square_mm": square_mm})
+        marker_mm = options.marker_mm or 0.75 * square_mm
+        markers = {"marker_mm": marker_mm, "dictionary": options.dictionary, "origin_mm": (0.0, 0.0)}
+        return BoardSpec.model_validate({"squares": size, "square_mm": square_mm} | markers)
+    except ValidationError as error:
+        raise invalid("board", error) from None
+
+
+def print_board(request: PrintRequest, _progress: Progress = unseen) -> Written:
+    """Write a board as a PDF. Raises as `write_pdf` does."""
+    board = named_board(request)
+    path = write_pdf(board, request.out, request.page)
+    return Written(path, (f"{path}: {describe(board)}",))
 
 
 def write_pdf(board: Board, path: Path, page: str = "a4") -> Path:

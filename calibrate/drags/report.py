@@ -17,9 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from brushloop.calibrate.artefact import load_artefact, made_by
-from brushloop.calibrate.drags import Drags, read_drags
-from brushloop.calibrate.drags.fit import PREDICTED, DragArtefact, predicted
+from brushloop.calibrate.artefact import load_artefact, made_by, put_to_use
+from brushloop.calibrate.commands import FitRequest
+from brushloop.calibrate.drags import MM_PER_PX, Drags, read_drags
+from brushloop.calibrate.drags.fit import FOLDER, PREDICTED, DragArtefact, adapt_drags, fit_drags, predicted
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import Written
 from brushloop.calibrate.report import (
     ORANGE,
     Axis,
@@ -278,6 +281,20 @@ def summary(validation: DragValidation) -> Iterator[Table | str]:
         yield table
     yield from (f"not fitted: {drag.stroke.stroke_id}: {'; '.join(drag.flags)}" for drag in drags.strokes if drag.flags)
     yield from (f"not used: {stroke_id}: {why}" for stroke_id, why in drags.refused)
+
+
+def fit_session(request: FitRequest, progress: Progress = unseen) -> Written:
+    """Fit the drags of a session, or adapt a known brush to them, and put the fit to use. Raises `CalibrationError`."""
+    if request.strokes is not None and request.prior is None:
+        raise CalibrationError("--strokes", "needs --prior, the fit that is adapted to so many strokes")
+    before = None if request.prior is None else load_artefact(request.prior, DragArtefact)
+    drags = read_drags(request.session, request.mm_per_px or (before.mm_per_px if before else MM_PER_PX), progress)
+    if before is None:
+        artefact = fit_drags(drags, progress)
+    else:
+        artefact = adapt_drags(drags, before, str(request.prior), request.strokes or len(drags.placed))
+    path = put_to_use(artefact, drags.session.recording.path.parent, FOLDER)
+    return Written(path, (*fit_lines(drags, artefact), f"Fit: {path}"))
 
 
 def fit_lines(drags: Drags, artefact: DragArtefact) -> Iterator[Any]:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate import presses
-from brushloop.calibrate.compare.place import SIZE_PX, Field, brush_of
+from brushloop.calibrate.compare import SIZE_PX, Field, brush_of
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.presses import Refused, cut, uncommanded
 from brushloop.calibrate.session import OpenSession, open_session

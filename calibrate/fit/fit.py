@@ -14,9 +14,12 @@ from typing import Any, Self
 import numpy as np
 from pydantic import model_validator
 
+from brushloop.calibrate import MM_PER_PX
 from brushloop.calibrate.artefact import SessionFit, load_artefact, made_by, put_to_use
-from brushloop.calibrate.compare import MM_PER_PX
-from brushloop.calibrate.compare.place import Field, brush_of
+from brushloop.calibrate.commands import FitRequest
+from brushloop.calibrate.compare import Field, brush_of
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import Written
 from brushloop.calibrate.fit.captures import (
     FEWEST_CELLS,
     SPREAD_MM,
@@ -56,6 +59,7 @@ from brushloop.model.fitted import MODES, NAMES, TERMS, FittedPress, fitted_mode
 from brushloop.model.outline import Outline
 from brushloop.model.similarity import csim
 from brushloop.model.strokes import StrokeModel, stroke_model
+from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Header
 from brushloop.sessions.terminal import Progress, unseen
 
@@ -107,15 +111,6 @@ class BrushFit(SessionFit):
 
 
 @dataclass(frozen=True, slots=True)
-class FitRequest:
-    """What is fitted, and how."""
-
-    session: Path
-    mm_per_px: float = MM_PER_PX
-    """Scale of the images."""
-
-
-@dataclass(frozen=True, slots=True)
 class FitResult:
     """The fitted brush that a session uses from now on, and what its captures say about it."""
 
@@ -161,12 +156,25 @@ class FitResult:
         return framed(self.page)
 
 
+def fit(request: FitRequest, progress: Progress = unseen) -> FitResult | Written:
+    """Fit what the session holds, presses or drags. Raises `CalibrationError`."""
+    from brushloop.calibrate.drags.report import fit_session
+
+    first = next(Recording(request.session).stroke_records(), None)
+    if first is not None and first.kind == "drag":
+        return fit_session(request, progress)
+    return fit_presses(request, progress)
+
+
 def fit_presses(request: FitRequest, progress: Progress = unseen) -> FitResult:
     """Fit the brush to the presses of a session, leave each cell out in turn, and measure the marks.
 
     The session uses the fit from now on, and its page is written. Raises `CalibrationError`.
     """
-    captures = read_presses(request.session, Field(mm_per_px=request.mm_per_px), progress)
+    if request.prior is not None:
+        raise CalibrationError("--prior", "adapts a fit of drags, and this session holds presses")
+    mm_per_px = request.mm_per_px or MM_PER_PX
+    captures = read_presses(request.session, Field(mm_per_px=mm_per_px), progress)
     session, grid, strokes = captures.session, captures.grid, captures.strokes
     press = fit_parameters(strokes, grid, captures.radius_mm, captures.length_mm)
     held_out = leave_cell_out(strokes, grid, press, progress=progress, store=session.store)
@@ -180,7 +188,7 @@ def fit_presses(request: FitRequest, progress: Progress = unseen) -> FitResult:
         length_mm=captures.length_mm,
         strokes=len(strokes),
         cells=tuple(by_cell(strokes)),
-        mm_per_px=request.mm_per_px,
+        mm_per_px=mm_per_px,
         parameters=dict(zip(NAMES, press.values.tolist(), strict=True)),
         edges_mm=press.edges.tolist(),
         ends_mm=press.ends.tolist(),

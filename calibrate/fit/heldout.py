@@ -10,7 +10,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.compare.place import Alignment, similarity
+from brushloop.calibrate.compare import Alignment, similarity
 from brushloop.calibrate.fit.captures import Cell, Floats, Grid, Pressed, by_cell
 from brushloop.calibrate.fit.descent import Prior, fit_presses
 from brushloop.calibrate.stats import CEILING, Summary, average, ceiling_values, pair_means

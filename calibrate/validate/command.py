@@ -10,6 +10,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from brushloop.calibrate.artefact import current, load_artefact
+from brushloop.calibrate.commands import ValidateRequest
 from brushloop.calibrate.drags.report import DragValidation, validate_drags, write_drags
 from brushloop.calibrate.drags.report import summary as drag_summary
 from brushloop.calibrate.errors import CalibrationError
@@ -26,7 +27,7 @@ from brushloop.calibrate.validate.figures import Curve, read_curve
 from brushloop.calibrate.validate.findings import terminal_lines
 from brushloop.calibrate.validate.models import FittedSession
 from brushloop.calibrate.validate.page import page_of, pages_beside
-from brushloop.calibrate.validate.run import Outcome, Refused, Request, validate_presses
+from brushloop.calibrate.validate.run import Outcome, Refused, validate_presses
 from brushloop.calibrate.validate.tables import Report, check_gates, parse_gate, report_of, summary_csv
 from brushloop.calibrate.work import cluster, threads
 from brushloop.calibrate.writing.compare import FILE as WRITTEN_FILE
@@ -53,6 +54,7 @@ class ValidationOutput:
     drags: tuple[DragValidation, ...] = ()
     notes: tuple[str, ...] = ()
     """What was found beside the sessions and left out, and why."""
+    gates: tuple[str, ...] = ()
 
     @property
     def page(self) -> Path:
@@ -69,6 +71,13 @@ class ValidationOutput:
         yield from self.notes
         yield f"Report: {self.folder / 'report.html'}"
 
+    def check(self) -> None:
+        """Check the gates, once the report is written. Raises `GateMissed` if any is missed."""
+        if self.gates and self.report is None:
+            raise CalibrationError("--gate", "applies to presses; these are drags")
+        if self.report is not None:
+            check_gates(self.report, self.gates)
+
     def _repr_html_(self) -> str:
         return framed(self.page)
 
@@ -84,8 +93,8 @@ class Beside:
     notes: list[str] = field(default_factory=list[str])
 
 
-def validate(request: Request, progress: Progress = unseen) -> ValidationOutput:
-    """Validate and write every file of the report; gates are checked by `check`.
+def validate(request: ValidateRequest, progress: Progress = unseen) -> ValidationOutput:
+    """Validate and write every file of the report; its gates are checked afterwards, by `ValidationOutput.check`.
 
     Raises `CalibrationError`, and what reading a recording raises. Finished work is kept in the folders
     of the sessions, so that the same command resumes.
@@ -110,17 +119,10 @@ def validate(request: Request, progress: Progress = unseen) -> ValidationOutput:
             cluster(request.scheduler) if request.scheduler else threads(request.workers) as scheduler,
         ):
             outcome = validate_presses(sessions, request, scheduler, progress)
-            return ValidationOutput(folder, _write(outcome, folder, curves, beside), notes=tuple(beside.notes))
+            report = _write(outcome, folder, curves, beside)
+            return ValidationOutput(folder, report, notes=tuple(beside.notes), gates=request.gates)
     except Timeout:
         raise CalibrationError(str(folder), "another validation is writing there") from None
-
-
-def check(output: ValidationOutput, request: Request) -> None:
-    """Check the gates. Raises `GateMissed` if any is missed."""
-    if request.gates and output.report is None:
-        raise CalibrationError("--gate", "applies to presses; these are drags")
-    if output.report is not None:
-        check_gates(output.report, request.gates)
 
 
 def open_session(place: str, fit: Path | None = None) -> FittedSession:
@@ -202,17 +204,19 @@ def _write(outcome: Outcome, folder: Path, curves: Sequence[Curve], beside: Besi
     return report
 
 
-def _drags(request: Request, sessions: Sequence[FittedSession], folder: Path, progress: Progress) -> ValidationOutput:
+def _drags(
+    request: ValidateRequest, sessions: Sequence[FittedSession], folder: Path, progress: Progress
+) -> ValidationOutput:
     validated: list[DragValidation] = []
     for session in sessions:
         validation = validate_drags(session.recording.path, request.fit, progress)
         target = folder / session.header.session_id if len(sessions) > 1 else folder
         write_drags(validation, target, request.command)
         validated.append(validation)
-    return ValidationOutput(folder, drags=tuple(validated))
+    return ValidationOutput(folder, drags=tuple(validated), gates=request.gates)
 
 
-def _folder(request: Request) -> Path:
+def _folder(request: ValidateRequest) -> Path:
     if request.out is not None:
         return request.out
     if len(request.places) == 1 and not URL.match(request.places[0]):

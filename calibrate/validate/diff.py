@@ -16,11 +16,13 @@ from statistics import fmean
 import numpy as np
 from rich.table import Table
 
+from brushloop.calibrate.commands import DiffRequest
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.scores import MEASURES
 from brushloop.calibrate.stats import Paired, holm, paired
 from brushloop.calibrate.validate.tables import Report, load_report
 from brushloop.sessions.disk import as_text, file_sha256
+from brushloop.sessions.terminal import Progress, unseen
 
 SIGNIFICANT = 0.05
 Series = tuple[str, str, str, str]
@@ -84,9 +86,9 @@ class Difference:
         yield table
 
 
-def compare(before: Path, after: Path) -> Difference:
+def compare(request: DiffRequest, _progress: Progress = unseen) -> Difference:
     """Compare two reports, or two validated sessions. Raises `CalibrationError` if they are not comparable."""
-    paths = report_path(before), report_path(after)
+    paths = report_path(request.before), report_path(request.after)
     old, new = (load_report(path) for path in paths)
     if old.source != new.source:
         what = f"is of {new.source}, {paths[0]} of {old.source}: they cannot be compared"

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from brushloop.calibrate.compare.place import shown
+from brushloop.calibrate.compare import shown
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_bounded
 from brushloop.calibrate.presses import Press

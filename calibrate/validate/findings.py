@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 
 from rich.table import Table
 
-from brushloop.calibrate.compare.place import ORDER, Key
+from brushloop.calibrate.compare import ORDER, Key
 from brushloop.calibrate.report import Point, brush_and_size, source_note, source_point
 from brushloop.calibrate.scores import Stat
 from brushloop.calibrate.stats import CEILING, NEAR_POINTS, Interval, Summary, is_near

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from brushloop.calibrate.artefact import Frozen
-from brushloop.calibrate.compare.place import Field, Pixels, brush_of, images_of
+from brushloop.calibrate.compare import Field, Pixels, brush_of, images_of
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.fit import BrushFit
 from brushloop.calibrate.fit.heldout import Draw

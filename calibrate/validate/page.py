@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from brushloop.calibrate.artefact import FOLDER
-from brushloop.calibrate.compare.place import KEYS, TABLE_3
+from brushloop.calibrate.compare import KEYS, TABLE_3
 from brushloop.calibrate.fit.fit import FOLDER as FITS
 from brushloop.calibrate.report import (
     recording_facts,

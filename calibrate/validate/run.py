@@ -8,12 +8,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from brushloop.calibrate.compare.place import (
+from brushloop.calibrate.commands import ValidateRequest
+from brushloop.calibrate.compare import (
     KEYS,
     Alignment,
     Field,
@@ -55,27 +55,9 @@ MAX_SCORED, MIN_LEFT = 200, 5
 MM_BINARY = KEYS.index((Alignment.MM, Tone.BINARY))
 
 
-@dataclass(frozen=True, slots=True)
-class Request:
-    """What the command line asked for."""
-
-    places: tuple[str, ...] = ()
-    """Paths or URLs of sessions."""
-    command: str = ""
-    """Named by the report as what made it."""
-    models: tuple[str, ...] = ()
-    """Names; all if empty."""
-    view: Field = field(default_factory=Field)
-    fit: Path | None = None
-    generators: tuple[Path, ...] = ()
-    curves: tuple[str, ...] = ()
-    """Trainings as NAME=FOLDER."""
-    gates: tuple[str, ...] = ()
-    ablations: bool = False
-    held_out: bool = True
-    out: Path | None = None
-    scheduler: str = ""
-    workers: int | None = None
+def field_of(request: ValidateRequest) -> Field:
+    """The millimetre field on which strokes are compared."""
+    return Field(mm_per_px=request.mm_per_px)
 
 
 class Refused(NamedTuple):
@@ -102,7 +84,7 @@ class Outcome:
     """Every score of a run, and the models that were compared."""
 
     sessions: Sequence[FittedSession]
-    request: Request
+    request: ValidateRequest
     models: Mapping[str, Sequence[Model]]
     """Models of each session, by its name."""
     scores: Scores
@@ -120,12 +102,12 @@ class Outcome:
         cell = press.session, press.condition
         if cell not in self.drawn:
             [store] = (session.store for session in self.sessions if session.header.session_id == press.session)
-            self.drawn[cell] = predicted(self.models[press.session], press.condition, self.request.view, store)[0]
+            self.drawn[cell] = predicted(self.models[press.session], press.condition, field_of(self.request), store)[0]
         return self.drawn[cell]
 
 
 def validate_presses(
-    sessions: Sequence[FittedSession], request: Request, scheduler: Scheduler, progress: Progress = unseen
+    sessions: Sequence[FittedSession], request: ValidateRequest, scheduler: Scheduler, progress: Progress = unseen
 ) -> Outcome:
     """Compare every model with every press.
 
@@ -149,7 +131,7 @@ def validate_presses(
         name, left_out = session.header.session_id, list[tuple[str, str]]()
         reasons = uncommanded, too_thin
         of_session = list(
-            read_presses(session, request.view, left_out, *reasons, scheduler=scheduler, progress=progress)
+            read_presses(session, field_of(request), left_out, *reasons, scheduler=scheduler, progress=progress)
         )
         refused += (Refused(name, *reason) for reason in left_out)
         every = in_order([*models[name], *_held_out(session, of_session, request, scheduler, progress)])
@@ -158,18 +140,18 @@ def validate_presses(
     names = list(dict.fromkeys(model.name for model in in_order([m for group in models.values() for m in group])))
     scores = Scores(presses, (*names, ANOTHER))
     for session in sessions:
-        _score(scores, session, models[session.header.session_id], request.view, refused, scheduler, progress)
+        _score(scores, session, models[session.header.session_id], field_of(request), refused, scheduler, progress)
     steps: list[Step] = []
     for number, session in enumerate(sessions if request.ablations else ()):
-        steps += _similarity_by_strokes(session, number, scores, request.view, scheduler)
+        steps += _similarity_by_strokes(session, number, scores, field_of(request), scheduler)
     return Outcome(sessions, request, models, scores, refused, steps)
 
 
 def _held_out(
-    session: FittedSession, presses: Sequence[Press], request: Request, scheduler: Scheduler, progress: Progress
+    session: FittedSession, presses: Sequence[Press], request: ValidateRequest, scheduler: Scheduler, progress: Progress
 ) -> Iterator[Model]:
     """Yield the models fitted to the session without the cells that they predict."""
-    view, wanted = request.view, request.models or (FITTED_HELD_OUT, BEZIER_REFITTED)
+    view, wanted = field_of(request), request.models or (FITTED_HELD_OUT, BEZIER_REFITTED)
     if request.held_out and (FITTED_HELD_OUT in wanted or BEZIER_REFITTED in wanted):
         left_out = _left_out(presses, MAX_FOLDS)
         fits = _refitted(session, left_out, view, scheduler, progress)

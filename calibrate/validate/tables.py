@@ -18,7 +18,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from brushloop.calibrate.artefact import Frozen
-from brushloop.calibrate.compare.place import (
+from brushloop.calibrate.compare import (
     ROBOT_WRITING,
     TABLE_1,
     TABLE_2,
@@ -193,7 +193,7 @@ def report_of(
         source=outcome.sessions[0].header.source,
         software={name: version(name) for name in PACKAGES} | {"python": platform.python_version()},
         command=outcome.request.command,
-        mm_per_px=outcome.request.view.mm_per_px,
+        mm_per_px=outcome.request.mm_per_px,
         ssim_settings=SSIM_SETTINGS,
         sessions=tuple(_session(session, outcome.scores) for session in outcome.sessions),
         models=(*_models(outcome), *(kind for kind in KINDS_OF_PRESS if kind.name in present)),

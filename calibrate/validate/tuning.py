@@ -9,17 +9,21 @@ from pathlib import Path
 
 import numpy as np
 
-from brushloop.calibrate.compare.place import FINE, Field, Image, averaged, brush_of
+from brushloop.calibrate.commands import CapturesRequest
+from brushloop.calibrate.compare import FINE, Field, Image, averaged, brush_of
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
+from brushloop.calibrate.files import Written, check_target
 from brushloop.calibrate.presses import Refused, prepare_press
 from brushloop.calibrate.report import source_label
 from brushloop.calibrate.session import OpenSession
 from brushloop.calibrate.stroke import PX_PER_MM
 from brushloop.calibrate.stroke.preprocess import Prepared
+from brushloop.calibrate.validate.command import one_source, open_session
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.generator.config import ANCHOR_SHARE, INPUTS, Placement, Target
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.records import Condition
+from brushloop.sessions.terminal import Progress, unseen
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +38,17 @@ class AlignedPresses:
     conditions: list[Condition]
     left_out: list[Refused]
     """Presses that the generator does not draw or that cannot be used."""
+
+
+def captures(request: CapturesRequest, _progress: Progress = unseen) -> Written:
+    """Write the presses of sessions of one source for `brushloop train tune`. Raises `CalibrationError`."""
+    check_target(request.out, ".safetensors", request.generator)
+    sessions = [open_session(place) for place in request.sessions]
+    one_source(sessions)
+    aligned = align_captures(sessions, request.generator)
+    write_captures(aligned, request.out)
+    left_out = [f"left out: {name}: {why}" for name, why in aligned.left_out]
+    return Written(request.out, (*left_out, f"{len(aligned.images)} presses ({aligned.source}): {request.out}"))
 
 
 def align_captures(sessions: Sequence[OpenSession], generator: Path) -> AlignedPresses:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import Field, PlainSerializer, PlainValidator, ValidationError
 
 from brushloop.calibrate.artefact import Frozen
-from brushloop.calibrate.compare.place import SIZE_PX, Image
+from brushloop.calibrate.compare import SIZE_PX, Image
 from brushloop.calibrate.errors import CalibrationError, invalid
 from brushloop.calibrate.files import read_bounded
 from brushloop.calibrate.report import write_files

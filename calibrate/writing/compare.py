@@ -17,7 +17,8 @@ import cv2
 import numpy as np
 
 from brushloop.calibrate.artefact import Frozen, made_by
-from brushloop.calibrate.compare.place import (
+from brushloop.calibrate.commands import CompareWrittenRequest
+from brushloop.calibrate.compare import (
     ROBOT_WRITING,
     SIZE_PX,
     TABLE_3,
@@ -30,11 +31,10 @@ from brushloop.calibrate.compare.place import (
     to_tone,
 )
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
-from brushloop.calibrate.files import read_gray
+from brushloop.calibrate.files import Written, read_gray
 from brushloop.calibrate.presses import Refused, prepare_cell
 from brushloop.calibrate.report import (
     Sealed,
-    Written,
     about,
     ink_uri,
     load_sealed,
@@ -191,21 +191,7 @@ class WritingComparison:
         return sum(len(character.captured) for character in self.characters)
 
 
-@dataclass(frozen=True, slots=True)
-class CompareRequest:
-    """Which written characters are compared, and where the report goes."""
-
-    session: Path
-    plan: Path
-    """The plan's folder, or its plan.json."""
-    out: Path
-    command: str
-    """Named by the report as what made it."""
-    references: tuple[str, ...] = ()
-    """Pictures to compare with instead of the plan's font, as `CHARACTER=FILE`."""
-
-
-def compare(request: CompareRequest, progress: Progress = unseen) -> Written:
+def compare(request: CompareWrittenRequest, progress: Progress = unseen) -> Written:
     """Compare written characters with their simulation and reference; write the report. Raises `CalibrationError`."""
     check_writable(request.out)
     references: dict[str, tuple[str, Image]] = {}

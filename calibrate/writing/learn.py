@@ -15,8 +15,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Annotated, Self
 
 import cv2
@@ -25,10 +23,11 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from brushloop.calibrate.artefact import SessionFit, made_by, put_to_use
-from brushloop.calibrate.compare.place import Image
+from brushloop.calibrate.commands import FitFootprintRequest, LearnRequest, PracticeRequest
+from brushloop.calibrate.compare import Image
 from brushloop.calibrate.drags.fit import captured_distance
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.report import Written
+from brushloop.calibrate.files import Written
 from brushloop.calibrate.session import open_session
 from brushloop.calibrate.stroke import PX_PER_MM
 from brushloop.calibrate.writing import (
@@ -111,21 +110,12 @@ class FootprintArtefact(SessionFit):
         return self
 
 
-@dataclass(frozen=True, slots=True)
-class PracticeRequest:
-    """What a practice sheet holds."""
-
-    out: Path
-    by: PlannedBy = field(default_factory=PlannedBy)
-    cell_mm: float = 70.0
-
-
-def fit(session: Path, progress: Progress = unseen) -> Written:
+def fit(request: FitFootprintRequest, progress: Progress = unseen) -> Written:
     """Fit the footprint to the figures of a session and put it to use.
 
     Raises `CalibrationError` if the session is an import, or holds too few strokes.
     """
-    opened, refused = open_session(session, "drag"), list[tuple[str, str]]()
+    opened, refused = open_session(request.session, "drag"), list[tuple[str, str]]()
     figures, cell_mm = recorded_figures(opened.header), opened.strokes[0].cell_mm
     assert cell_mm is not None  # as every stroke that a protocol of figures drew has
     strokes, ink = list[list[Floats]](), list[Image]()
@@ -140,7 +130,7 @@ def fit(session: Path, progress: Progress = unseen) -> Written:
         ink.append(np.asarray(coverage, np.float32))
     count = sum(map(len, strokes))
     if count < LEAST:
-        raise CalibrationError(str(session), f"holds {count} usable strokes, at least {LEAST} are needed")
+        raise CalibrationError(str(request.session), f"holds {count} usable strokes, at least {LEAST} are needed")
     footprint, csim_percent = fitted(drawings_of(strokes, ink, cell_mm[2]))
     artefact = FootprintArtefact(
         session_id=opened.header.session_id,
@@ -153,7 +143,7 @@ def fit(session: Path, progress: Progress = unseen) -> Written:
         strokes=count,
         csim_percent=csim_percent,
     )
-    path = put_to_use(artefact, session, FOLDER)
+    path = put_to_use(artefact, opened.recording.path.parent, FOLDER)
     words = (
         f"footprint of {count} strokes on {len(ink)} cells ({artefact.source}): draws them with CSIM "
         f"{csim_percent:.1f} %, ink = 1"
@@ -173,7 +163,8 @@ def fitted(drawings: Drawings) -> tuple[Footprint, float]:
 def practice(request: PracticeRequest, _progress: Progress = unseen) -> Written:
     """Write the protocol of a practice sheet, each stroke on a patch of its own. Raises `CalibrationError`."""
     check_writable(request.out)
-    strokes = practice_strokes(request.cell_mm, request.by.reach, request.by.length_mm)
+    by = PlannedBy(radius_mm=request.radius_mm, length_mm=request.length_mm)
+    strokes = practice_strokes(request.cell_mm, by.reach, by.length_mm)
     figures = tuple(
         Figure(
             name=f"{NAME}-{number + 1:02d}",
@@ -182,9 +173,7 @@ def practice(request: PracticeRequest, _progress: Progress = unseen) -> Written:
         )
         for number in range(FIGURES)
     )
-    plan = Plan(
-        model="none: practice", planned_by=request.by, cell_mm=request.cell_mm, software=made_by(), figures=figures
-    )
+    plan = Plan(model="none: practice", planned_by=by, cell_mm=request.cell_mm, software=made_by(), figures=figures)
     protocol = write_plan(plan, 1, request.out)
     return Written(protocol, (str(protocol),))
 
@@ -214,19 +203,6 @@ def practice_strokes(side_mm: float, reach: Reach, brush_length_mm: float) -> li
         if len(stroke) >= 3:
             out.append(stroke)
     return out
-
-
-@dataclass(frozen=True, slots=True)
-class LearnRequest:
-    """From which session the next plan is made."""
-
-    session: Path
-    plan: Path
-    """The plan that was written: its folder, or its plan.json."""
-    out: Path
-    repeats: int = 1
-    settled_repeats: int | None = None
-    """The same, used once every character is settled."""
 
 
 def learn(request: LearnRequest, progress: Progress = unseen) -> Written:

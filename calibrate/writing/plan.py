@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from brushloop.calibrate.artefact import load_artefact, made_by
+from brushloop.calibrate.commands import PlanRequest
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.files import read_bounded
-from brushloop.calibrate.report import BLUE, Written, picture_grid, save_picture
+from brushloop.calibrate.files import Written, read_bounded
+from brushloop.calibrate.report import BLUE, picture_grid, save_picture
 from brushloop.calibrate.writing import Figure, Plan, PlannedBy, as_medians, as_points, code_points, write_plan
 from brushloop.calibrate.writing.learn import FootprintArtefact
 from brushloop.model.ccdbsm import Brush, DomainError
@@ -36,24 +36,6 @@ Planned = tuple[Figure, Image]
 """A figure, and the model's image of its first plan."""
 
 
-@dataclass(frozen=True, slots=True)
-class PlanRequest:
-    """Which characters are planned, and how."""
-
-    what: str
-    """Characters, or a .csv trajectory."""
-    out: Path
-    by: PlannedBy = field(default_factory=PlannedBy)
-    data: Path | None = None
-    """Folder of hanzi-writer files, such as 字.json."""
-    footprint: Path | None = None
-    """Result of `write fit`: the plan leads the brush by it; replaces the stroke model and `steps`."""
-    cell_mm: float = 70.0
-    steps: int = 60
-    """Steps of refinement; 0 keeps the first plan."""
-    repeats: int = 1
-
-
 def plan(request: PlanRequest, _progress: Progress = unseen) -> Written:
     """Plan each character of a text, or a trajectory file, and write protocol, plan and picture.
 
@@ -61,7 +43,15 @@ def plan(request: PlanRequest, _progress: Progress = unseen) -> Written:
     """
     check_writable(request.out)
     fitted = load_artefact(request.footprint, FootprintArtefact) if request.footprint is not None else None
-    by = request.by if fitted is None else request.by.model_copy(update={"footprint": fitted.footprint().values})
+    by = PlannedBy(
+        radius_mm=request.radius_mm,
+        length_mm=request.length_mm,
+        depth_range_mm=request.depth_range_mm,
+        tilt_range_deg=request.tilt_range_deg,
+        speed_mm_s=request.speed_mm_s,
+        wrist_deg_s=request.wrist_deg_s,
+        footprint=None if fitted is None else fitted.footprint().values,
+    )
     low, high = by.tilt_range_deg
     tilt_deg = min(max(TILT_DEG, low), high)
     try:

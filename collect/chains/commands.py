@@ -5,12 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from brushloop.calibrate.artefact import current
+from brushloop.calibrate.commands import CalibrateRequest, FitRequest, show_work
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.start import Collected, CollectRequest, collect
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.terminal import say, show_work
+from brushloop.sessions.terminal import say
 
 
 def finished_session(root: Path, config: Path, protocol: Path) -> Path | None:
@@ -51,7 +52,7 @@ def collected_session(request: CollectRequest) -> Path:
 
 def calibrated(session: Path) -> None:
     """Calibrate a session that was not calibrated yet. Raises `CalibrationError`, `SessionError`."""
-    from brushloop.calibrate.calibrated import CalibrateRequest, calibrate_session  # slow to import
+    from brushloop.calibrate.calibrated import calibrate_session  # slow to import
 
     if current(session) is None:
         say(f"calibrate {session}")
@@ -60,7 +61,7 @@ def calibrated(session: Path) -> None:
 
 def fitted(session: Path) -> Path:
     """The brush fit in use of a session, made if there is none. Raises `CalibrationError`, `SessionError`."""
-    from brushloop.calibrate.fit.fit import FOLDER, FitRequest, fit_presses  # slow to import
+    from brushloop.calibrate.fit.fit import FOLDER, fit_presses  # slow to import
 
     fit = current(session, FOLDER)
     if fit is None:

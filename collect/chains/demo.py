@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from brushloop.calibrate.commands import ValidateRequest, show_work
 from brushloop.calibrate.writing import PROTOCOL as WRITE
 from brushloop.collect.chains.commands import calibrated, collected, finished_session, fitted
 from brushloop.collect.chains.loop import PAGE as LOOP_PAGE
@@ -24,7 +25,7 @@ from brushloop.collect.rig.config import load_rig
 from brushloop.collect.start import CollectRequest
 from brushloop.drivers.loopback import FaultRefused, LoopbackRig, ask, start
 from brushloop.model.generator import SHIPPED_GENERATOR
-from brushloop.sessions.terminal import say, show_work
+from brushloop.sessions.terminal import say
 
 CHARACTER = "字"
 LEFT_OUT_CODE = 3
@@ -197,12 +198,12 @@ class Demo:
         Writing(WritingRequest(CHARACTER, config, folder, self._sessions, count=count, sheet=1)).run()
 
     def _validate(self) -> None:
-        from brushloop.calibrate.validate.command import Request, validate  # slow to import
+        from brushloop.calibrate.validate.command import validate  # slow to import
 
         command = f"brushloop validate {self._session} --generator {SHIPPED_GENERATOR}"
         say(f"$ {command}")
         places = (str(self._session),)
-        show_work(validate, Request(places=places, command=command, generators=(SHIPPED_GENERATOR,)))
+        show_work(validate, ValidateRequest(places, command=command, generators=(SHIPPED_GENERATOR,)))
 
     def _blank_sheet(self, protocol: Path) -> None:
         """Make the rig ready for the session of this protocol, with a blank sheet unless the session has begun."""

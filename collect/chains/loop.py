@@ -13,6 +13,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from brushloop.calibrate.commands import CompareLoopRequest, RecoverRequest, show_work
 from brushloop.calibrate.files import read_bounded, write_whole
 from brushloop.collect.chains.commands import calibrated, collected_session, fitted
 from brushloop.collect.engine.open_or_resume import check_fresh_sheet
@@ -22,7 +23,7 @@ from brushloop.collect.rig.config_file import read_text
 from brushloop.collect.start import CollectRequest
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import BareName
-from brushloop.sessions.terminal import say, show_work
+from brushloop.sessions.terminal import say
 
 SETTINGS, RECOVERED, PROTOCOL, PAGE = "settings.json", "recovered.csv", "protocol-replay.toml", "loop.html"
 FITS = "brushfit"
@@ -81,11 +82,11 @@ def run_loop(request: LoopRequest) -> Path:
     )
     again = collected_session(wanted)
 
-    from brushloop.calibrate.loop import CompareRequest, compare  # slow to import
+    from brushloop.calibrate.loop import compare  # slow to import
 
     command = f"brushloop loop compare {folder} {again} --fit {fit} --out {request.out}"
     say(f"$ {command}")
-    return show_work(compare, CompareRequest(folder, again, request.out, command, fit)).path
+    return show_work(compare, CompareLoopRequest(folder, again, fit, out=request.out, command=command)).path
 
 
 def _fit(request: LoopRequest, recording: Recording) -> Path:
@@ -103,7 +104,7 @@ def _recover(request: LoopRequest, folder: Path, fit: Path, settings: Settings) 
     """Recover depth and tilt; the protocol is written last, so where it exists this stage is done."""
     protocol = request.out / PROTOCOL
     if not protocol.exists():
-        from brushloop.calibrate.invert import RecoverRequest, recover  # loads torch
+        from brushloop.calibrate.invert import recover  # slow to import
 
         wanted = RecoverRequest(
             folder,

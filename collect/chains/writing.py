@@ -10,7 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from brushloop.calibrate.artefact import current
-from brushloop.calibrate.writing import PROTOCOL, PlannedBy, load_plan
+from brushloop.calibrate.commands import (
+    CompareWrittenRequest,
+    FitFootprintRequest,
+    LearnRequest,
+    PlanRequest,
+    PracticeRequest,
+    show_work,
+)
+from brushloop.calibrate.writing import PROTOCOL, load_plan
 from brushloop.collect.chains.commands import collected_session, finished_session
 from brushloop.collect.engine.open_or_resume import check_fresh_sheet
 from brushloop.collect.errors import ConfigError
@@ -18,7 +26,7 @@ from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.kinds import WriteConfig
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.start import CollectRequest
-from brushloop.sessions.terminal import say, show_work
+from brushloop.sessions.terminal import say
 
 PAGE = "written.html"
 FOOTPRINT = "footprint"
@@ -86,11 +94,13 @@ class Writing:
 
         from brushloop.calibrate.writing import plan as planning  # slow to import
 
-        wanted = planning.PlanRequest(
+        wanted = PlanRequest(
             request.what,
             plan,
-            PlannedBy(radius_mm=brush.radius_mm, length_mm=brush.length_mm, speed_mm_s=request.speed_mm_s),
             data=request.data,
+            radius_mm=brush.radius_mm,
+            length_mm=brush.length_mm,
+            speed_mm_s=request.speed_mm_s,
             footprint=self._footprint() if request.practice else None,
             cell_mm=request.cell_mm,
             repeats=self._repeats(1),
@@ -107,13 +117,12 @@ class Writing:
         if not (folder / PROTOCOL).exists():
             brush = load_rig(self._request.config).brush
             say(f"write practice --out {folder}")
-            by = PlannedBy(radius_mm=brush.radius_mm, length_mm=brush.length_mm)
-            show_work(learn.practice, learn.PracticeRequest(folder, by))
+            show_work(learn.practice, PracticeRequest(folder, brush.radius_mm, brush.length_mm))
         session = self._collected(folder / PROTOCOL)
         footprint = current(session, FOOTPRINT)
         if footprint is None:
             say(f"write fit {session}")
-            footprint = show_work(learn.fit, session).path
+            footprint = show_work(learn.fit, FitFootprintRequest(session)).path
         return footprint
 
     def _learn(self, plan: Path, number: int) -> Path:
@@ -128,7 +137,7 @@ class Writing:
 
         say(f"write learn {session} --plan {plan} --out {after}")
         repeats, settled = self._repeats(number + 1), self._request.count
-        show_work(learn.learn, learn.LearnRequest(session, plan, after, repeats=repeats, settled_repeats=settled))
+        show_work(learn.learn, LearnRequest(session, plan, after, repeats=repeats, settled_repeats=settled))
         return after
 
     def _repeats(self, number: int) -> int:
@@ -163,4 +172,4 @@ class Writing:
         options = "".join(f" --reference {reference}" for reference in references)
         line = f"brushloop write compare {session} --plan {plan} --out {out}{options}"
         say(f"$ {line}")
-        return show_work(compare.compare, compare.CompareRequest(session, plan, out, line, references)).path
+        return show_work(compare.compare, CompareWrittenRequest(session, plan, references, out, line)).path

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from brushloop.calibrate.compare.place import KEYS, Tone
+from brushloop.calibrate.compare import KEYS, Tone
 from brushloop.calibrate.loop import AGAIN, ANOTHER, SIMULATED, LoopRecord, statistics_of, verdicts
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.scores import Scores

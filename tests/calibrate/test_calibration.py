@@ -15,7 +15,8 @@ import pytest
 
 from brushloop.calibrate.artefact import HASH_CHARS, current, load_artefact, put_to_use
 from brushloop.calibrate.board.lens import FITTED
-from brushloop.calibrate.calibrated import CalibrateRequest, calibrate_session
+from brushloop.calibrate.calibrated import calibrate_session
+from brushloop.calibrate.commands import CalibrateRequest
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.session import Calibration, calibration_of
 from brushloop.drivers.geometry import brush_pose

@@ -14,9 +14,10 @@ import pytest
 from typer.testing import CliRunner
 
 from brushloop.__main__ import app
-from brushloop.calibrate.calibrated import CalibrateRequest, calibrate_session
-from brushloop.calibrate.compare.place import Field
-from brushloop.calibrate.export import export
+from brushloop.calibrate.calibrated import calibrate_session
+from brushloop.calibrate.commands import CalibrateRequest, ExportRequest
+from brushloop.calibrate.compare import Field
+from brushloop.calibrate.export import StrokesLeftOut, export
 from brushloop.calibrate.stats import odd_waits, waits_of
 from brushloop.sessions.disk import as_cell, as_text, number
 from brushloop.sessions.errors import InputError, SessionError
@@ -53,7 +54,7 @@ def test_the_photographs_are_those_of_the_recording_byte_for_byte(make, closed, 
 
 
 def test_the_poses_of_each_press_are_a_time_series_of_its_stroke(make, closed, to):
-    export(closed, to, "csv")
+    export(ExportRequest(closed, to, "csv"))
     poses = rows_of(to / "poses.csv")
     frames = [(row["episode_index"], row["frame_index"]) for row in poses]
     assert frames == [(str(episode), str(frame)) for episode in range(2) for frame in range(5)]
@@ -65,7 +66,7 @@ def test_the_poses_of_each_press_are_a_time_series_of_its_stroke(make, closed, t
 def test_what_was_commanded_and_reached_are_columns_and_what_is_not_given_is_empty(make, tmp_path, to):
     values = {"depth_mm": 13.0, "reached_mm": 12.9, "anchor_mm": (1.5, 2.5), "commanded": {"length_mm": 30.0}}
     recording = make.record(tmp_path / "a.mcap", make.still(0), make.stroke(0), make.still(1), make.stroke(1, **values))
-    export(recording, to, "csv")
+    export(ExportRequest(recording, to, "csv"))
     columns = ("depth_mm", "reached_mm", "anchor_x_mm", "anchor_y_mm", "commanded_length_mm")
     rows = [[row[c] for c in columns] for row in rows_of(to / "strokes.csv")]
     assert rows == [[""] * 5, ["13.0", "12.9", "1.5", "2.5", "30.0"]]
@@ -84,7 +85,7 @@ def test_force_and_quality_are_exported_with_each_stroke(make, tmp_path, to):
     make.take(store, "a capture", [make.still(0), judged, make.stroke(0)], make.captured("H13-a05-r00", 0))
     store.close()
     store.release()
-    export(store.folder, to, "csv")
+    export(ExportRequest(store.folder, to, "csv"))
     forces = [(row["episode_index"], row["frame_index"], row["fz_n"]) for row in rows_of(to / "forces.csv")]
     assert forces == [("0", "0", "-0.0"), ("0", "1", "-1.0")]
     [stroke] = rows_of(to / "strokes.csv")
@@ -94,7 +95,7 @@ def test_force_and_quality_are_exported_with_each_stroke(make, tmp_path, to):
 def test_parquet_has_the_same_columns(closed, tmp_path):
     parquet = pytest.importorskip("pyarrow.parquet")
     for kind in ("csv", "parquet"):
-        export(closed, tmp_path / kind, kind)
+        export(ExportRequest(closed, tmp_path / kind, kind))
     for name in ("strokes", "poses"):
         table = parquet.read_table(tmp_path / "parquet" / f"{name}.parquet")
         rows = rows_of(tmp_path / "csv" / f"{name}.csv")
@@ -106,7 +107,7 @@ def test_parquet_has_the_same_columns(closed, tmp_path):
 def test_without_pyarrow_the_error_names_the_remedy_and_nothing_is_left(closed, to, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(InputError, match="parquet needs pyarrow: pip install pyarrow"):
-        export(closed, to, "parquet")
+        export(ExportRequest(closed, to, "parquet"))
     assert list(to.parent.glob("*exported*")) == []
 
 
@@ -117,19 +118,19 @@ def test_a_full_disk_leaves_nothing_and_a_folder_that_holds_anything_is_left_as_
     with monkeypatch.context() as patch:
         patch.setattr("brushloop.sessions.disk.fsync_folder", full)
         with pytest.raises(SessionError, match="No space left"):
-            export(closed, to, "csv")
+            export(ExportRequest(closed, to, "csv"))
     assert list(to.parent.glob("*exported*")) == []
     to.mkdir()
     (to / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match="not an empty folder"):
-        export(closed, to, "csv")
+        export(ExportRequest(closed, to, "csv"))
     assert [path.name for path in to.iterdir()] == ["notes.txt"]
 
 
 def test_names_that_a_file_system_would_refuse_become_names(make, tmp_path, to):
     strokes = [make.stroke(n, stroke_id=name) for n, name in enumerate(["../../etc/x", "a/b", "a_b", "墨" * 90])]
     path = make.record(tmp_path / "a.mcap", *(make.still(n) for n in range(4)), *strokes)
-    export(path, to, "csv")
+    export(ExportRequest(path, to, "csv"))
     names = sorted(p.name for p in (to / "images").iterdir())
     assert names == ["0000-______etc_x.png", "0001-a_b.png", "0002-a_b.png", f"0003-{'_' * 80}.png"]
 
@@ -178,7 +179,8 @@ def test_imports_are_rescaled_and_what_cannot_be_cropped_is_named(make, tmp_path
         assert "holds no stroke that can be cropped: 0 is blank" in str(ran.exception)
         assert not to.exists()
         return
-    assert ran.exit_code == 3
+    assert isinstance(ran.exception, StrokesLeftOut)
+    assert ran.exception.exit_code == 3
     assert "left out: 1: is blank" in ran.output
     [row] = rows_of(to / "strokes.csv")
     assert row["mask_file"] == "masks/0000-0.png"
@@ -215,7 +217,7 @@ def test_far_is_two_seconds_and_three_median_deviations(waits: list[float], far:
 def test_an_export_gives_the_wait_and_names_strokes_whose_wait_differs(make, tmp_path, to):
     fields = [{"dip_to_touch_s": wait} for wait in (1.0, 1.1, 10.0, 1.2)] + [{}]
     messages = [message for n, one in enumerate(fields) for message in (make.still(n), make.stroke(n, **one))]
-    export(make.record(tmp_path / "a.mcap", *messages), to, "csv")
+    export(ExportRequest(make.record(tmp_path / "a.mcap", *messages), to, "csv"))
     rows = rows_of(to / "strokes.csv")
     assert [row["dip_to_touch_s"] for row in rows] == ["1.0", "1.1", "10.0", "1.2", ""]
     assert [row["dip_to_touch_unlike"] for row in rows] == ["0.0", "0.0", "1.0", "0.0", ""]
@@ -241,7 +243,7 @@ def test_names_go_out_and_in_again_by_our_own_importer(make, photos, run, to):
     make.photographs(photos, *rows)
     recorded = run(ImportOptions())
     assert [stroke.stroke_id for stroke in Recording(recorded).stroke_records()] == names
-    export(recorded, to, "csv")
+    export(ExportRequest(recorded, to, "csv"))
     cells = [row["stroke_id"] for row in rows_of(to / "strokes.csv")]
     assert cells == ["'=1+1", "'@home", "'-2-3", "-5", "''=x", "a"]
     assert [as_text(cell) for cell in cells] == names

@@ -12,14 +12,14 @@ import cv2
 import numpy as np
 import pytest
 
-from brushloop.calibrate.compare.place import Field
+from brushloop.calibrate.commands import RecoverRequest
+from brushloop.calibrate.compare import Field
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.invert import (
     NO_MODEL_ERROR,
     NOT_INFORMATIVE,
     PROTOCOL,
     Recovered,
-    RecoverRequest,
     Row,
     common_variance,
     covers_most,

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 
-from brushloop.calibrate.compare.place import Alignment, Field, Tone
+from brushloop.calibrate.compare import Alignment, Field, Tone
 from brushloop.calibrate.loop import (
     AGAIN,
     ANOTHER,

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from brushloop.__main__ import app
 from brushloop.calibrate.board.lens import Gray
 from brushloop.calibrate.board.spec import BoardSpec, charuco_board
-from brushloop.calibrate.compare.place import KEYS, Tone
+from brushloop.calibrate.compare import KEYS, Tone
 from brushloop.calibrate.loop import NOT_AGAIN, Pair, score_pairs, statistics_of, verdicts, write_loop
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.report import Axis, Marks, Panel, chart_uri, source_label, source_note

@@ -18,14 +18,15 @@ import numpy as np
 import pytest
 
 from brushloop.calibrate import presses, work
-from brushloop.calibrate.compare.place import Field
+from brushloop.calibrate.commands import FitRequest, ValidateRequest
+from brushloop.calibrate.compare import Field
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.fit import heldout
-from brushloop.calibrate.fit.fit import FitRequest, fit_presses
+from brushloop.calibrate.fit.fit import fit_presses
 from brushloop.calibrate.presses import Press, cut, too_thin, uncommanded
 from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.calibrate.validate import run as validation
-from brushloop.calibrate.validate.command import Request, validate
+from brushloop.calibrate.validate.command import validate
 from brushloop.sessions.recording import Recording, mark_bad_or_good
 from tests.calibrate.given import CALIBRATION
 from tests.photographed import imported, imported_presses
@@ -34,7 +35,7 @@ CELLS = [(11.0, 0.0), (15.0, 5.0), (20.0, 10.0)]
 READ = """
 import sys
 from pathlib import Path
-from brushloop.calibrate.compare.place import Field
+from brushloop.calibrate.compare import Field
 from brushloop.calibrate.presses import read_presses
 from brushloop.calibrate.session import open_session
 print([float(press.coverage.sum()) for press in read_presses(open_session(Path(sys.argv[1])), Field(), [])])
@@ -80,7 +81,7 @@ def same(one: Press, other: Press) -> bool:
 
 
 def test_fit_and_validate_do_no_work_twice(session: Path, tmp_path: Path, calls: Counter[str]) -> None:
-    request = Request(places=(str(session),), out=tmp_path / "report")
+    request = ValidateRequest(places=(str(session),), out=tmp_path / "report")
     fit_presses(FitRequest(session))
     validate(request)
     assert (calls["prepare_job"], calls["refit"], calls["score_job"]) == (3, 3, 3)

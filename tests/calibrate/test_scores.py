@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from skimage.metrics import structural_similarity
 
-from brushloop.calibrate.compare.place import (
+from brushloop.calibrate.compare import (
     BEST_SHIFT_PX,
     KEYS,
     Alignment,

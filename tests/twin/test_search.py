@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brushloop.calibrate.compare.place import Field
+from brushloop.calibrate.compare import Field
 from brushloop.calibrate.fit.captures import Grid, Pressed, grid_of
 from brushloop.collect.rig.config_touch import QualityConfig
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.board.pix2len import Plane, see_board
-from brushloop.calibrate.compare.place import SIZE_PX, Field, covered
+from brushloop.calibrate.compare import SIZE_PX, Field, covered
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.stats import odd_waits, wait_limit_s, waits_of
 from brushloop.calibrate.stroke import PX_PER_MM, Gray, Params

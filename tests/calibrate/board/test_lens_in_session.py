@@ -17,9 +17,9 @@ from brushloop.calibrate.artefact import current, load_artefact
 from brushloop.calibrate.board.detect import find_board
 from brushloop.calibrate.board.lens import Lens, fit_lens, read_lens
 from brushloop.calibrate.board.pix2len import see_board
-from brushloop.calibrate.calibrated import CalibrateRequest
 from brushloop.calibrate.calibrated import calibrate_session as calibrate
-from brushloop.calibrate.compare.place import Field
+from brushloop.calibrate.commands import CalibrateRequest
+from brushloop.calibrate.compare import Field
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.presses import prepare_press
 from brushloop.calibrate.session import Calibration

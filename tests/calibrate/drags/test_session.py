@@ -46,8 +46,8 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def fit_command(session: Path, *more: str) -> tuple[Path, str]:
-    """The artefact that `brushloop fit --drags` writes, and what it prints."""
-    ran = CliRunner().invoke(app, ["fit", str(session), "--drags", "--mm-per-px", "1.0", *more])
+    """The artefact that `brushloop fit` writes for drags, and what it prints."""
+    ran = CliRunner().invoke(app, ["fit", str(session), "--mm-per-px", "1.0", *more])
     assert ran.exit_code == 0, ran.output
     path = current(session, FOLDER)
     assert path is not None
@@ -101,7 +101,7 @@ def test_a_known_brush_is_adapted_to_few_strokes(session: Path, fitted: tuple[Pa
     assert "drift_x_mm" in output
     one = load_artefact(path, DragArtefact)
     assert one.parameters["drift_x_mm"].low is None  # a single stroke has no interval, not one of width zero
-    many = CliRunner().invoke(app, ["fit", str(session), "--drags", *options, "7"])
+    many = CliRunner().invoke(app, ["fit", str(session), *options, "7"])
     assert "allowed 1 to 6" in str(many.exception)
 
 
@@ -115,7 +115,7 @@ def test_an_edited_file_hostile_ink_and_presses_are_refused_with_one_line(
         edited.write_text(fitted[0].read_text().replace(old, new))
         with pytest.raises(CalibrationError, match=words):
             load_artefact(edited, DragArtefact)
-    ran = CliRunner().invoke(app, ["fit", str(session)])
+    ran = CliRunner().invoke(app, ["invert", str(session)])
     assert ran.exit_code != 0
     assert "drags" in str(ran.exception)
 

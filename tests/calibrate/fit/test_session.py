@@ -9,8 +9,9 @@ from typer.testing import CliRunner
 
 from brushloop.__main__ import app
 from brushloop.calibrate.artefact import current, load_artefact
+from brushloop.calibrate.commands import FitRequest
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.fit.fit import FOLDER, BrushFit, FitRequest, fit_presses
+from brushloop.calibrate.fit.fit import FOLDER, BrushFit, fit_presses
 from brushloop.calibrate.session import open_session
 from brushloop.calibrate.validate.tables import load_report
 from brushloop.model.fitted import NAME, NAMES
@@ -51,7 +52,7 @@ def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> Non
     mean = {name: report.stat(name) for name in ("ccd-bsm", NAME)}
     assert mean[NAME].csim.avg > mean["ccd-bsm"].csim.avg + 5.0
 
-    with pytest.raises(CalibrationError, match="holds presses, which `fit` takes without --drags"):
+    with pytest.raises(CalibrationError, match="holds presses: this needs drags"):
         open_session(session, kind="drag")
 
 

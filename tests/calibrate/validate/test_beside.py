@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from brushloop.__main__ import app
-from brushloop.calibrate.compare.place import TABLE_1
+from brushloop.calibrate.compare import TABLE_1
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.validate.tables import NORMAL, STRICT, Report, load_report, table_1, table_3
 from brushloop.sessions.recording import Recording

@@ -187,7 +187,7 @@ def test_jobs_come_back_whole_and_alike_though_a_worker_dies(cluster: Cluster, s
     program = f"""
 import os, signal
 from pathlib import Path
-from brushloop.calibrate.compare.place import Field
+from brushloop.calibrate.compare import Field
 from brushloop.calibrate.presses import PrepareJob, prepare_job
 from brushloop.calibrate.work import cluster, threads
 from brushloop.sessions.recording import Recording

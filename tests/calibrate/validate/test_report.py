@@ -15,12 +15,13 @@ from typer.testing import CliRunner
 
 import brushloop
 from brushloop.__main__ import app
-from brushloop.calibrate.compare.place import KEYS
+from brushloop.calibrate.commands import DiffRequest, FitRequest, ValidateRequest
+from brushloop.calibrate.compare import KEYS
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.fit.fit import FitRequest, fit_presses
+from brushloop.calibrate.fit.fit import fit_presses
 from brushloop.calibrate.fit.heldout import BEZIER, FITTED
 from brushloop.calibrate.stats import CEILING
-from brushloop.calibrate.validate.command import Request, validate
+from brushloop.calibrate.validate.command import validate
 from brushloop.calibrate.validate.diff import compare
 from brushloop.calibrate.validate.findings import trust
 from brushloop.calibrate.validate.models import BEZIER_REFITTED, FITTED_HELD_OUT
@@ -76,7 +77,7 @@ def test_every_model_is_scored_in_both_alignments_and_tones(report: Report) -> N
 def test_fit_and_validate_print_the_same_held_out_scores(session: Path, tmp_path: Path) -> None:
     copied = Path(shutil.copytree(session, tmp_path / session.name))
     fitted = fit_presses(FitRequest(copied))
-    report = validate(Request(places=(str(copied),), fit=fitted.path, out=tmp_path / "report")).report
+    report = validate(ValidateRequest(places=(str(copied),), fit=fitted.path, out=tmp_path / "report")).report
     assert report is not None
     rows = {row.model: row for row in fitted.held_out}
     for name, validated in {CEILING: CEILING, FITTED: FITTED_HELD_OUT, BEZIER: BEZIER_REFITTED}.items():
@@ -139,7 +140,7 @@ def test_a_gate_that_holds_passes_and_one_that_is_missed_says_by_how_much_and_ex
 )
 def test_what_is_no_gate_is_refused_before_any_work(text: str) -> None:
     with pytest.raises(CalibrationError, match=r"expected \[MODEL:\]\[ALIGNMENT:\]"):
-        validate(Request(places=("nowhere",), gates=(text,)))
+        validate(ValidateRequest(places=("nowhere",), gates=(text,)))
 
 
 def test_only_the_models_asked_for_and_an_unknown_one_is_refused(session: Path, tmp_path: Path) -> None:
@@ -262,7 +263,7 @@ def before(session: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_report_does_not_differ_from_itself(before: Path) -> None:
-    found = compare(before, before / "report.json")
+    found = compare(DiffRequest(before, before / "report.json"))
     assert found.by_stroke
     assert len(found.changes) == 3 * 4 * 2
     assert {change.verdict for change in found.changes} == {"no significant difference"}
@@ -271,7 +272,7 @@ def test_a_report_does_not_differ_from_itself(before: Path) -> None:
 
 def test_another_scale_of_the_field_is_reported_stroke_by_stroke(session: Path, before: Path, tmp_path: Path) -> None:
     run(session, "--out", tmp_path, *TWO, "--mm-per-px", "0.5")
-    found = {change.series: change for change in compare(before, tmp_path).changes}
+    found = {change.series: change for change in compare(DiffRequest(before, tmp_path)).changes}
     # A coarser field: more blank paper in every window of SSIM, in each of the five cells.
     coarser = found[("line", "mm", "binary", "ssim")]
     assert (coarser.test.n, coarser.test.groups) == (10, 5)
@@ -287,7 +288,7 @@ def test_another_scale_of_the_field_is_reported_stroke_by_stroke(session: Path, 
 def test_two_sessions_are_compared_cell_by_cell(make_session: object, before: Path, tmp_path: Path) -> None:
     other = make_session(tmp_path, "other", seed=500, blank=False)  # pyright: ignore[reportCallIssue]
     run(other, *TWO)
-    found = compare(before, other)  # the session's own folder
+    found = compare(DiffRequest(before, other))  # the session's own folder
     assert not found.by_stroke
     assert all(change.test.n == 5 for change in found.changes)
     assert {change.verdict for change in found.changes} == {"no significant difference"}
@@ -299,10 +300,10 @@ def test_what_has_no_report_or_an_edited_table_is_refused(session: Path, before:
     shutil.copytree(before, tmp_path / "validation")
     for never in (tmp_path / "never", tmp_path / "never" / "presses.mcap"):
         with pytest.raises(CalibrationError, match=f"{never}: was not validated: run `brushloop validate {never}`"):
-            compare(before, never)
+            compare(DiffRequest(before, never))
     with pytest.raises(CalibrationError, match=r"nowhere: does not exist: give a report\.json"):
-        compare(tmp_path / "nowhere", before)
+        compare(DiffRequest(tmp_path / "nowhere", before))
     edited = tmp_path / "validation" / "scores.csv"
     edited.write_text(edited.read_text().replace("0.9", "0.8"))
     with pytest.raises(CalibrationError, match="its SHA-256 differs"):
-        compare(before, tmp_path / "validation")
+        compare(DiffRequest(before, tmp_path / "validation"))

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from brushloop.calibrate.compare.place import Alignment, Polarity, Tone
+from brushloop.calibrate.compare import Alignment, Polarity, Tone
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.writing import Figure, Plan, PlannedBy, as_points, load_plan
 from brushloop.calibrate.writing.compare import (

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from brushloop.calibrate.commands import PracticeRequest
 from brushloop.calibrate.writing.learn import (
     FIGURES,
     MARGIN,
     FootprintArtefact,
-    PracticeRequest,
     fitted,
     practice,
     practice_strokes,

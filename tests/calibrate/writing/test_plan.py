@@ -11,9 +11,10 @@ import pytest
 from typer.testing import CliRunner
 
 from brushloop.__main__ import app
+from brushloop.calibrate.commands import PlanRequest
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.writing import PROTOCOL
-from brushloop.calibrate.writing.plan import PICTURE, PlanRequest, plan, pressed, read_wanted
+from brushloop.calibrate.writing.plan import PICTURE, plan, pressed, read_wanted
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.kinds import WriteConfig
 from brushloop.model.ccdbsm import Brush

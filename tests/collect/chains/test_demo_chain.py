@@ -8,9 +8,10 @@ import pytest
 from typer.testing import CliRunner
 
 import brushloop.__main__
+from brushloop.calibrate.commands import ValidateRequest
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.validate import command
-from brushloop.calibrate.validate.command import Request, ValidationOutput
+from brushloop.calibrate.validate.command import ValidationOutput
 from brushloop.collect.chains import demo
 from brushloop.collect.chains.demo import FULL, LEFT_OUT_CODE, QUICK, Demo, Size
 from brushloop.collect.chains.loop import LoopRequest
@@ -44,7 +45,7 @@ class Chain:
         Make().session(folder, closed=True, session_id=session_id, protocol=protocol, **known)
         return Collected(folder, self.left_out)
 
-    def validated(self, request: Request, _progress: object) -> ValidationOutput:
+    def validated(self, request: ValidateRequest, _progress: object) -> ValidationOutput:
         self.ran.append("validate")
         if self.validate_fails:
             raise CalibrationError(request.places[0], "cannot be validated")

@@ -6,12 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from brushloop.calibrate.report import Written
+from brushloop.calibrate.commands import (
+    CompareWrittenRequest,
+    FitFootprintRequest,
+    LearnRequest,
+    PlanRequest,
+    PracticeRequest,
+)
+from brushloop.calibrate.files import Written
 from brushloop.calibrate.writing import FILE as PLAN
 from brushloop.calibrate.writing import PROTOCOL, Figure, Plan, PlannedBy
-from brushloop.calibrate.writing.compare import CompareRequest
-from brushloop.calibrate.writing.learn import LearnRequest, PracticeRequest
-from brushloop.calibrate.writing.plan import PlanRequest
 from brushloop.collect.chains import writing
 from brushloop.collect.chains.writing import FOOTPRINT, Writing, WritingRequest
 from brushloop.collect.errors import ConfigError
@@ -47,11 +51,11 @@ class Commands:
         settled = self._rounds >= self._settled_after
         return self._planned("learn", request.out, (request.settled_repeats if settled else None) or request.repeats)
 
-    def fit(self, session: Path, _: object) -> Written:
+    def fit(self, request: FitFootprintRequest, _: object) -> Written:
         self.ran.append("fit")
-        return Written(session / FOOTPRINT / "0123456789abcdef.json", ())
+        return Written(request.session / FOOTPRINT / "0123456789abcdef.json", ())
 
-    def compare(self, request: CompareRequest, _: object) -> Written:
+    def compare(self, request: CompareWrittenRequest, _: object) -> Written:
         self.ran.append("compare")
         return Written(request.out / "written.html", ())
 

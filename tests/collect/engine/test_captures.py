@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 
-from brushloop.calibrate.calibrated import CalibrateRequest, calibrate_session
-from brushloop.calibrate.compare.place import KEYS, Alignment, Field, Tone, simulated
+from brushloop.calibrate.calibrated import calibrate_session
+from brushloop.calibrate.commands import CalibrateRequest
+from brushloop.calibrate.compare import KEYS, Alignment, Field, Tone, simulated
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.engine import recorder
 from brushloop.collect.engine.control import State

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.compare import MM_PER_PX
+from brushloop.calibrate import MM_PER_PX
 from brushloop.calibrate.stroke.preprocess import Prepared
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.outline import Outline

@@ -1,0 +1,358 @@
+"""The commands of analysis: one frozen request for each, and how a request becomes a command.
+
+The options of a command are the annotated fields of its request, and its help is the request's docstring. Fields that
+are not annotated are for callers in Python only. Nothing heavy is imported before a command runs.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import MISSING, dataclass, field, fields
+from importlib import import_module
+from inspect import Parameter, Signature
+from pathlib import Path
+from typing import Annotated, Any, Protocol, TypeVar, get_args, get_origin, get_type_hints, runtime_checkable
+
+from typer import Argument, Option
+from typer.core import TyperGroup
+
+from brushloop.calibrate import MM_PER_PX
+from brushloop.sessions.terminal import Progress, say, shown
+
+Request = TypeVar("Request")
+
+
+@runtime_checkable
+class Checked(Protocol):
+    """A result that may fall short of what was asked."""
+
+    def check(self) -> None:
+        """Raise an error with an exit code if it does, once everything is written and printed."""
+        ...
+
+
+class Printable(Protocol):
+    """The result of a command."""
+
+    def lines(self) -> Iterable[object]:
+        """What the command prints: lines and tables."""
+        ...
+
+
+Result = TypeVar("Result", bound=Printable)
+
+
+def show_work(work: Callable[[Request, Progress], Result], request: Request) -> Result:
+    """Do the work of a command, show its progress, and print and return its result."""
+    with shown() as progress:
+        result = work(request, progress)
+    say(*result.lines())
+    if isinstance(result, Checked):
+        result.check()
+    return result
+
+
+def command(request: type[Any], work: str) -> Callable[..., None]:
+    """A command that fills a request and gives it to `work`, a function of brushloop as `module:name`."""
+
+    def run(**options: Any) -> None:
+        module, _, name = work.partition(":")
+        values = {option: tuple(value) if option in repeated else value for option, value in options.items()}
+        show_work(getattr(import_module(f"brushloop.{module}"), name), request(**values))
+
+    hints = get_type_hints(request, include_extras=True)
+    parameters, repeated = list[Parameter](), set[str]()
+    for each in fields(request):
+        if get_origin(hints[each.name]) is Annotated:
+            kind, option = get_args(hints[each.name])
+            if get_origin(kind) is tuple and get_args(kind)[1:] == (...,):
+                repeated.add(each.name)
+                kind = list[get_args(kind)[0]]
+            annotation = Annotated[kind, option]
+            default = Parameter.empty if each.default is MISSING else each.default
+            parameters.append(Parameter(each.name, Parameter.KEYWORD_ONLY, default=default, annotation=annotation))
+    run.__doc__ = request.__doc__
+    run.__signature__ = Signature(parameters)
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return run
+
+
+class PathOrCommand(TyperGroup):
+    """A group that runs its first command unless its first argument is the name of another one.
+
+    `./diff` is then a path, `diff` the command of that name.
+    """
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put the first command's name before anything that is not a command's name."""
+        first, *others = self.commands
+        if not args or args[0] not in self.commands:
+            self.commands[first].epilog = f"Other commands, each with a --help of its own: {', '.join(others)}."
+            args = [first, *args]
+        return super().parse_args(ctx, args)
+
+
+def _command_line() -> str:
+    """The command that runs now, as a report names what made it."""
+    return " ".join(["brushloop", *sys.argv[1:]])
+
+
+Scale = Annotated[float, Option(min=0.1, max=1.0, help="Scale of the 128 x 128 field, mm per pixel.")]
+Patch = Annotated[float, Option("--cell-mm", min=30, max=500, help="Side of each patch of paper.")]
+Repeats = Annotated[int, Option(min=1, max=1000, help="How often each is written.")]
+Length = Annotated[float, Option(min=5, max=200, help="Length L of the brush.")]
+PlanFile = Annotated[Path, Option(help="The plan's folder, or its plan.json.")]
+Written = Annotated[Path, Argument(help="The session in which a plan was written.")]
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrateRequest:
+    """Fit scale and paper plane from the board in view; writes an immutable calibration/<hash>.json and its page."""
+
+    session: Annotated[Path, Argument(help="A session's folder or its .mcap file.")]
+    lens: Annotated[Path | None, Option(help="Lens file of `camera intrinsics`; the session's own by default.")] = None
+
+
+@dataclass(frozen=True, slots=True)
+class FitRequest:
+    """Fit the stroke model to a session's presses; writes an immutable brushfit/<hash>.json and its page.
+
+    For a session of drags it fits the lag of the bristles and writes dragfit/<hash>.json.
+    """
+
+    session: Annotated[Path, Argument(help="A session of presses, or of drags: its folder or its .mcap file.")]
+    mm_per_px: Annotated[
+        float | None, Option(min=0.1, max=1.0, help=f"Scale of the images; {MM_PER_PX:g}, for drags 0.4.")
+    ] = None
+    prior: Annotated[Path | None, Option(help="A dragfit of this brush, whose place and width are adapted.")] = None
+    strokes: Annotated[
+        int | None, Option(min=1, help="With --prior: only this many strokes, as different as possible.")
+    ] = None
+
+
+@dataclass(frozen=True, slots=True)
+class ValidateRequest:
+    """Compare every model with every captured stroke; run the same command again to resume."""
+
+    places: Annotated[
+        tuple[str, ...],
+        Argument(metavar="SESSION", help="Sessions: folders, .mcap files, or URLs with a checksum."),
+    ]
+    models: Annotated[tuple[str, ...], Option("--model", help="Only these models; all by default.")] = ()
+    generators: Annotated[tuple[Path, ...], Option("--generator", help="A trained generator.safetensors.")] = ()
+    mm_per_px: Scale = MM_PER_PX
+    fit: Annotated[Path | None, Option(help="Brush fit, the one in use by default; of drags, a dragfit.")] = None
+    out: Annotated[Path | None, Option(help="Folder of the report; <session>/validation by default.")] = None
+    gates: Annotated[
+        tuple[str, ...], Option("--gate", help="Like 'csim_avg>=0.90', quoted; exit code 5 if missed.")
+    ] = ()
+    ablations: Annotated[
+        bool, Option("--ablations", help="Other lambdas, and similarity by number of fitted presses.")
+    ] = False
+    curves: Annotated[tuple[str, ...], Option(help="NAME=FOLDER of a training, for figures 9 and 12.")] = ()
+    held_out: Annotated[bool, Option(help="Fit to other cells, each cell left out in turn.")] = True
+    scheduler: Annotated[str, Option(help="An existing Dask cluster, as tcp://host:8786.")] = ""
+    workers: Annotated[int | None, Option(min=1, max=1024, help="Threads; all cores by default.")] = None
+    command: str = field(default_factory=_command_line)
+    """Named by the report as what made it."""
+
+
+@dataclass(frozen=True, slots=True)
+class DiffRequest:
+    """Show what got better or worse between two reports, sessions or software versions, by a paired test."""
+
+    before: Annotated[Path, Argument(help="A report.json, or a session that was validated.")]
+    after: Annotated[Path, Argument(help="A report.json or session to compare it with.")]
+
+
+@dataclass(frozen=True, slots=True)
+class CapturesRequest:
+    """Write captured presses in the format that `brushloop train tune` reads."""
+
+    sessions: Annotated[tuple[str, ...], Argument(metavar="SESSION", help="Sessions of presses.")]
+    generator: Annotated[Path, Option(help="The generator.safetensors to tune.")]
+    out: Annotated[Path, Option(help="The file for `brushloop train tune`.")] = Path("captures.safetensors")
+
+
+@dataclass(frozen=True, slots=True)
+class ExportRequest:
+    """Export strokes, poses and forces: pictures as files, and tables as CSV or Parquet.
+
+    Ends with exit code 3 if strokes could not be cropped; they are named.
+    """
+
+    session: Annotated[Path, Argument(help="A closed session's folder, or an .mcap file.")]
+    out: Annotated[Path, Argument(help="The new folder.")]
+    kind: Annotated[str, Option("--format", help="How tables are written: csv or parquet.")] = "csv"
+    crops: Annotated[
+        bool, Option("--crops", help="Rectified crops at 20 px/mm with masks, instead of photographs.")
+    ] = False
+
+
+@dataclass(frozen=True, slots=True)
+class RecoverRequest:
+    """Recover depth and tilt of every captured press; writes a CSV and a protocol that presses them again."""
+
+    session: Annotated[Path, Argument(help="A session's folder or its .mcap file; imports count as sessions.")]
+    out: Annotated[Path, Option(help="CSV to write; protocol-replay.toml goes beside it.")] = Path("recovered.csv")
+    fit: Annotated[Path | None, Option(help="A brush fitted to captures; else CCD-BSM as published.")] = None
+    depth_range_mm: tuple[float, float] = (2.0, 30.0)
+    tilt_range_deg: tuple[float, float] = (0.0, 30.0)
+    presses: int | None = None
+    """Only this many, spread evenly over the session."""
+    repeats: int = 1
+    """How often the protocol presses each stroke."""
+    seed: int = 1
+    """Seed of the order in which it does."""
+
+
+@dataclass(frozen=True, slots=True)
+class CompareLoopRequest:
+    """Compare re-pressed strokes with their originals, and with the brush's own repeatability."""
+
+    original: Annotated[Path, Argument(help="The session whose strokes were pressed again.")]
+    again: Annotated[Path, Argument(help="The session of the replay protocol.")]
+    fit: Annotated[Path | None, Option(help="Brush fit that recovered depth and tilt; else CCD-BSM as published.")] = (
+        None
+    )
+    mm_per_px: Scale = MM_PER_PX
+    out: Annotated[Path, Option(help="Folder for loop.html, loop.csv, loop.json.")] = Path("loop")
+    command: str = field(default_factory=_command_line)
+    """Named by the report as what made it."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlanRequest:
+    """Plan characters: depth from the width of each stroke, heading along it, then refined until the image matches."""
+
+    what: Annotated[str, Argument(help="Characters (字 子 永 are shipped), or a .csv trajectory.")]
+    out: Annotated[Path, Option(help="Folder for protocol-write.toml and plan.png.")] = Path("write-plan")
+    data: Annotated[Path | None, Option(help="Folder of hanzi-writer files, such as 字.json.")] = None
+    radius_mm: Annotated[float, Option(min=0.5, max=50, help="Radius R of the brush.")] = 6.0
+    length_mm: Length = 48.0
+    footprint: Annotated[
+        Path | None, Option(help="Result of `write fit`: the plan leads the brush by the footprint of its own drags.")
+    ] = None
+    cell_mm: Patch = 70.0
+    depth_range_mm: Annotated[tuple[float, float], Option("--depth-range", help="Least and greatest depth, mm.")] = (
+        0.5,
+        20.0,
+    )
+    tilt_range_deg: Annotated[
+        tuple[float, float], Option("--tilt-range", help="Least and greatest tilt, deg; at most 30.")
+    ] = (0.0, 10.0)
+    speed_mm_s: Annotated[float, Option(min=1, max=100, help="Speed of the tip.")] = 15.0
+    wrist_deg_s: Annotated[float, Option(min=1, max=720, help="Greatest speed of the wrist.")] = 180.0
+    steps: Annotated[int, Option(min=0, max=1000, help="Steps of refinement; 0 keeps the first plan.")] = 60
+    repeats: Repeats = 1
+
+
+@dataclass(frozen=True, slots=True)
+class PracticeRequest:
+    """Plan a practice sheet: strokes from which `write fit` learns how this brush is dragged.
+
+    They go no deeper than 0.3 of the brush's length.
+    """
+
+    out: Annotated[Path, Option(help="Folder for protocol-write.toml.")] = Path("practice")
+    radius_mm: float = 6.0
+    length_mm: Length = 48.0
+    cell_mm: Patch = 70.0
+
+
+@dataclass(frozen=True, slots=True)
+class FitFootprintRequest:
+    """Fit the footprint of the dragged brush, for `write plan --footprint`."""
+
+    session: Annotated[Path, Argument(help="A calibrated session of a practice sheet, or of any figures.")]
+
+
+@dataclass(frozen=True, slots=True)
+class LearnRequest:
+    """Make the next plan from what the ink of this one showed, phase by phase."""
+
+    session: Written
+    plan: PlanFile
+    out: Annotated[Path, Option(help="Folder for the next plan.")]
+    repeats: Repeats = 1
+    settled_repeats: int | None = None
+    """The same, used once every character is settled."""
+
+
+@dataclass(frozen=True, slots=True)
+class CompareWrittenRequest:
+    """Compare written characters with the simulated image and with the reference, in both polarities (Table 3)."""
+
+    session: Written
+    plan: PlanFile
+    references: Annotated[
+        tuple[str, ...],
+        Option("--reference", help="字=picture.png: compare with this picture instead of the plan's font."),
+    ] = ()
+    out: Annotated[Path, Option(help="Folder for written.html, .csv, .json and figure-13.png.")] = Path("written")
+    command: str = field(default_factory=_command_line)
+    """Named by the report as what made it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BoardOptions:
+    """A board: a checkerboard or a ChArUco board."""
+
+    checkerboard: Annotated[str, Option(help="Inner corners of a checkerboard, as 9x6.")] = ""
+    charuco: Annotated[str, Option(help="Squares of a ChArUco board, as 26x20.")] = ""
+    square_mm: Annotated[float, Option(min=0.5, max=1000.0, help="Side of a square, measured on the print.")] = 12.0
+    marker_mm: Annotated[
+        float, Option(min=0.0, max=1000.0, help="Side of a marker; 0: three quarters of a square.")
+    ] = 0.0
+    dictionary: Annotated[str, Option(help="Markers of the ChArUco board.")] = "DICT_5X5_1000"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PrintRequest(BoardOptions):
+    """Write a printable board as a PDF at true scale."""
+
+    out: Annotated[Path, Argument(help="The new PDF.")]
+    page: Annotated[str, Option(help="a4, a3, a2 or letter.")] = "a4"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LensRequest(BoardOptions):
+    """Fit the lens, and say what each photograph contributes, which were dropped, and what else to photograph."""
+
+    photographs: Annotated[tuple[Path, ...], Argument(help="Photographs of one board, held in many ways.")]
+    out: Annotated[Path, Option(help="Folder for the lens file.")] = Path("camera")
+
+
+@dataclass(frozen=True, slots=True)
+class TrainRequest:
+    """Train the neural stroke generator on exact images of CCD-BSM (Algorithm 1), in one process on one device."""
+
+    out: Annotated[Path, Option(help="Folder of this training; the same command resumes it.")] = Path("generator")
+    target: Annotated[str, Option(help="press or anchored.")] = "press"
+    config: Annotated[Path | None, Option(help="A train.toml instead of a target's defaults.")] = None
+
+
+@dataclass(frozen=True, slots=True)
+class TuneRequest:
+    """Fine-tune a generator on captured strokes; some are held out to validate on."""
+
+    generator: Annotated[Path, Argument(help="The generator.safetensors to start from.")]
+    captures: Annotated[Path, Argument(help="Captured strokes, a safetensors file.")]
+    out: Annotated[Path, Option(help="Folder of this training.")] = Path("generator-tuned")
+    steps: Annotated[int, Option(min=1, help="Number of steps.")] = 300
+    learning_rate: Annotated[float, Option(min=0, max=1, help="Peak learning rate.")] = 3e-4
+    held_out: Annotated[float, Option(min=0, max=1, help="Share of conditions to validate on.")] = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class TwinRequest:
+    """Fit the simulator's brush, ink and camera noise to a session's presses; writes twin.toml.
+
+    `brushloop sim --brush twin.toml` is then a rig that presses like that brush. A run that was interrupted continues
+    when the same command is given again.
+    """
+
+    session: Annotated[Path, Argument(help="A session of presses: its folder or its .mcap file.")]
+    out: Annotated[Path | None, Option(help="File to write; twin.toml in the session's folder.")] = None
+    replace: Annotated[bool, Option("--replace", help="Replace the file if it exists.")] = False
