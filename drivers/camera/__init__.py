@@ -1,6 +1,324 @@
-"""Cameras behind OpenCV: a device, a stream, or a video file."""
+"""A camera that is read without pause, so that no frame is older than it looks, and decoded only when somebody looks.
 
-from brushloop.drivers.camera.opencv import OpenCvCamera
-from brushloop.drivers.camera.source import CameraTable, Locked, found_settings
+An unread capture hands back frames that are seconds old (its buffer cannot be shortened). A grabber thread reads all
+the time and keeps only the newest frame; `fresh` then waits for one that was exposed late enough, decodes it and looks
+at it. A live source that ends is opened again, with a notice. Frames that are black, saturated, torn, frozen or late
+are named and skipped.
+
+JPEGs that are pushed over HTTP are kept as they come. Every other source is read through OpenCV, which decodes each
+frame.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+from brushloop.drivers.camera.source import (
+    DEVICE,
+    CameraTable,
+    Capture,
+    JpegStream,
+    Locked,
+    Picture,
+    found_settings,
+    gray_levels,
+    is_repeated,
+    open_source,
+)
+from brushloop.drivers.devices import Frame, Identity, Stamp
+from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected
+from brushloop.drivers.host import Clock
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 __all__ = ["CameraTable", "Locked", "OpenCvCamera", "found_settings"]
+
+SAMPLE_STEP = 7
+"""Pixels are sampled at this step in both directions; a prime, so that no pattern hides between them."""
+BLACK_BELOW = 25
+LIGHT_SHARE = 0.005
+"""A frame in which fewer of the sampled pixels than this are lighter than `BLACK_BELOW` is black."""
+SATURATED_SHARE = 0.5
+TORN_BAND_SHARE = 0.02
+"""Share of the rows, at the bottom, that are uniform if the decoder ran out of data."""
+BURST_SHARE = 0.5
+"""Frames that arrive within less than this share of the usual period are a backlog."""
+PERIODS_KEPT = 31
+PERIODS_LEARNED = 3
+"""Number of gaps from which the usual period is taken."""
+STEADY_AFTER = 8
+"""Number of frames at the usual period after which it is no longer taken for misjudged."""
+
+
+class FrameFault(StrEnum):
+    """What is wrong with a frame."""
+
+    BLACK = "black"
+    SATURATED = "saturated"
+    TORN = "torn"
+    FROZEN = "frozen"
+    LATE = "late"
+
+
+LIKELY = {
+    FrameFault.BLACK: "The picture is black: lens covered or light off? ",
+    FrameFault.SATURATED: "The picture is white: too much light, or exposed too long? ",
+}
+"""The cause of a fault that a person can see at the camera."""
+
+
+def looked_at(picture: Picture) -> NDArray[np.uint8] | FrameFault:
+    """The picture as (h, w) uint8 gray levels, or the first fault that it shows by itself."""
+    import numpy as np
+
+    image = gray_levels(picture)
+    if image is None:
+        return FrameFault.TORN
+    sample = image[::SAMPLE_STEP, ::SAMPLE_STEP]
+    if np.count_nonzero(sample >= BLACK_BELOW) < LIGHT_SHARE * sample.size:
+        return FrameFault.BLACK
+    if float(np.mean(sample >= 255)) > SATURATED_SHARE:
+        return FrameFault.SATURATED
+    band = image[-max(8, round(TORN_BAND_SHARE * image.shape[0])) :]
+    if int(band.max()) - int(band.min()) <= 1 and int(band.min()) < 254:  # clipped white is light, not loss
+        return FrameFault.TORN
+    return image
+
+
+class Backlog:
+    """Tells frames that had waited in a buffer by the times at which the frames of one camera arrive."""
+
+    def __init__(self, latency_ns: int) -> None:
+        self._latency_ns = latency_ns
+        self._last_ns: int | None = None
+        self._periods: deque[int] = deque(maxlen=PERIODS_KEPT)
+        self._waiting = 0
+        """Number of coming frames that may have waited in a buffer."""
+        self._steady = 0
+        """Number of frames that came at the usual period."""
+        self._stalled = False
+        self._learning_again = False
+
+    def is_late(self, arrival_ns: int) -> bool:
+        """True for a frame that had waited in a buffer: its arrival says nothing about its exposure."""
+        gap_ns = arrival_ns - self._last_ns if self._last_ns is not None else 0
+        self._last_ns = arrival_ns
+        if len(self._periods) < PERIODS_LEARNED:
+            self._periods.append(gap_ns)
+            return self._learning_again
+        usual_ns = max(sorted(self._periods)[len(self._periods) // 2], 1)
+        stalled = gap_ns > max(3 * usual_ns, self._latency_ns)
+        again, self._stalled = stalled and self._stalled, stalled
+        if again and self._steady < STEADY_AFTER:
+            # A backlog comes in a burst, so two pauses in a row are the period; the gaps of a first burst were not.
+            self._periods.clear()
+            self._steady, self._learning_again = 0, True
+            return True
+        if stalled:
+            # No more frames can have waited than came in the gap, so a camera with a misjudged period recovers.
+            self._waiting = 1 + gap_ns // usual_ns
+        if self._waiting == 0:
+            self._periods.append(gap_ns)
+            self._steady, self._learning_again = self._steady + 1, False
+            return False
+        if stalled or gap_ns < BURST_SHARE * usual_ns:
+            self._waiting -= 1
+            if self._waiting == 0:
+                self._periods.clear()
+            return True
+        self._waiting = 0
+        return False
+
+
+# ---------------------------------------------------------------- the driver
+
+REOPEN_AFTER_S = 0.5
+JOIN_S = 5.0
+
+
+class OpenCvCamera:
+    """The camera of one source. Each connection has its own grabber, so no frame outlives its connection."""
+
+    def __init__(self, table: CameraTable, clock: Clock, on_notice: Callable[[str], None] = lambda _text: None) -> None:
+        self._table = table
+        self._clock = clock
+        self._on_notice = on_notice
+        self._grabber: _Grabber | None = None
+
+    async def connect(self) -> Identity:
+        """Start the grabber and wait for its first valid frame. Raises `ConnectionLost`, `DeviceError`, ..."""
+        grabber = self._grabber = _Grabber(self._table, self._clock, self._on_notice)
+        grabber.thread.start()
+        try:
+            frame = await self.fresh(Stamp(0))
+        except BaseException:
+            await self.close()
+            raise
+        height, width = frame.image.shape
+        locked = "".join(f", {name} {value:g}" for name, value in grabber.settings.items())
+        return Identity(DEVICE, f"{self._table.source} {width}x{height}{locked}", "", grabber.simulated)
+
+    async def fresh(self, after: Stamp) -> Frame:
+        """The first valid frame exposed after `after.host_ns`, never an older buffered one.
+
+        Raises `DeviceTimeout`, `ConnectionLost`.
+        """
+        if self._grabber is None:
+            raise NotConnected(DEVICE, "fresh", "not connected")
+        return await asyncio.to_thread(self._grabber.wait_for, after.host_ns)
+
+    async def close(self) -> None:
+        """End the grabber and wait for it; a read that hangs is left to the daemon thread."""
+        grabber = self._grabber
+        if grabber is not None:
+            grabber.end()
+            await asyncio.to_thread(grabber.thread.join, JOIN_S)
+            self._grabber = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Arrival:
+    """A frame that nobody has looked at yet."""
+
+    stamp: Stamp
+    exposed_after_ns: int
+    picture: Picture
+
+
+class _Grabber:
+    """The frames of one connection; its thread owns the source from open to release."""
+
+    def __init__(self, table: CameraTable, clock: Clock, on_notice: Callable[[str], None]) -> None:
+        self._table = table
+        self._clock = clock
+        self._on_notice = on_notice
+        self._condition = threading.Condition()
+        self._newest: _Arrival | None = None
+        self._skipped: Counter[FrameFault] = Counter()
+        self._lost_ns: int | None = None
+        """Since when a live source has been gone."""
+        self._ended: DeviceError | None = None
+        self._closing = threading.Event()
+        self.thread = threading.Thread(target=self._grab, name="camera grabber", daemon=True)
+        self.settings: dict[str, float] = {}
+        self.simulated = False
+
+    def end(self) -> None:
+        """Wake up whoever waits for a frame, and let the thread end after its current read."""
+        self._closing.set()
+        with self._condition:
+            self._condition.notify_all()
+
+    def wait_for(self, after_ns: int) -> Frame:
+        """The first valid frame exposed after `after_ns`; blocks. Raises `DeviceTimeout`, `ConnectionLost`."""
+        until_s, skipped_before = time.monotonic() + self._table.timeout_s, self._skipped.copy()
+        while True:
+            arrival = self._arrived(after_ns, until_s, skipped_before)
+            image = looked_at(arrival.picture)
+            if not isinstance(image, FrameFault):
+                return Frame(arrival.stamp, arrival.exposed_after_ns, image)
+            self._skip(image)
+            after_ns = arrival.exposed_after_ns + 1
+
+    def _arrived(self, after_ns: int, until_s: float, skipped_before: Counter[FrameFault]) -> _Arrival:
+        def late_enough() -> _Arrival | None:
+            newest = self._newest
+            return newest if newest is not None and newest.exposed_after_ns >= after_ns else None
+
+        def over() -> bool:
+            return self._ended is not None or self._closing.is_set()
+
+        with self._condition:
+            if not self._condition.wait_for(lambda: late_enough() or over(), until_s - time.monotonic()):
+                raise DeviceTimeout(
+                    DEVICE,
+                    "fresh",
+                    f"no valid new frame from {self._table.source} in {self._table.timeout_s:g} s"
+                    + self._why(self._skipped - skipped_before),
+                    remedy="Check cable, light and stream; the arm does not move meanwhile.",
+                )
+            arrival = late_enough()
+            if arrival is not None and not self._closing.is_set():
+                return arrival
+            raise self._ended or ConnectionLost(DEVICE, "fresh", "closed while waiting")
+
+    def _why(self, skipped: Counter[FrameFault]) -> str:
+        """Why no valid frame came, in brackets; empty if that is not known."""
+        if self._lost_ns is not None:
+            return " (the stream ended and is opened again)"
+        if not skipped:
+            return ""
+        causes = "".join(LIKELY.get(fault, "") for fault in skipped)
+        counts = ", ".join(f"{count} {fault}" for fault, count in sorted(skipped.items()))
+        return f" ({causes}frames skipped: {counts})"
+
+    def _skip(self, fault: FrameFault) -> None:
+        with self._condition:
+            self._skipped[fault] += 1
+
+    def _grab(self) -> None:
+        try:
+            while not self._closing.is_set():
+                opening_ns = self._clock.now_ns()
+                try:
+                    source = open_source(self._table)
+                except ConnectionLost:
+                    if self._lost_ns is None:
+                        raise
+                    self._closing.wait(REOPEN_AFTER_S)
+                    continue
+                try:
+                    if self._lost_ns is not None:
+                        self._on_notice(f"camera is back after {(self._clock.now_ns() - self._lost_ns) / 1e9:.1f} s")
+                        self._lost_ns = None
+                    self._read_all(source, opening_ns)
+                finally:
+                    source.release()
+                if self._closing.is_set():
+                    return
+                if not source.live:
+                    raise ConnectionLost(DEVICE, "read", f"{self._table.source} ended")
+                self._lost_ns = self._clock.now_ns()
+                self._on_notice("camera: the stream ended and is opened again")
+                self._closing.wait(REOPEN_AFTER_S)
+        except DeviceError as error:
+            self._fail(error)
+        except BaseException as error:
+            self._fail(DeviceError(DEVICE, "read", f"the grabber failed: {error!r}"))
+            raise
+
+    def _read_all(self, source: JpegStream | Capture, opening_ns: int) -> None:
+        """Read until the source ends; late and repeated frames are skipped."""
+        self.settings, self.simulated = source.settings, source.simulated
+        latency_ns = round(self._table.latency_ms * 1e6)
+        backlog, before = Backlog(latency_ns), None
+        while not self._closing.is_set():
+            picture = source.read()
+            arrival_ns = self._clock.now_ns()
+            if picture is None:
+                return
+            # The first frame was read to learn the format, and waited until the capture was open.
+            exposed_ns = (opening_ns if before is None else arrival_ns) - latency_ns
+            late, repeated = backlog.is_late(arrival_ns), is_repeated(picture, before)
+            before = picture
+            if source.live and (late or repeated):
+                self._skip(FrameFault.LATE if late else FrameFault.FROZEN)
+                continue
+            with self._condition:
+                seq = self._newest.stamp.seq + 1 if self._newest is not None else 0
+                self._newest = _Arrival(Stamp(arrival_ns, None, seq), exposed_ns, picture)
+                self._condition.notify_all()
+
+    def _fail(self, error: DeviceError) -> None:
+        with self._condition:
+            self._ended = error
+            self._condition.notify_all()

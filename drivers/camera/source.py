@@ -1,12 +1,13 @@
-"""The table of a camera, and the capture of OpenCV that it names, with its settings locked."""
+"""The table of a camera, where its frames come from, and its settings, which are locked."""
 
 from __future__ import annotations
 
 import http.client
+import io
 import os
 import time
-from typing import TYPE_CHECKING, Annotated, Literal, cast
-from urllib.parse import urlsplit
+import urllib.request
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias, cast
 
 from pydantic import BaseModel, Field
 
@@ -15,7 +16,6 @@ from brushloop.drivers.errors import ConnectionLost, DeviceError
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
-
 
 DEVICE = "camera"
 LOOPBACK_SERVER = "brushloop-loopback"
@@ -42,10 +42,6 @@ class Locked(BaseModel, frozen=True, extra="forbid"):
     focus: Setting | None = None
     """Turns autofocus off."""
 
-    def wanted(self) -> dict[str, float]:
-        """The settings to lock, by name."""
-        return {name: float(value) for name, value in self.model_dump(exclude_none=True).items()}
-
 
 class CameraTable(BaseModel, frozen=True, extra="forbid"):
     """The table `[camera]` of `rig.toml` but for the lens: a camera that looks at the sheet."""
@@ -65,34 +61,85 @@ class CameraTable(BaseModel, frozen=True, extra="forbid"):
     locked: Locked = Locked()
 
 
+# ---------------------------------------------------------------- where frames come from
+
+PROPERTIES = {
+    "width": "CAP_PROP_FRAME_WIDTH",
+    "height": "CAP_PROP_FRAME_HEIGHT",
+    "exposure": "CAP_PROP_EXPOSURE",
+    "gain": "CAP_PROP_GAIN",
+    "white_balance_k": "CAP_PROP_WB_TEMPERATURE",
+    "focus": "CAP_PROP_FOCUS",
+}
+"""OpenCV's name of each setting in `Locked`."""
+AUTOMATIC = {
+    "exposure": ("CAP_PROP_AUTO_EXPOSURE", 1.0),  # V4L2's menu: 1 is manual, 3 aperture priority
+    "white_balance_k": ("CAP_PROP_AUTO_WB", 0.0),
+    "focus": ("CAP_PROP_AUTOFOCUS", 0.0),
+}
+"""What sets them by itself, and the value that switches it off."""
 SETTING_TOLERANCE = 0.01
 """Relative difference up to which a setting that is read back counts as applied."""
+MAX_JPEG_BYTES = 64 * 1024 * 1024
+MAX_LINE_BYTES = 64 * 1024
 
 
-def says_loopback(url: str) -> bool:
-    """Whether an HTTP server identifies itself as the loopback camera; False where it does not answer."""
-    if not url.startswith("http://"):
-        return False
-    parts = urlsplit(url)
-    connection = http.client.HTTPConnection(parts.hostname or "", parts.port or 80, timeout=2.0)
-    try:
-        connection.request("HEAD", parts.path or "/")
-        return connection.getresponse().getheader("Server") == LOOPBACK_SERVER
-    except (OSError, http.client.HTTPException):
-        return False
-    finally:
-        connection.close()
+class JpegStream:
+    """JPEGs pushed over HTTP (`multipart/x-mixed-replace`), each handed over as it came.
+
+    `simulated` is True for the loopback camera, which identifies itself.
+    """
+
+    live = True
+
+    def __init__(self, table: CameraTable) -> None:
+        """Raises `OSError` where nothing answers, and ValueError for an answer of another kind."""
+        self.settings: dict[str, float] = {}
+        opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+        self._response = opener.open(table.source, timeout=table.timeout_s)
+        self.simulated = self._response.headers["Server"] == LOOPBACK_SERVER
+        try:
+            if self._response.headers.get_content_maintype() != "multipart":
+                raise ValueError("not a stream of pictures")
+            self._first: bytes | None = self._part()
+        except BaseException:
+            self.release()
+            raise
+
+    def read(self) -> bytes | None:
+        """The next JPEG; None where the stream has ended, or is silent for longer than its timeout."""
+        jpeg, self._first = self._first, None
+        try:
+            return jpeg or self._part()
+        except (OSError, ValueError, http.client.HTTPException):
+            return None
+
+    def release(self) -> None:
+        """Close the connection."""
+        self._response.close()
+
+    def _part(self) -> bytes:
+        """The body of the next part. Raises `OSError` at the end, and ValueError where its length is not given."""
+        while not (line := self._response.readline(MAX_LINE_BYTES)).startswith(b"--"):
+            if not line:
+                raise ConnectionError("the stream ended")
+        length = int(http.client.parse_headers(self._response)["Content-Length"] or 0)
+        if not 0 < length <= MAX_JPEG_BYTES:
+            raise ValueError(f"a part of {length} bytes")
+        jpeg = self._response.read(length)
+        if len(jpeg) < length:
+            raise ConnectionError("the stream ended")
+        return jpeg
 
 
-class CaptureSource:
+class Capture:
     """A `cv2.VideoCapture` on a device, a stream or a file, its settings locked and read back.
 
-    Owned by one thread from open to release. `live` is False for a file; `independent` is True where FFmpeg decodes a
-    JPEG for each frame; `settings` are those read back, by name; `simulated` is True for the loopback camera, which
-    identifies itself, and for recordings.
+    `live` is False for a file; `settings` are those read back, by name; `simulated` is True for recordings.
     """
 
     def __init__(self, table: CameraTable) -> None:
+        """Raises `ConnectionLost`, and `DeviceError` for a setting that the camera does not keep."""
         # Set before the first capture: otherwise the libraries would write their own lines across the screen.
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
         import cv2
@@ -101,6 +148,7 @@ class CaptureSource:
         source = table.source
         is_device = source.isdecimal()
         self.live = is_device or "://" in source
+        self.simulated = not self.live
         timeout_ms = round(table.timeout_s * 1e3)
         # One decoder thread: frame-parallel decoding would hold every frame back by one or more periods.
         stream = [
@@ -112,10 +160,7 @@ class CaptureSource:
         try:
             if not self._capture.isOpened():
                 raise ConnectionLost(DEVICE, "open", f"cannot open {source}")
-            fourcc = int(self._capture.get(cv2.CAP_PROP_FOURCC))
-            self.independent = not is_device and fourcc == cv2.VideoWriter.fourcc(*"MJPG")
-            self.settings = self._lock(table, is_device)
-            self.simulated = not self.live or says_loopback(source)
+            self.settings = self._lock(table.locked) if is_device else {}
         except BaseException:
             self.release()
             raise
@@ -129,55 +174,25 @@ class CaptureSource:
         """Close the capture."""
         self._capture.release()
 
-    def _lock(self, table: CameraTable, is_device: bool) -> dict[str, float]:
+    def _lock(self, locked: Locked) -> dict[str, float]:
         import cv2
 
-        wanted = table.locked.wanted()
-        if wanted and not is_device:
-            names = ", ".join(wanted)
-            raise DeviceError(
-                DEVICE,
-                "lock",
-                f"{names} cannot be set through {table.source}",
-                remedy="Lock them in the camera's own set-up and leave them out of the configuration.",
-            )
-        properties = _properties()
-        automatic = {
-            # V4L2's menu: 1 is manual, 3 aperture priority.
-            "exposure": (cv2.CAP_PROP_AUTO_EXPOSURE, 1.0),
-            "white_balance_k": (cv2.CAP_PROP_AUTO_WB, 0.0),
-            "focus": (cv2.CAP_PROP_AUTOFOCUS, 0.0),
-        }
-        settings: dict[str, float] = {}
+        wanted: dict[str, float] = locked.model_dump(exclude_none=True)
         for name, value in wanted.items():
-            if name in automatic:
-                self._capture.set(*automatic[name])
-            self._capture.set(properties[name], value)
+            if name in AUTOMATIC:
+                automatic, off = AUTOMATIC[name]
+                self._capture.set(getattr(cv2, automatic), off)
+            self._capture.set(getattr(cv2, PROPERTIES[name]), value)
+        settings = {name: float(self._capture.get(getattr(cv2, PROPERTIES[name]))) for name in wanted}
         for name, value in wanted.items():
-            got = float(self._capture.get(properties[name]))
-            if abs(got - value) > SETTING_TOLERANCE * max(abs(value), 1.0):
+            if abs(settings[name] - value) > SETTING_TOLERANCE * max(abs(value), 1.0):
                 raise DeviceError(
                     DEVICE,
                     "lock",
-                    f"{name} = {value:g} was asked for, but {got:g} is read back",
+                    f"{name} = {value:g} was asked for, but {settings[name]:g} is read back",
                     remedy="Choose a value that the camera has; `v4l2-ctl --list-ctrls` lists them.",
                 )
-            settings[name] = got
         return settings
-
-
-def _properties() -> dict[str, int]:
-    """OpenCV's number of each setting in `Locked`."""
-    import cv2
-
-    return {
-        "width": cv2.CAP_PROP_FRAME_WIDTH,
-        "height": cv2.CAP_PROP_FRAME_HEIGHT,
-        "exposure": cv2.CAP_PROP_EXPOSURE,
-        "gain": cv2.CAP_PROP_GAIN,
-        "white_balance_k": cv2.CAP_PROP_WB_TEMPERATURE,
-        "focus": cv2.CAP_PROP_FOCUS,
-    }
 
 
 def found_settings(device: int, settle_s: float) -> dict[str, float]:
@@ -192,7 +207,69 @@ def found_settings(device: int, settle_s: float) -> dict[str, float]:
         until_s = time.monotonic() + settle_s
         while time.monotonic() < until_s and capture.read()[0]:
             pass
-        settings = {name: float(capture.get(number)) for name, number in _properties().items()}
+        settings = {name: float(capture.get(getattr(cv2, number))) for name, number in PROPERTIES.items()}
     finally:
         capture.release()
     return {name: value for name, value in settings.items() if value > 0.0 or (name == "exposure" and value < -0.5)}
+
+
+def open_source(table: CameraTable) -> JpegStream | Capture:
+    """The source that the table names; one thread owns it from here to its release.
+
+    Raises `ConnectionLost` where it does not open, and `DeviceError` for a setting that it does not keep.
+    """
+    locked = table.locked.model_dump(exclude_none=True)
+    if locked and not table.source.isdecimal():
+        raise DeviceError(
+            DEVICE,
+            "lock",
+            f"{', '.join(locked)} cannot be set through {table.source}",
+            remedy="Lock them in the camera's own set-up and leave them out of the configuration.",
+        )
+    if table.source.startswith(("http://", "https://")):
+        try:
+            return JpegStream(table)
+        except OSError as error:
+            raise ConnectionLost(DEVICE, "open", f"cannot open {table.source}: {error}") from None
+        except (ValueError, http.client.HTTPException):
+            pass  # not pushed JPEGs, or a password in the address: FFmpeg knows more kinds of streams
+    return Capture(table)
+
+
+# ---------------------------------------------------------------- pictures
+
+Picture: TypeAlias = "bytes | NDArray[np.uint8]"
+"""A JPEG, or an (h, w) or (h, w, 3) BGR image."""
+SCAN = b"\xff\xda"
+"""Begins the picture in a JPEG, after the headers."""
+
+
+def gray_levels(picture: Picture) -> NDArray[np.uint8] | None:
+    """The picture as (h, w) uint8; None for a JPEG that is cut off or broken.
+
+    The colour of ink on paper is not worth three times the disk space.
+    """
+    import cv2
+    import numpy as np
+    from PIL import Image  # unlike OpenCV's, its decoder does not write on the terminal
+
+    if not isinstance(picture, bytes):
+        return picture if picture.ndim == 2 else cast("NDArray[np.uint8]", cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
+    try:
+        with Image.open(io.BytesIO(picture), formats=("JPEG",)) as image:
+            image.draft("L", image.size)
+            return np.asarray(image.convert("L"))
+    except (OSError, SyntaxError, ValueError):
+        return None
+
+
+def is_repeated(picture: Picture, before: Picture | None) -> bool:
+    """Whether a picture is that of the frame before to the bit. Pictures of a camera that works have noise.
+
+    The headers of a JPEG, which may contain the time, are not compared.
+    """
+    import numpy as np
+
+    if isinstance(picture, bytes) and isinstance(before, bytes):
+        return picture.partition(SCAN)[2] == before.partition(SCAN)[2]
+    return before is not None and np.array_equal(np.asarray(picture), np.asarray(before))
