@@ -6,6 +6,7 @@ import http.client
 import io
 import os
 import time
+import urllib.error
 import urllib.request
 from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias, cast
 
@@ -96,7 +97,11 @@ class JpegStream:
         """Raises `OSError` where nothing answers, and ValueError for an answer of another kind."""
         self.settings: dict[str, float] = {}
         opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-        self._response = opener.open(table.source, timeout=table.timeout_s)
+        try:
+            self._response = opener.open(table.source, timeout=table.timeout_s)
+        except urllib.error.HTTPError as refusal:
+            refusal.close()
+            raise
         self.simulated = self._response.headers["Server"] == LOOPBACK_SERVER
         try:
             if self._response.headers.get_content_maintype() != "multipart":
