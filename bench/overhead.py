@@ -150,9 +150,9 @@ def _collect(folder: Path) -> None:
 @contextlib.contextmanager
 def _watching(spans: Spans) -> Iterator[None]:
     """Note when each part begins and ends."""
+    from brushloop.collect.engine import capture as capturing
     from brushloop.collect.engine.recorder import Recorder
     from brushloop.collect.engine.run import Run
-    from brushloop.collect.engine.steps import capture as capturing
     from brushloop.drivers.arcs.robot import AuboArcs
     from brushloop.drivers.camera import OpenCvCamera
     from brushloop.drivers.ink.station import InkStation

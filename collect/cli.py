@@ -66,9 +66,6 @@ def collect(
     from brushloop.collect.engine.live import LiveView
 
     on_screen = _on_screen(tui)
-    if dry_run is not None:
-        start.dry_run(config, protocol, dry_run, armed=arm, on_screen=on_screen)
-        return
     request = start.CollectRequest(
         config,
         protocol,
@@ -79,7 +76,11 @@ def collect(
         on_screen=on_screen,
         guided=set_up and on_screen,
         live=LiveView(live_port) if live else None,
+        dry_run_mm=dry_run,
     )
+    if dry_run is not None:
+        start.dry_run(request)
+        return
     left_out = start.collect(request).left_out
     if left_out:
         say(f"finished; {left_out} strokes failed every time and were left out", err=True)
@@ -92,10 +93,10 @@ def browse() -> None:
     from brushloop.collect.tui.pictures import Pictures
     from brushloop.collect.tui.start_screen import SessionBrowser
 
-    def engine_for(opening: Opening, *, watched: bool, guided: bool, preview: bool) -> Engine:
+    def engine_for(opening: Opening) -> Engine:
         from brushloop.collect import start
 
-        return start.engine_for(opening, watched=watched, guided=guided, preview=preview)
+        return start.engine_for(opening)
 
     run_app(OperatorApp(browser=SessionBrowser(engine_for), pictures=Pictures(pixels=True)))
 

@@ -1,14 +1,16 @@
-"""Questions that a run asks its operator, and requests that the operator makes by key."""
+"""Questions that a run asks its operator, and what the operator asks of a run by key or signal."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import signal
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from brushloop.collect.errors import NeedsOperator
@@ -177,3 +179,22 @@ class OperatorRequests:
                 return False
             self._open.remove(request)
             return True
+
+
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+@contextlib.contextmanager
+def stop_signals(handle: Callable[[int], object]) -> Generator[None]:
+    """Within the block, call `handle` with the number of each of `STOP_SIGNALS`, in a separate thread."""
+
+    def on_signal(number: int, _frame: FrameType | None) -> None:
+        # Not from the handler itself: it may have interrupted code that holds the engine's lock.
+        threading.Thread(target=handle, args=(number,), name="stop key").start()
+
+    before = {number: signal.signal(number, on_signal) for number in STOP_SIGNALS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

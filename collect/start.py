@@ -1,45 +1,26 @@
-"""One run of `brushloop collect`: read, check and open the session, then hand over to a screen or a progress bar."""
+"""One run of `brushloop collect`: read, check and open the session, then run behind a screen or a progress bar."""
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
+import time
 from collections.abc import Callable
-from contextlib import closing, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from brushloop.collect.engine.engine import DryRunEngine, Engine
-from brushloop.collect.engine.live import LiveView
-from brushloop.collect.engine.open_or_resume import Opening, find_resumable, open_store
-from brushloop.collect.headless import run_headless
+from brushloop.collect.engine.engine import Engine
+from brushloop.collect.engine.open_or_resume import CollectRequest, Opening, find_resumable
+from brushloop.collect.engine.snapshot import REFRESH_S, eta_text, no_pose_text
+from brushloop.collect.operator import stop_signals
 from brushloop.collect.planning.limit_check import check_protocol
 from brushloop.drivers.host import HostClock
 from brushloop.sessions.disk import check_writable
-from brushloop.sessions.terminal import say
+from brushloop.sessions.terminal import plain_console, say
 
 PRESSES = frozenset({"grid", "few-strokes", "list"})
 """Protocols whose recording can be calibrated and validated by itself; after others, no single next command exists."""
-
-
-@dataclass(frozen=True, slots=True)
-class CollectRequest:
-    """What is collected, and how."""
-
-    config: Path
-    protocol: Path
-    out: Path = Path("sessions")
-    """Folder that holds sessions."""
-    new: bool = False
-    """Start a new session although one is open."""
-    sheet: int | None = None
-    """Number of the sheet that the operator has put in."""
-    armed: bool = False
-    """Whether real hardware may move."""
-    on_screen: bool = False
-    guided: bool = False
-    """Whether the operator accepts on the screen what each set-up step measured."""
-    live: LiveView | None = None
 
 
 class Collected(NamedTuple):
@@ -49,56 +30,26 @@ class Collected(NamedTuple):
     left_out: int
 
 
-def engine_for(
-    opening: Opening,
-    *,
-    watched: bool,
-    live: LiveView | None = None,
-    guided: bool = False,
-    preview: bool = False,
-    make: type[Engine] = Engine,
-) -> Engine:
+def engine_for(opening: Opening) -> Engine:
     """Make an engine that resumes the open session or begins a new one; connects nothing yet. Raises `ConfigError`."""
-    resume = find_resumable(opening)
-    if resume is not None:
-        opening = opening.as_begun(resume)
-    check_protocol(opening.rig_path, opening.protocol_path, opening.rig, opening.protocol)
-    check_writable(resume or opening.root)
-    clock = HostClock()
-    return make(
-        opening.rig,
-        opening.protocol,
-        lambda rig: open_store(opening, resume, rig, clock),
-        clock,
-        resumes=resume,
-        watched=watched,
-        armed=opening.armed,
-        live=live,
-        guided=guided,
-        preview=preview,
-    )
+    request, resume = opening.request, find_resumable(opening)
+    check_protocol(request.config, request.protocol, opening.rig, opening.protocol)
+    check_writable(resume or request.out)
+    return Engine(opening, resume, HostClock())
 
 
 def collect(request: CollectRequest) -> Collected:
     """Run to the end and print where the recording lies and what comes next. Raises the error that ended the run."""
-    opening = Opening.load(
-        request.out, request.config, request.protocol, new=request.new, sheet=request.sheet, armed=request.armed
-    )
+    opening = Opening.load(request)
 
-    def make(resume: str | None = None) -> Engine:
-        return engine_for(
-            opening if resume is None else replace(opening, new=False, resume=resume),
-            watched=request.on_screen,
-            live=request.live,
-            guided=request.guided,
-            preview=request.on_screen,
-        )
+    def resumed(session_id: str) -> Engine:
+        return engine_for(replace(opening, request=replace(request, new=False, resume=session_id)))
 
-    engine = make()
-    with nullcontext() if request.live is None else closing(request.live):
+    engine = engine_for(opening)
+    with contextlib.nullcontext() if request.live is None else contextlib.closing(request.live):
         if request.live is not None:
             request.live.start()
-        now = _run(engine, make, on_screen=request.on_screen).snapshot()
+        now = _run(engine, resumed, on_screen=request.on_screen).snapshot()
     folder = Path(now.folder)
     say(*ending(folder, opening.protocol.kind))
     return Collected(folder, now.given_up)
@@ -115,12 +66,11 @@ def collect_session(
     return collect(CollectRequest(Path(config), Path(protocol), Path(out), sheet=sheet, armed=armed)).folder
 
 
-def dry_run(config: Path, protocol: Path, depth_mm: float, *, armed: bool, on_screen: bool) -> None:
+def dry_run(request: CollectRequest) -> None:
     """Move through the protocol in the air; the recording is thrown away, so that no cell counts as used."""
     with tempfile.TemporaryDirectory(prefix="brushloop-dry-") as folder:
-        opening = Opening.load(Path(folder), config, protocol, armed=armed, dry_run_mm=depth_mm)
-        engine = engine_for(opening, watched=on_screen, preview=on_screen, make=DryRunEngine)
-        _run(engine, None, on_screen=on_screen)
+        engine = engine_for(Opening.load(replace(request, out=Path(folder))))
+        _run(engine, None, on_screen=request.on_screen)
     say("dry run done; nothing was kept")
 
 
@@ -145,3 +95,53 @@ def _run(engine: Engine, again: Callable[[str], Engine] | None, *, on_screen: bo
     app = OperatorApp(engine, again=again, pictures=Pictures(pixels=True))
     run_app(app)
     return app.engine or engine
+
+
+def run_headless(engine: Engine) -> None:
+    """Run to the end; raise the error that ended the run. If the output goes away, the step ends and the arm parks."""
+    with stop_signals(engine.obey):
+        engine.start()
+        try:
+            # The terminal or pipe may be gone; rich turns a broken pipe into a SystemExit.
+            with contextlib.suppress(OSError, SystemExit):
+                show_progress(engine)
+        finally:
+            if not engine.finished:
+                engine.park()
+            engine.join()
+
+
+def show_progress(engine: Engine) -> None:
+    """Print the log and a progress bar until the run is over."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    shown, silent = 0, False
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[eta]}"),
+    )
+    with Progress(*columns, console=plain_console(stderr=True)) as progress:
+        task = progress.add_task("connect", total=None, eta="")
+        while True:
+            over = engine.finished
+            now = engine.snapshot()
+            for line in now.messages[max(shown - now.messages_before, 0) :]:
+                progress.console.print(line, highlight=False)
+            shown = now.messages_before + len(now.messages)
+            if (now.no_pose_s is not None) is not silent:
+                silent = now.no_pose_s is not None
+                line = f"warning: {no_pose_text(now)}" if silent else "the arm sends its pose again"
+                progress.console.print(line, highlight=False)
+            progress.update(
+                task,
+                description=", ".join(part for part in (f"{now.state}: {now.step}", no_pose_text(now)) if part),
+                completed=now.strokes_done,
+                total=now.strokes_planned,
+                eta=eta_text(now),
+            )
+            if over:
+                return
+            time.sleep(REFRESH_S)

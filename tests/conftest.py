@@ -41,7 +41,7 @@ TOLERATED = ("asyncio_", "pytest_timeout", "ThreadPoolExecutor", "tqdm", "fsspec
 FIRST = (
     "tests/test_demo.py",
     "tests/collect/tui/test_session.py",
-    "tests/collect/quality/test_recognised.py",
+    "tests/collect/photograph/test_recognised.py",
     "tests/calibrate/fit",
     "tests/model/test_train.py",
     "tests/collect/teach/test_first_day.py",

@@ -20,7 +20,7 @@ import pytest
 
 from brushloop.collect import start
 from brushloop.collect.engine.engine import Engine
-from brushloop.collect.engine.open_or_resume import Opening
+from brushloop.collect.engine.open_or_resume import CollectRequest, Opening
 from brushloop.collect.rig import devices
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import Rig, connected
@@ -111,12 +111,12 @@ class Lab:
         motion = self.rig.world.motion
         return motion.exec_id(self.rig.world.clock.now_s()) == -1 and motion.size == 0
 
-    def engine(self, *, new: bool = False, sheet: int | None = None, armed: bool = False, **options: Any) -> Engine:
-        """As `brushloop collect` makes it; `options` are those of `brushloop.collect.start.engine_for`."""
-        opening = Opening.load(
-            self.sessions, self.folder / "rig.toml", self.folder / "protocol.toml", new=new, sheet=sheet, armed=armed
-        )
-        self.engines.append(start.engine_for(opening, make=self.make, **{"watched": False, **options}))
+    def engine(self, **options: Any) -> Engine:
+        """As `brushloop collect` makes it; `options` are those of a `CollectRequest`."""
+        request = CollectRequest(self.folder / "rig.toml", self.folder / "protocol.toml", self.sessions, **options)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(start, "Engine", self.make)
+            self.engines.append(start.engine_for(Opening.load(request)))
         return self.engines[-1]
 
     def run(self, **options: Any) -> Engine:
@@ -346,7 +346,7 @@ def wireless_lab(folder: Path, config: SimConfig = COARSE) -> Iterator[Lab]:
         patch.setattr("brushloop.collect.engine.engine.connected", rig.connected)
         patch.setattr(Engine, "new_event_loop", staticmethod(lambda: MemoryLoop(rig.time)))
         patch.setattr(start, "HostClock", lambda: rig.time)
-        patch.setattr("brushloop.collect.headless.REFRESH_S", 0.01)
+        patch.setattr(start, "REFRESH_S", 0.01)
         lab = Lab(rig, folder, make=SteppedEngine)
         yield lab
         for engine in lab.engines:

@@ -7,14 +7,15 @@ import inspect
 import threading
 import time
 from collections.abc import Callable, Coroutine
+from pathlib import Path
 from typing import Any, TypeVar
 
 import pytest
 
 from brushloop.collect.engine.engine import Engine
+from brushloop.collect.engine.open_or_resume import Opening
 from brushloop.collect.engine.snapshot import Snapshot
 from brushloop.collect.operator import Prompt
-from brushloop.collect.rig.config import RigConfig
 from tests import waiting
 from tests.simulated_time import MemoryLoop, SimulatedTime
 
@@ -78,8 +79,8 @@ class Turns:
 class SteppedEngine(Engine):
     """An engine that stands still unless its test waits for it."""
 
-    def __init__(self, rig: RigConfig, protocol: Any, open_store: Any, clock: Any, **options: Any) -> None:
-        super().__init__(rig, protocol, open_store, clock, **options)
+    def __init__(self, opening: Opening, resumes: Path | None, clock: Any) -> None:
+        super().__init__(opening, resumes, clock)
         self.turns = Turns(clock)
         self._loop: MemoryLoop | None = None
 

@@ -19,10 +19,10 @@ import numpy as np
 import pytest
 
 from brushloop.collect.engine.engine import Engine
-from brushloop.collect.engine.open_or_resume import Opening, open_store
+from brushloop.collect.engine.open_or_resume import CollectRequest, Opening
+from brushloop.collect.photograph.measure import Mark
 from brushloop.collect.planning.walk import walk
 from brushloop.collect.protocols.steps import PressStep
-from brushloop.collect.quality.measure import Mark
 from brushloop.collect.rig.config import InkConfig, RigConfig
 from brushloop.collect.rig.config_touch import QualityConfig
 from brushloop.drivers.camera import CameraTable, OpenCvCamera
@@ -145,11 +145,11 @@ def test_an_ink_device_is_a_table_and_a_driver_and_the_engine_inks_a_brush_with_
         rig_path, protocol_path = tmp_path / "rig.toml", tmp_path / "protocol.toml"
         rig_path.write_text(lab.toml().replace("latency_ms = 250.0", "latency_ms = 100.0"), encoding="utf-8")
         protocol_path.write_text('kind = "grid"\ndepths_mm = [15.0]\ntilts_deg = [0.0]\nrepeats = 1\n', "utf-8")
-        opening, clock = Opening.load(tmp_path / "sessions", rig_path, protocol_path), HostClock()
+        opening, clock = Opening.load(CollectRequest(rig_path, protocol_path, tmp_path / "sessions")), HostClock()
         fields = tomllib.loads(lab.toml())
         fields["ink"]["device"] = {"kind": "syringe", "port": f"127.0.0.1:{port}", "dose_ml": 2.0}
         rig = RigWithSyringe(**fields)
-        engine = Engine(rig, opening.protocol, lambda r: open_store(opening, None, r, clock), clock)
+        engine = Engine(replace(opening, rig=rig), None, clock)
         engine.start()
         wait_for_end(engine)
     assert engine.snapshot().strokes_done == 1, "its ink was judged"

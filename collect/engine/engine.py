@@ -11,13 +11,14 @@ import asyncio
 import concurrent.futures
 import contextlib
 import math
+import signal
 import threading
 from collections.abc import Callable, Generator
 from pathlib import Path
-from typing import ClassVar
 
 from brushloop.collect.engine.control import FINAL, RunControl, State
-from brushloop.collect.engine.live import LiveView, Telemetry, each_frame
+from brushloop.collect.engine.live import Telemetry, each_frame
+from brushloop.collect.engine.open_or_resume import Opening, open_store
 from brushloop.collect.engine.policy import board_first, resume_question
 from brushloop.collect.engine.recorder import uninterrupted
 from brushloop.collect.engine.run import Run
@@ -33,8 +34,6 @@ from brushloop.collect.errors import (
 from brushloop.collect.motion import Procedures
 from brushloop.collect.operator import Asker, Choice, OperatorRequest, OperatorRequests, Prompt
 from brushloop.collect.planning.walk import sheet_of, steps_on
-from brushloop.collect.protocols.config import ProtocolConfig
-from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import Rig, connected
 from brushloop.drivers.errors import DeviceError, NotConnected, Stale
 from brushloop.drivers.host import Clock
@@ -46,10 +45,7 @@ PARKED_MM = 2.0
 """Distance from the park position, in mm, within which the arm counts as parked."""
 SILENT_S = 1.0
 """Time without a pose after which the snapshot says so: the arm or the connection to it has failed."""
-UNCHECKED = (
-    "no self-check: it is switched off in rig.toml, or this session began without it. Nothing checks whether arm, "
-    "camera and configuration agree"
-)
+UNCHECKED = "no self-check: it is switched off in rig.toml. Nothing checks whether arm, camera and configuration agree"
 
 BEGUN_DRY = "dry run: nothing is pressed, dipped or kept"
 OVER_DRY = "dry run: every move was made"
@@ -57,46 +53,23 @@ OVER_DRY = "dry run: every move was made"
 ARM = Choice("a", "arm it: I am looking at the robot cell, my hand is at the emergency stop")
 LEAVE = Choice("x", "do not arm it")
 
-OpenStore = Callable[[Rig], SessionStore]
-"""Makes or resumes the session, once the devices have been identified and before anything is powered."""
-
 
 class Engine:
     """Runs one session. Call `start`, look at `snapshot` until `finished`, then call `join`."""
 
-    presses: ClassVar[bool] = True
-    """False for a dry run. A real run warns when it has no self-check, and its log names the session's folder."""
     new_event_loop: Callable[[], asyncio.AbstractEventLoop] = staticmethod(asyncio.new_event_loop)
     """Makes the event loop of the run."""
 
-    def __init__(
-        self,
-        rig: RigConfig,
-        protocol: ProtocolConfig,
-        open_store: OpenStore,
-        clock: Clock,
-        *,
-        resumes: Path | None = None,
-        watched: bool = False,
-        armed: bool = False,
-        live: LiveView | None = None,
-        guided: bool = False,
-        preview: bool = False,
-    ) -> None:
-        """`resumes`: folder of the session that `open_store` opens; None for a new one. `watched`: a screen can answer
-        questions. `armed`: the operator allows real hardware to move. `live` was already started. `guided`: a person
-        accepts each set-up step. `preview`: snapshots hold a camera picture."""
-        self._rig_config = rig
-        self._protocol_config = protocol
-        self._open_store = open_store
+    def __init__(self, opening: Opening, resumes: Path | None, clock: Clock) -> None:
+        """`resumes`: folder of the session that is resumed; None for a new one. The live view was already started."""
+        self._opening = opening
+        self._request = opening.request
+        self._rig_config = opening.rig
         self._resumes = resumes
-        self._progress = Progress(protocol, clock, sheet_of(rig, protocol).layout, resumes)
+        layout = sheet_of(opening.rig, opening.protocol).layout
+        self._progress = Progress(opening.protocol, clock, layout, resumes)
         self._clock = clock
-        self._asker = Asker(watched=watched, waiting=self._waiting)
-        self._armed = armed
-        self._live = live
-        self._guided = guided
-        self._preview = preview
+        self._asker = Asker(watched=self._request.on_screen, waiting=self._waiting)
         self._telemetry = Telemetry()
         self._requests = OperatorRequests()
         self._control = RunControl(self._progress.doing)
@@ -175,6 +148,11 @@ class Engine:
         """Answer question `number`; False if it is closed. From any thread."""
         return self._asker.answer(number, key)
 
+    def obey(self, signal_number: int) -> None:
+        """On SIGHUP finish the step, lift and park: nobody is there to lift a brush that was stopped on the paper. On
+        any other signal stop at once, also while the arm is being parked."""
+        (self.park if signal_number == signal.SIGHUP else self.stop)()
+
     def pause(self) -> None:
         """Pause before the next step."""
         self._control.pause()
@@ -250,22 +228,23 @@ class Engine:
         async with connected(self._rig_config, self._clock, self._progress.log) as rig:
             self._rig = rig
             await self._permitted(rig)
-            store = self._store = self._open_store(rig)
+            store = self._store = open_store(self._opening, self._resumes, rig, self._clock)
+            dry, live = self._request.dry_run_mm is not None, self._request.live
             try:
                 strokes = self._progress.opened(store)
                 begun = f"resumed with {strokes} strokes" if strokes else "session"
-                self._progress.log(f"{begun}: {store.folder}" if self.presses else BEGUN_DRY)
-                if (self._armed or not rig.simulated) and self.presses and not self._rig_config.self_check.enabled:
+                self._progress.log(BEGUN_DRY if dry else f"{begun}: {store.folder}")
+                if (self._request.armed or not rig.simulated) and not dry and not self._rig_config.self_check.enabled:
                     self._progress.log(UNCHECKED, warning=True)
-                if self._live is not None:
-                    self._progress.log(f"live view: {self._live.url}")
-                shows = ([self._telemetry.frame] if self._preview else []) + ([self._live.frame] if self._live else [])
+                if live is not None:
+                    self._progress.log(f"live view: {live.url}")
+                shows = ([self._telemetry.frame] if self._request.on_screen else []) + ([live.frame] if live else [])
                 async with each_frame(rig.camera, shows):
                     await self._protocol(rig, store)
                 self._control.begin_closing()
                 self._progress.doing("merge and verify")
                 final = await uninterrupted(store.close)
-                self._progress.log(f"closed: {final}" if self.presses else OVER_DRY)
+                self._progress.log(OVER_DRY if dry else f"closed: {final}")
                 self._progress.over()
             finally:
                 with contextlib.suppress(DeviceError):
@@ -283,7 +262,7 @@ class Engine:
         if self._resumes is not None and self._asker.attended:
             ended = replay(self._resumes / JOURNAL_NAME).ended
             prompt = resume_question(self._resumes.name, ended, f"{hardware}. " if real else "")
-        elif self._armed or not real:
+        elif self._request.armed or not real:
             return
         elif self._asker.attended:
             prompt = Prompt(f"{hardware}. May it move?", (ARM, LEAVE), LEAVE.key)
@@ -306,7 +285,7 @@ class Engine:
 
     async def _protocol(self, rig: Rig, store: SessionStore) -> None:
         self._procedures = Procedures(rig)
-        protocol = self._protocol_config
+        protocol = self._opening.protocol
         run = Run(
             rig=rig,
             store=store,
@@ -318,11 +297,11 @@ class Engine:
             requests=self._requests,
             control=self._control,
             telemetry=self._telemetry,
-            live=self._live,
-            guided=self._guided,
+            live=self._request.live,
+            guided=self._request.guided,
         )
         steps = steps_on(self._rig_config, protocol)
-        await run.carry_out(board_first(steps) if self._guided else steps)
+        await run.carry_out(board_first(steps) if self._request.guided else steps)
 
     def _end(self, state: State, error: Exception) -> None:
         """End with `error`, whose message says so if the arm may move or the brush may be down. The session keeps it
@@ -337,9 +316,3 @@ class Engine:
         if self._store is not None:
             with contextlib.suppress(SessionError):
                 self._store.ended(describe(error))
-
-
-class DryRunEngine(Engine):
-    """Engine that makes each move of a run with a lifted rig (`Opening.load`), in a folder that will be deleted."""
-
-    presses = False

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from brushloop.collect.engine.snapshot import Picture
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.photograph.frames import gray
-from brushloop.collect.quality.measure import blur_px, busiest_tile
+from brushloop.collect.photograph.measure import blur_px, busiest_tile
 from brushloop.drivers.devices import Camera, ForceSample, Frame, Stamp
 from brushloop.drivers.errors import DeviceError
 from brushloop.sessions.mcap_writer import Outgoing, channel_of, encoded

@@ -9,11 +9,12 @@ from __future__ import annotations
 import datetime as dt
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast
 
+from brushloop.collect.engine.live import LiveView
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
 from brushloop.collect.rig.config import TRAVEL_CLEARANCE_MM, InkConfig, RigConfig, load_rig, overrides
@@ -44,67 +45,56 @@ CLEAR_MM = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Opening:
-    """What the command line says about the session, and its configuration, which is read only once."""
+class CollectRequest:
+    """What is collected, and how: the options of a command, or what a screen asks for."""
 
-    root: Path
-    rig_path: Path
-    protocol_path: Path
-    rig: RigConfig
-    protocol: ProtocolConfig
-    snapshots: dict[str, str]
+    config: Path
+    protocol: Path
+    out: Path = Path("sessions")
+    """Folder that holds sessions."""
     new: bool = False
-    """Start a new session although another one is open."""
+    """Start a new session although one is open."""
+    resume: str | None = None
+    """Id of the session to resume, and no other."""
     sheet: int | None = None
     """Number of the sheet that is in, from 1, as the operator gave it."""
     armed: bool = False
     """The operator has looked at the robot cell: real hardware may move."""
-    self_check_left_out: bool = False
-    """rig.toml does not say whether there is a self-check: `armed` decides, but an open session keeps its setting."""
-    resume: str | None = None
-    """Id of the session to resume, and no other."""
+    on_screen: bool = False
+    """A screen shows run and camera, and can answer questions."""
+    guided: bool = False
+    """The operator accepts on the screen what each set-up step measured."""
+    live: LiveView | None = None
+    dry_run_mm: float | None = None
+    """Only move, with paper and ink lifted by this much: nothing is pressed, dipped or kept."""
+
+
+@dataclass(frozen=True, slots=True)
+class Opening:
+    """A request with its configuration, which is read only once."""
+
+    request: CollectRequest
+    rig: RigConfig
+    protocol: ProtocolConfig
+    snapshots: dict[str, str]
+    """Texts of the files that a new session keeps, by name."""
 
     @classmethod
-    def load(
-        cls,
-        root: Path,
-        rig_path: Path,
-        protocol_path: Path,
-        *,
-        new: bool = False,
-        sheet: int | None = None,
-        armed: bool = False,
-        dry_run_mm: float | None = None,
-    ) -> Opening:
-        """Read both files; `dry_run_mm` lifts paper and ink for a dry run. Raises `ConfigError`."""
-        rig, protocol = load_rig(rig_path), load_protocol(protocol_path)
-        left_out, rig = rig.self_check.enabled is None, rig.settled(armed)
-        if dry_run_mm is not None:
-            rig = _lifted(rig, protocol, dry_run_mm)
+    def load(cls, request: CollectRequest) -> Opening:
+        """Read both files. Raises `ConfigError`."""
+        rig, protocol = load_rig(request.config), load_protocol(request.protocol)
         snapshots = {
-            "rig.toml": rig_path.read_text(encoding="utf-8"),
-            "protocol.toml": protocol_path.read_text(encoding="utf-8"),
+            "rig.toml": request.config.read_text(encoding="utf-8"),
+            "protocol.toml": request.protocol.read_text(encoding="utf-8"),
             # The effective values: a touch height from the environment is part of the record.
-            RIG_EFFECTIVE: _effective(rig),
+            RIG_EFFECTIVE: rig.model_dump_json(indent=2, exclude=MACHINE_NAMES) + "\n",
             # Includes the rows of the tables that the protocol names.
             PROTOCOL_EFFECTIVE: protocol.model_dump_json(indent=2) + "\n",
         }
-        return cls(root, rig_path, protocol_path, rig, protocol, snapshots, new, sheet, armed, left_out)
-
-    def as_begun(self, folder: Path) -> Opening:
-        """Return a copy to resume that session: if rig.toml omits the self-check, the session's setting applies."""
-        if not self.self_check_left_out:
-            return self
-        try:
-            begun = json.loads(read_bounded(folder / RIG_EFFECTIVE, MAX_SNAPSHOT_BYTES))["self_check"]["enabled"]
-        except (SessionError, ValueError, LookupError, TypeError, RecursionError):
-            return self
-        rig = self.rig.checking_itself(begun is True)
-        return replace(self, rig=rig, snapshots={**self.snapshots, RIG_EFFECTIVE: _effective(rig)})
-
-
-def _effective(rig: RigConfig) -> str:
-    return rig.model_dump_json(indent=2, exclude=MACHINE_NAMES) + "\n"
+        rig = rig.settled(request.armed)
+        if request.dry_run_mm is not None:
+            rig = _lifted(rig, protocol, request.dry_run_mm)
+        return cls(request, rig, protocol, snapshots)
 
 
 def _lifted(rig: RigConfig, protocol: ProtocolConfig, by_mm: float) -> RigConfig:
@@ -121,8 +111,9 @@ def _lifted(rig: RigConfig, protocol: ProtocolConfig, by_mm: float) -> RigConfig
             "",
             f"{by_mm:g} mm is outside [{low_mm:g}, {high_mm:g}] mm: above the deepest press, below travel",
         )
-    return rig.checking_itself(False).model_copy(
+    return rig.model_copy(
         update={
+            "self_check": rig.self_check.model_copy(update={"enabled": False}),
             "paper": rig.paper.model_copy(update={"touch_z_mm": rig.paper.touch_z_mm + by_mm}),
             "ink": _lifted_ink(rig.ink, by_mm),
             "touch": rig.touch.model_copy(update={"method": "taught", "points_mm": []}),
@@ -142,15 +133,16 @@ def find_resumable(opening: Opening) -> Path | None:
 
     Raises `ConfigError` if the configuration changed, or if a new session might press on a used sheet.
     """
-    if not opening.root.is_dir():
+    request = opening.request
+    if not request.out.is_dir():
         return None
-    refusals: list[ConfigError] = []
-    if opening.resume is not None:
-        folders = [opening.root / opening.resume]
+    if request.resume is not None:
+        folders = [request.out / request.resume]
     else:
-        folders = [] if opening.new else open_sessions(opening.root)
+        folders = [] if request.new else open_sessions(request.out)
+    refusals: list[ConfigError] = []
     for folder in reversed(folders):
-        changes = differences(folder, opening.as_begun(folder).snapshots)
+        changes = differences(folder, opening.snapshots)
         if not changes:
             return folder
         if len(changes) > MOST_SHOWN:
@@ -163,7 +155,7 @@ def find_resumable(opening: Opening) -> Path | None:
         refusals.append(ConfigError(folder, "", what))
     if refusals:
         raise refusals[0]
-    check_fresh_sheet(opening.root, opening.sheet)
+    check_fresh_sheet(request.out, request.sheet)
     return None
 
 
@@ -277,21 +269,22 @@ def open_store(opening: Opening, resume: Path | None, rig: Rig, clock: Clock) ->
     """Make or resume the session. Raises `ConfigError` if it was begun on another robot."""
     header = _header(opening, rig)
     if resume is None:
-        session_id = next_session_id(opening.root, opening.protocol.kind, dt.date.today())
+        root = opening.request.out
+        session_id = next_session_id(root, opening.protocol.kind, dt.date.today())
         header = header.model_copy(update={"session_id": session_id})
-        return SessionStore.create(opening.root / session_id, header, opening.snapshots, clock.now_ns)
+        return SessionStore.create(root / session_id, header, opening.snapshots, clock.now_ns)
     store = SessionStore(resume, clock.now_ns)
     try:
         # Before anything moves: damage to a step would otherwise show only when everything is collected.
         store.verify()
         if (store.header.source, store.header.robot) != (header.source, header.robot):
             raise ConfigError(
-                opening.rig_path,
+                opening.request.config,
                 "robot",
                 f"session {resume.name} was begun on {store.header.robot} ({store.header.source}), "
                 f"but {header.robot} ({header.source}) answers",
             )
-        put_in_sheet(store, opening.sheet)
+        put_in_sheet(store, opening.request.sheet)
     except BaseException:
         store.release()
         raise
@@ -316,7 +309,7 @@ def _header(opening: Opening, rig: Rig) -> Header:
         force_sensor=_who(rig.force_identity),
         paper=config.paper.name,
         protocol=protocol.model_dump_json(),
-        origin=f"{config.name}, {opening.rig_path.name}",
+        origin=f"{config.name}, {opening.request.config.name}",
     )
 
 

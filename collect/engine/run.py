@@ -10,6 +10,7 @@ import itertools
 from collections.abc import Awaitable, Callable, Generator
 from dataclasses import dataclass, field
 
+from brushloop.collect.engine import brush, capture
 from brushloop.collect.engine.control import RunControl, State
 from brushloop.collect.engine.live import LiveView, Telemetry
 from brushloop.collect.engine.policy import (
@@ -23,7 +24,6 @@ from brushloop.collect.engine.policy import (
     question,
 )
 from brushloop.collect.engine.recorder import ForceGuard, Recorder, RunContext, StepContext, uninterrupted
-from brushloop.collect.engine.steps import brush, capture
 from brushloop.collect.errors import (
     NeedsOperator,
     Parked,

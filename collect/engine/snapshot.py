@@ -26,13 +26,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from brushloop.collect.operator import OperatorRequest, Prompt
+    from brushloop.collect.photograph.checks import Verdict
     from brushloop.collect.protocols.config import ProtocolConfig
-    from brushloop.collect.quality.checks import Verdict
     from brushloop.collect.rig.paper import Layout
     from brushloop.drivers.host import Clock
     from brushloop.sessions.store import SessionStore
 
 LOG_LINES = 200
+REFRESH_S = 0.1
+"""Time between two snapshots that a screen or a progress bar shows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,6 +175,26 @@ class Snapshot:
     """Folder of the session; empty until there is one."""
     no_pose_s: float | None = None
     """Time since the arm last sent a pose; None below a second. While it is set, no value on the screen is live."""
+
+
+def eta_text(now: Snapshot) -> str:
+    """`ETA 12:05`, or nothing while no stroke has been timed."""
+    if now.eta_s is None:
+        return ""
+    return f"ETA {minutes_text(now.eta_s)}"
+
+
+def minutes_text(seconds: float) -> str:
+    """Minutes and seconds as `12:05`."""
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes}:{rest:02d}"
+
+
+def no_pose_text(now: Snapshot) -> str:
+    """`no pose for 1.4 s`, or nothing while the arm sends its pose."""
+    if now.no_pose_s is None:
+        return ""
+    return f"no pose for {now.no_pose_s:.{1 if now.no_pose_s < 10.0 else 0}f} s"
 
 
 class Progress:

@@ -168,10 +168,7 @@ class RigConfig(Config):
         """Return a copy that decides the self-check if it was left out: on wherever real hardware may move."""
         if self.self_check.enabled is not None:
             return self
-        return self.checking_itself(armed or not self.robot.on_this_machine)
-
-    def checking_itself(self, enabled: bool) -> RigConfig:
-        """Return a copy with the self-check on or off."""
+        enabled = armed or not self.robot.on_this_machine
         return self.model_copy(update={"self_check": self.self_check.model_copy(update={"enabled": enabled})})
 
     @model_validator(mode="after")

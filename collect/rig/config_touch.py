@@ -86,8 +86,7 @@ class SelfCheckConfig(Config):
     """Three marks at the corners of an uneven triangle, found by the camera, before a session."""
 
     enabled: bool | None = None
-    """If left out, it is on where real hardware may move (with `--arm`, or an arm that is not on this machine); a
-    resumed session keeps the setting with which it began."""
+    """If left out, it is on where real hardware may move: with `--arm`, or an arm that is not on this machine."""
     depth_mm: Annotated[float, Field(ge=0.5, le=10.0)] = 2.0
     legs_mm: tuple[Annotated[float, Field(ge=8.0, le=200.0)], Annotated[float, Field(ge=8.0, le=200.0)]] = (24.0, 15.0)
     """Legs of the triangle along paper x and y, on sheets without room for one over three patches; unequal, so that no

@@ -9,8 +9,8 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
-from brushloop.collect.engine.engine import DryRunEngine, Engine
-from brushloop.collect.engine.open_or_resume import Opening, open_store
+from brushloop.collect.engine.engine import Engine
+from brushloop.collect.engine.open_or_resume import CollectRequest, Opening
 from brushloop.collect.errors import CannotTeach
 from brushloop.collect.planning.limit_check import check_protocol
 from brushloop.collect.rig.config import RigConfig
@@ -77,19 +77,11 @@ class ProofStep(Step):
         """
         protocol_path = folder / "protocol.toml"
         protocol_path.write_text(protocol, encoding="utf-8")
-        above_mm = ABOVE_MM if dry else None
-        opening = Opening.load(folder / "sessions", day.rig_path, protocol_path, armed=True, dry_run_mm=above_mm)
+        request = CollectRequest(day.rig_path, protocol_path, folder / "sessions", armed=True, on_screen=True)
+        opening = Opening.load(replace(request, dry_run_mm=ABOVE_MM if dry else None))
         opening = replace(opening, rig=slowly(opening.rig))
         check_protocol(day.rig_path, protocol_path, opening.rig, opening.protocol)
-        make = DryRunEngine if dry else Engine
-        engine = make(
-            opening.rig,
-            opening.protocol,
-            lambda rig: open_store(opening, None, rig, day.clock),
-            day.clock,
-            watched=True,
-            armed=True,
-        )
+        engine = Engine(opening, None, day.clock)
         engine.start()
         try:
             await self._followed(day, engine)

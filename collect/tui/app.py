@@ -16,10 +16,9 @@ from textual import events, work
 from textual.binding import Binding, BindingType
 
 from brushloop.collect.engine.control import FINAL, State
-from brushloop.collect.engine.snapshot import Snapshot
+from brushloop.collect.engine.snapshot import REFRESH_S, Snapshot
 from brushloop.collect.errors import NOT_AT_REST, CollectAborted, ConfigError
-from brushloop.collect.headless import REFRESH_S, obey, stop_signals
-from brushloop.collect.operator import Choice, Prompt
+from brushloop.collect.operator import Choice, Prompt, stop_signals
 from brushloop.collect.tui.pictures import Pictures
 from brushloop.collect.tui.question_screens import YES, AskScreen, yes_or_no
 from brushloop.collect.tui.run_screen import CAN_RESUME, RunScreen, live_content
@@ -303,7 +302,7 @@ def run_app(app: OperatorApp) -> None:
 
     def on_signal(number: int) -> None:
         if app.engine is not None:
-            obey(app.engine, number)
+            app.engine.obey(number)
         app.leaving = True
 
     intact = False

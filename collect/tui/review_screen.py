@@ -27,8 +27,8 @@ from brushloop.calibrate.fit.fit import FOLDER as FITS
 from brushloop.calibrate.fit.fit import BrushFit
 from brushloop.calibrate.session import board_of, lens_in_use
 from brushloop.calibrate.stats import odd_waits, waits_of
+from brushloop.collect.engine.capture import mark_of, pictures_of
 from brushloop.collect.engine.snapshot import LastCapture
-from brushloop.collect.engine.steps.capture import mark_of, pictures_of
 from brushloop.collect.operator import Prompt
 from brushloop.collect.rig.paper import Patch
 from brushloop.collect.tui.capture_screen import CaptureScreen

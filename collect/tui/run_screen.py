@@ -17,8 +17,15 @@ from textual.screen import Screen
 from textual.widgets import DataTable, Footer
 
 from brushloop.collect.engine.control import FINAL, State
-from brushloop.collect.engine.snapshot import CellCount, Mark, SheetMap, Snapshot
-from brushloop.collect.headless import eta_text, minutes_text, no_pose_text
+from brushloop.collect.engine.snapshot import (
+    CellCount,
+    Mark,
+    SheetMap,
+    Snapshot,
+    eta_text,
+    minutes_text,
+    no_pose_text,
+)
 from brushloop.collect.operator import OperatorRequest
 from brushloop.collect.tui.capture_screen import CaptureScreen, checks_content
 from brushloop.collect.tui.pictures import Pictures, binary_picture

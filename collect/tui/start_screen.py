@@ -28,6 +28,7 @@ from brushloop.sessions.terminal import text_of
 
 if TYPE_CHECKING:
     from brushloop.collect.engine.engine import Engine
+    from brushloop.collect.engine.open_or_resume import Opening
     from brushloop.sessions.show import Details, Summary
 
 RECENT = 50
@@ -41,7 +42,7 @@ GOES_ON = "The arm first lifts and parks; then the run continues there. No strok
 class SessionBrowser:
     """Reads sessions and makes engines; connects to no device."""
 
-    engine_for: Callable[..., Engine]
+    engine_for: Callable[[Opening], Engine]
     """Makes the engine of a run, not yet started; see `collect.start.engine_for`."""
     root: Path = Path("sessions")
     """Folder that holds sessions."""
@@ -77,14 +78,14 @@ class SessionBrowser:
 
         A session goes on with its own protocol. Connects nothing yet. Raises `ConfigError`.
         """
-        from brushloop.collect.engine.open_or_resume import PROTOCOL_EFFECTIVE, Opening
+        from brushloop.collect.engine.open_or_resume import PROTOCOL_EFFECTIVE, CollectRequest, Opening
 
+        request = CollectRequest(self.config, self.protocol, self.root, on_screen=True, guided=True)
         if session_id is None:
-            opening = Opening.load(self.root, self.config, self.protocol, new=True, sheet=1)
+            request = replace(request, new=True, sheet=1)
         else:
-            opening = Opening.load(self.root, self.config, self.root / session_id / PROTOCOL_EFFECTIVE)
-            opening = replace(opening, resume=session_id)
-        return self.engine_for(opening, watched=True, guided=True, preview=True)
+            request = replace(request, protocol=self.root / session_id / PROTOCOL_EFFECTIVE, resume=session_id)
+        return self.engine_for(Opening.load(request))
 
 
 class StartScreen(Screen[None]):

@@ -21,9 +21,9 @@ from textual.content import Content
 from textual.screen import Screen
 from textual.widgets import Footer, Input
 
+from brushloop.collect.engine.snapshot import REFRESH_S
 from brushloop.collect.errors import CollectAborted
-from brushloop.collect.headless import REFRESH_S, stop_signals
-from brushloop.collect.operator import Asker, Prompt
+from brushloop.collect.operator import Asker, Prompt, stop_signals
 from brushloop.collect.photograph.frames import gray
 from brushloop.collect.teach.day import LeftOff, Picture, Shown, Target, WentBack
 from brushloop.collect.tui.pictures import Pictures

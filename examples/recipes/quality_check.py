@@ -1,14 +1,14 @@
 """A quality check: a stroke whose ink is unusually dark.
 
-Put such a function into `collect/quality/checks.py` and its name into `MARK_CHECKS` there. A finding of its own needs a
-name in `Failure` there, and its limit belongs in `QualityConfig` (`collect/rig/config_touch.py`), so that a rig can set
-it. `docs/quality.md` says what it measures.
+Put such a function into `collect/photograph/checks.py` and its name into `MARK_CHECKS` there. A finding of its own
+needs a name in `Failure` there, and its limit belongs in `QualityConfig` (`collect/rig/config_touch.py`), so that a rig
+can set it. `docs/quality.md` says what it measures.
 """
 
 from __future__ import annotations
 
-from brushloop.collect.quality.checks import Failure
-from brushloop.collect.quality.measure import Mark
+from brushloop.collect.photograph.checks import Failure
+from brushloop.collect.photograph.measure import Mark
 from brushloop.collect.rig.config_touch import QualityConfig
 from brushloop.sessions.records import Check
 

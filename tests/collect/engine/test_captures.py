@@ -15,14 +15,14 @@ from brushloop.calibrate.calibrated import calibrate_session
 from brushloop.calibrate.commands import CalibrateRequest
 from brushloop.calibrate.compare import KEYS, Alignment, Field, Tone, simulated
 from brushloop.calibrate.errors import CalibrationError
+from brushloop.collect.engine import capture as capturing
 from brushloop.collect.engine import recorder
+from brushloop.collect.engine.capture import mark_of
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.recorder import RunContext
 from brushloop.collect.engine.snapshot import LastCapture
-from brushloop.collect.engine.steps import capture as capturing
-from brushloop.collect.engine.steps.capture import mark_of
 from brushloop.collect.errors import BadPicture, ConfigError, NeedsOperator, Parked, StepError
-from brushloop.collect.quality.checks import Verdict, check_drawing
+from brushloop.collect.photograph.checks import Verdict, check_drawing
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.tui.review_screen import Review
 from brushloop.drivers.sim.brush.footprint import Flaw
@@ -73,7 +73,7 @@ def test_a_stroke_that_fails_every_time_is_given_up_where_nobody_watches(sharp_l
 
 def test_a_question_that_nobody_answered_is_asked_again_on_resume(sharp_lab: Lab) -> None:
     sharp_lab.rig.world.flaws.update(dict.fromkeys(range(20), (Flaw.SPLIT, 1.0)))
-    left = sharp_lab.engine(watched=True)
+    left = sharp_lab.engine(on_screen=True)
     left.start()
     assert until(left, lambda now: now.prompt is not None).state is State.ASKING
     left.park()  # as `q` does, and a lost connection
@@ -81,7 +81,7 @@ def test_a_question_that_nobody_answered_is_asked_again_on_resume(sharp_lab: Lab
         wait_for_end(left)
     assert left.snapshot().given_up == 0
 
-    resumed = sharp_lab.engine(watched=True)
+    resumed = sharp_lab.engine(on_screen=True)
     questions = answered_alike(resumed, "g")
     assert [question.partition(":")[0] for question in questions[1:]] == ["H13-a0-r01, take 3"]
     assert (resumed.snapshot().strokes_done, resumed.snapshot().given_up) == (1, 0)
@@ -102,7 +102,7 @@ def test_ink_on_a_cell_that_should_be_blank_is_seen_before_the_brush_is_dipped(s
 def test_a_full_sheet_is_changed_on_the_screen_and_the_run_goes_on(sharp_lab: Lab) -> None:
     sharp_lab.edit_rig("cell_mm = [40.0, 24.0]", "cell_mm = [100.0, 60.0]")
     sharp_lab.write_protocol("[13.0, 15.0]", "[0.0]")
-    engine = sharp_lab.engine(watched=True)
+    engine = sharp_lab.engine(on_screen=True)
     engine.start()
     prompt = question(engine)
     assert "Sheet 1 is full" in prompt.question

@@ -11,11 +11,11 @@ from typing import Any, cast
 
 import pytest
 
+from brushloop.collect.engine import brush as brush_steps
+from brushloop.collect.engine import capture as capturing
 from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.recorder import meanwhile
 from brushloop.collect.engine.snapshot import Progress
-from brushloop.collect.engine.steps import brush as brush_steps
-from brushloop.collect.engine.steps import capture as capturing
 from brushloop.collect.errors import BadPicture, CollectAborted, ConfigError
 from brushloop.collect.motion import Procedures, dip_moves, wash_moves
 from brushloop.collect.planning.summary import make_plan

@@ -10,7 +10,6 @@ import pytest
 
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.engine import UNCHECKED, Engine
-from brushloop.collect.engine.open_or_resume import Opening
 from brushloop.collect.engine.snapshot import Snapshot
 from brushloop.collect.errors import CollectAborted, ConfigError, NeedsOperator, Parked, SheetFull
 from brushloop.drivers.arcs.controller import SafetyMode
@@ -167,7 +166,7 @@ def test_real_hardware_is_not_moved_unless_armed_or_allowed_on_the_screen(
     with pytest.raises(ConfigError, match=r"real hardware.*--arm"):
         lab.run()
     with pytest.raises(CollectAborted, match="nothing moved"):
-        answered_alike(lab.engine(watched=True), "x")
+        answered_alike(lab.engine(on_screen=True), "x")
     assert not lab.sessions.exists()
     assert lab.rig.arcs.cabinet.power.mode == "PowerOff"
 
@@ -198,7 +197,7 @@ def test_who_resumes_on_a_screen_is_asked_before_anything_moves(lab: Lab) -> Non
     folder = begun(lab)
     before = lab.rig.world.tool(), (folder / JOURNAL_NAME).read_bytes()
     for leaves in (False, True):
-        engine = lab.engine(watched=True)
+        engine = lab.engine(on_screen=True)
         engine.start()
         prompt = question(engine, "parked on request")
         assert engine.snapshot().state is State.ASKING
@@ -209,7 +208,7 @@ def test_who_resumes_on_a_screen_is_asked_before_anything_moves(lab: Lab) -> Non
         assert (lab.rig.world.tool(), (folder / JOURNAL_NAME).read_bytes()) == before
 
     SessionStore(folder, lambda: 1).release()  # as a process that is killed
-    engine = lab.engine(watched=True)
+    engine = lab.engine(on_screen=True)
     [asked] = answered_alike(engine, "g")
     assert "cut off" in asked
     assert engine.snapshot().strokes_done == 2
@@ -239,7 +238,7 @@ def test_a_session_is_not_resumed_on_another_robot(lab: Lab, monkeypatch: pytest
 def test_a_resume_that_fails_while_connecting_still_names_its_session(lab: Lab) -> None:
     folder = begun(lab)
     lab.edit_rig(f"port = {lab.rig.arcs.port}", "port = 1")
-    engine = lab.engine(watched=True)
+    engine = lab.engine(on_screen=True)
     engine.start()
     with pytest.raises(DeviceError):
         wait_for_end(engine)
@@ -256,7 +255,7 @@ def test_a_resume_that_fails_while_connecting_still_names_its_session(lab: Lab) 
 def test_a_safety_stop_holds_the_session_until_a_person_has_released_it(lab: Lab, mode: SafetyMode) -> None:
     """An answer before that is asked again and moves nothing."""
     slowly(lab)
-    engine, power = lab.engine(watched=True), lab.rig.arcs.cabinet.power
+    engine, power = lab.engine(on_screen=True), lab.rig.arcs.cabinet.power
     engine.start()
     until(engine, lambda _: lab.rig.world.tool().z_mm <= 117.0)
     lab.rig.arcs.cabinet.safety_stop(mode)
@@ -304,7 +303,7 @@ def test_a_dry_run_moves_all_the_way_and_leaves_neither_ink_nor_session(lab: Lab
 
 
 @pytest.mark.parametrize("depth_mm", [24.0, 46.0])
-def test_a_dry_run_too_low_or_too_high_is_refused_with_the_range(lab: Lab, tmp_path: Path, depth_mm: float) -> None:
+def test_a_dry_run_too_low_or_too_high_is_refused_with_the_range(lab: Lab, depth_mm: float) -> None:
     lab.write_protocol("[20.0]", "[0.0]")
     with pytest.raises(ConfigError, match=r"--dry-run.*outside \[25, 44.97\] mm"):
-        Opening.load(tmp_path / "out", lab.folder / "rig.toml", lab.folder / "protocol.toml", dry_run_mm=depth_mm)
+        lab.engine(dry_run_mm=depth_mm)

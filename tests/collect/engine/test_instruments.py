@@ -134,7 +134,7 @@ def test_an_empty_reservoir_holds_the_run_before_a_dry_press_until_it_is_refille
     firmware: Any = lab.rig.ink.instrument
     lab.write_protocol("[11.0]", "[0.0]")
     lab.rig.world.well.ml, firmware.reservoir_ml = 4.0, 0.2
-    engine = lab.engine(watched=watched)
+    engine = lab.engine(on_screen=watched)
     engine.start()
     if watched:
         prompt = question(engine, "Refill the reservoir")

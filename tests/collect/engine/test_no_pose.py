@@ -8,9 +8,10 @@ from typing import Any
 
 import pytest
 
-from brushloop.collect import headless
+from brushloop.collect import start
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.engine import Engine
+from brushloop.collect.engine.open_or_resume import CollectRequest, Opening
 from brushloop.collect.engine.snapshot import Snapshot
 from brushloop.collect.protocols.kinds import GridConfig
 from brushloop.collect.rig.config import load_rig
@@ -39,7 +40,9 @@ def test_the_snapshot_says_for_how_long_no_pose_has_come(tmp_path: Path) -> None
     config, clock = load_rig(tmp_path / "rig.toml"), HandClock()
     robot = make_robot(config, clock, print)
     devices: Any = robot
-    engine = Engine(config, GridConfig(kind="grid", depths_mm=[11.0], tilts_deg=[0.0]), devices, clock)
+    grid = GridConfig(kind="grid", depths_mm=[11.0], tilts_deg=[0.0])
+    request = CollectRequest(tmp_path / "rig.toml", tmp_path / "protocol.toml")
+    engine = Engine(Opening(request, config, grid, {}), None, clock)
     assert engine.snapshot().no_pose_s is None, "not connected yet"
     engine._rig = Rig(config, clock, robot, devices, WHO, WHO)
     assert engine.snapshot().no_pose_s is None, "no pose yet"
@@ -101,7 +104,7 @@ def test_without_a_screen_it_is_one_line_when_it_begins_and_one_when_it_ends(
             return self.now.state is State.DONE
 
     shots = [picture(messages=(), no_pose_s=s) for s in (None, None, 1.04, 1.1, 2.0, None)]
-    monkeypatch.setattr(headless, "REFRESH_S", 0.0)
-    headless._show(Scripted(iter([*shots, picture(state=State.DONE, messages=())])))
+    monkeypatch.setattr(start, "REFRESH_S", 0.0)
+    start.show_progress(Scripted(iter([*shots, picture(state=State.DONE, messages=())])))
     printed = [line for line in capsys.readouterr().err.splitlines() if "pose" in line]
     assert printed == ["warning: no pose for 1.0 s", "the arm sends its pose again"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime as dt
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,6 +12,7 @@ import pytest
 
 from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.open_or_resume import (
+    CollectRequest,
     Opening,
     find_resumable,
     next_session_id,
@@ -51,14 +51,13 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def begin(session_id: str = "grid-01", *, armed: bool = False) -> None:
+def begin(session_id: str = "grid-01") -> None:
     header = Header(session_id=session_id, source=Source.LOOPBACK, software="brushloop 0")
-    snapshots = opening(armed=armed).snapshots
-    SessionStore.create(Path("sessions") / session_id, header, snapshots, HostClock().now_ns).release()
+    SessionStore.create(Path("sessions") / session_id, header, opening().snapshots, HostClock().now_ns).release()
 
 
-def opening(*, armed: bool = False) -> Opening:
-    return Opening.load(Path("sessions"), Path("rig.toml"), Path("protocol.toml"), armed=armed)
+def opening(config: Path = Path("rig.toml"), **options: Any) -> Opening:
+    return Opening.load(CollectRequest(config, Path("protocol.toml"), **options))
 
 
 def kinds(opened: Opening) -> list[StepKind]:
@@ -98,7 +97,7 @@ def test_an_unreadable_session_stands_in_no_others_way(lab: Path, trouble: str) 
     [line] = refused()
     assert "One cannot be resumed as it is: sessions/old/journal.jsonl: " in line
     assert "--sheet 1" in line
-    assert find_resumable(replace(opening(), sheet=1)) is None
+    assert find_resumable(opening(sheet=1)) is None
 
 
 def test_file_field_old_and_new_value_are_reported_and_where_the_old_file_lies(lab: Path) -> None:
@@ -110,7 +109,7 @@ def test_file_field_old_and_new_value_are_reported_and_where_the_old_file_lies(l
     ]
     # and what it says is true
     old = Path("sessions/grid-01")
-    assert find_resumable(Opening.load(Path("sessions"), old / "rig.toml", Path("protocol.toml"))) == old
+    assert find_resumable(opening(old / "rig.toml")) == old
 
 
 def test_both_files_and_the_environment_are_distinguished(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,6 +151,7 @@ def test_a_session_whose_old_values_cannot_be_read_is_not_gone_on_with(lab: Path
 
 def test_where_hardware_may_move_the_rig_is_checked_first_unless_it_is_switched_off(lab: Path) -> None:
     assert StepKind.SELF_CHECK in kinds(opening(armed=True))
+    assert find_resumable(opening(armed=True)), "a session goes on with --arm that was begun without"
     assert StepKind.SELF_CHECK not in kinds(opening())
     edit("rig.toml", 'host = "127.0.0.1"', 'host = "192.168.1.7"')  # to be armed on the screen
     assert StepKind.SELF_CHECK in kinds(opening())
@@ -165,7 +165,7 @@ def test_the_start_screen_resumes_each_session_with_its_own_protocol(lab: Path) 
     Path("protocol.toml").write_text('kind = "calibration"\n')
     openings: list[Opening] = []
 
-    def engine_for(opening: Opening, *, watched: bool, guided: bool, preview: bool) -> Engine:
+    def engine_for(opening: Opening) -> Engine:
         openings.append(opening)
         return FakeEngine(picture())
 
@@ -174,19 +174,6 @@ def test_the_start_screen_resumes_each_session_with_its_own_protocol(lab: Path) 
         browser.engine(session_id)
         assert find_resumable(openings[-1]) == Path("sessions") / session_id
         assert openings[-1].protocol.kind == "grid"
-
-
-@pytest.mark.parametrize("begun_armed", [False, True])
-def test_a_session_goes_on_with_or_without_its_check_as_it_was_begun(lab: Path, *, begun_armed: bool) -> None:
-    shutil.rmtree("sessions")
-    begin(armed=begun_armed)
-    session = Path("sessions/grid-01")
-    for armed in (False, True):
-        assert find_resumable(opening(armed=armed)) == session
-        going_on = opening(armed=armed).as_begun(session)
-        assert kinds(going_on) == kinds(opening(armed=begun_armed))
-    edit("rig.toml", "[motion]", f"[self_check]\nenabled = {str(not begun_armed).lower()}\n\n[motion]")
-    assert "self_check.enabled" in "".join(refused())
 
 
 def test_a_sheet_stays_in_until_each_stroke_on_it_is_photographed() -> None:

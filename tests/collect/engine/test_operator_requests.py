@@ -64,7 +64,7 @@ async def test_a_question_that_is_asked_as_the_screen_goes_away_does_not_wait_fo
 
 def test_a_stroke_is_pressed_again_on_a_new_cell_because_the_operator_asked(lab: Lab) -> None:
     lab.write_protocol("[11.0]", "[0.0]")
-    engine = lab.engine(watched=True)
+    engine = lab.engine(on_screen=True)
     engine.request(OperatorRequest.RETAKE)
     engine.request(OperatorRequest.NEW_SHEET)
     engine.request(OperatorRequest.NEW_SHEET)
@@ -81,7 +81,7 @@ def test_a_stroke_is_pressed_again_on_a_new_cell_because_the_operator_asked(lab:
 
 def test_a_stroke_is_left_out_before_it_is_pressed_and_stays_left_out_after_a_resume(lab: Lab) -> None:
     lab.write_protocol("[11.0, 15.0]", "[0.0]")
-    first = lab.engine(watched=True)
+    first = lab.engine(on_screen=True)
     first.request(OperatorRequest.SKIP)
     first.start()
     until(first, lambda now: now.given_up == 1)
@@ -98,7 +98,7 @@ def test_a_stroke_is_left_out_before_it_is_pressed_and_stays_left_out_after_a_re
 
 def test_what_is_marked_bad_meanwhile_is_pressed_again_at_the_end_exactly_once(lab: Lab) -> None:
     lab.write_protocol("[11.0, 15.0]", "[0.0]")
-    first = lab.engine(watched=True)
+    first = lab.engine(on_screen=True)
     first.start()
     last = until(first, lambda now: now.strokes_done == 1 and now.last is not None).last
     assert last is not None
@@ -123,7 +123,7 @@ def test_what_is_marked_bad_meanwhile_is_pressed_again_at_the_end_exactly_once(l
 
 def test_a_new_sheet_is_asked_for_and_the_next_stroke_lies_on_it(lab: Lab) -> None:
     lab.write_protocol("[11.0]", "[0.0]")
-    engine = lab.engine(watched=True)
+    engine = lab.engine(on_screen=True)
     engine.request(OperatorRequest.NEW_SHEET)
     engine.start()
     answer(engine, "Replace sheet 1 by a blank one", "g")
@@ -136,7 +136,7 @@ def test_a_new_sheet_is_asked_for_and_the_next_stroke_lies_on_it(lab: Lab) -> No
 
 def test_the_paper_is_found_again_by_jog_between_two_strokes(lab: Lab) -> None:
     lab.write_protocol("[11.0]", "[0.0]")
-    engine = lab.engine(watched=True)
+    engine = lab.engine(on_screen=True)
     engine.request(OperatorRequest.JOG)
     engine.start()
     for _ in range(3):  # touches at one point, which must agree
@@ -174,7 +174,7 @@ def test_a_jog_between_strokes_that_fails_leaves_the_paper_where_it_was(
 ) -> None:
     lab.write_protocol("[11.0]", "[0.0]")
     failing(monkeypatch, error)
-    engine = lab.engine(watched=True)
+    engine = lab.engine(on_screen=True)
     engine.request(OperatorRequest.JOG)
     engine.start()
     if asks:
@@ -185,7 +185,7 @@ def test_a_jog_between_strokes_that_fails_leaves_the_paper_where_it_was(
 
 def test_a_height_that_is_not_taken_and_a_jog_that_is_given_up_leave_the_paper_where_it_was(lab: Lab) -> None:
     lab.write_protocol("[11.0, 15.0]", "[0.0]")
-    engine = lab.engine(watched=True)
+    engine = lab.engine(on_screen=True)
     engine.request(OperatorRequest.JOG)
     engine.start()
     for number in range(1, 4):
@@ -208,7 +208,7 @@ def test_a_height_that_is_not_taken_and_a_jog_that_is_given_up_leave_the_paper_w
 def test_who_gives_the_jog_of_the_set_up_up_keeps_the_taught_height_and_the_run_goes_on(lab: Lab, guided: bool) -> None:
     lab.write_protocol("[11.0]", "[0.0]")
     lab.edit_rig("[paper]", '[touch]\nmethod = "jog"\n\n[paper]')
-    engine = lab.engine(watched=True, guided=guided)
+    engine = lab.engine(on_screen=True, guided=guided)
     engine.start()
     if guided:
         answer(engine, "Camera, board, scale", "g")
@@ -230,7 +230,7 @@ def test_who_gives_the_jog_of_the_set_up_up_keeps_the_taught_height_and_the_run_
 
 def test_park_ends_the_run_after_the_step_with_the_arm_at_its_place(lab: Lab) -> None:
     lab.write_protocol("[11.0]", "[0.0, 10.0]")
-    engine = lab.engine(watched=True)
+    engine = lab.engine(on_screen=True)
     engine.start()
     until(engine, lambda now: now.strokes_done == 1)
     engine.park()
@@ -246,7 +246,7 @@ def test_park_ends_the_run_after_the_step_with_the_arm_at_its_place(lab: Lab) ->
 
 @pytest.mark.parametrize("state", [State.PAUSED, State.ASKING])
 def test_park_while_the_run_waits_parks_and_asks_nobody_any_more(lab: Lab, state: State) -> None:
-    engine = lab.engine(watched=True, guided=state is State.ASKING)
+    engine = lab.engine(on_screen=True, guided=state is State.ASKING)
     if state is State.PAUSED:
         engine.pause()
     engine.start()
@@ -262,7 +262,7 @@ def test_who_accepted_the_set_up_is_not_asked_at_later_views_of_the_board(lab: L
     lab.write_protocol("[11.0, 15.0]")
     with (lab.folder / "protocol.toml").open("a") as protocol:
         protocol.write("board_every = 1\n")
-    engine = lab.engine(watched=True, guided=True)
+    engine = lab.engine(on_screen=True, guided=True)
     engine.start()
     answer(engine, "Camera, board, scale", "g")
     answer(engine, "Zero touch and plane", "g")
@@ -274,7 +274,7 @@ def test_who_accepted_the_set_up_is_not_asked_at_later_views_of_the_board(lab: L
 def test_a_guided_calibration_has_no_self_check(lab: Lab) -> None:
     (lab.folder / "protocol.toml").write_text('kind = "calibration"\nboard_views = 2\n')
     lab.edit_rig("", "\n[self_check]\nenabled = true\n")
-    engine = lab.engine(watched=True, guided=True)
+    engine = lab.engine(on_screen=True, guided=True)
     engine.start()
     answer(engine, "Camera, board, scale", "g")
     answer(engine, "Zero touch and plane", "g")
@@ -284,7 +284,7 @@ def test_a_guided_calibration_has_no_self_check(lab: Lab) -> None:
 
 def test_a_guided_set_up_measures_again_when_it_is_asked_to_and_shows_the_camera(lab: Lab) -> None:
     lab.write_protocol("[11.0]", "[0.0]")
-    engine = lab.engine(watched=True, guided=True, preview=True)
+    engine = lab.engine(on_screen=True, guided=True)
     engine.start()
     answer(engine, "Camera, board, scale", "a")
     now = until(engine, lambda now: now.prompt is not None and now.prompt.number == 2)

@@ -100,7 +100,7 @@ def test_an_arm_that_was_moved_at_a_question_first_goes_up_along_its_tool(lab: L
     """A jog asks at every step, with the brush near the paper."""
     text = (lab.folder / "rig.toml").read_text()
     (lab.folder / "rig.toml").write_text(text + '\n[touch]\nmethod = "jog"\ntouches = 1\n')
-    engine = lab.engine(watched=True)
+    engine = lab.engine(on_screen=True)
     engine.start()
     jog = question(engine, "Jog until")
     second_client(lab, engine, UNDER)
@@ -119,7 +119,7 @@ def test_an_arm_that_was_moved_at_a_question_first_goes_up_along_its_tool(lab: L
 
 
 def test_an_arm_that_somebody_still_moves_is_asked_about_and_left_alone(lab: Lab) -> None:
-    engine = lab.engine(watched=True)
+    engine = lab.engine(on_screen=True)
     start_and_pause(engine)
     here = lab.rig.world.tool()
     up = to_wire(dataclasses.replace(here, z_mm=here.z_mm + 30.0))
@@ -136,7 +136,7 @@ def test_an_arm_that_somebody_still_moves_is_asked_about_and_left_alone(lab: Lab
 
 
 def test_an_arm_that_was_switched_off_in_a_pause_is_asked_about_and_powered_again(lab: Lab) -> None:
-    engine = lab.engine(watched=True)
+    engine = lab.engine(on_screen=True)
     start_and_pause(engine)
     second_client(lab, engine, RobotManage_poweroff={})
     sent = lines_sent(lab)
@@ -159,7 +159,7 @@ def test_where_nobody_watches_an_arm_that_was_switched_off_ends_the_run_with_the
 
 
 def test_an_arm_that_was_left_outside_its_limits_is_not_moved_until_it_is_jogged_back(lab: Lab) -> None:
-    engine = lab.engine(watched=True)
+    engine = lab.engine(on_screen=True)
     start_and_pause(engine)
     second_client(lab, engine, brush_pose(480.0, 40.0, 250.0, tilt_deg=60.0))
     sent = lines_sent(lab)
@@ -216,7 +216,7 @@ def test_a_tool_offset_that_changes_after_the_last_look_leaves_a_void_and_no_str
 
 
 def test_whoever_watches_has_the_tool_set_anew_and_goes_on(lab: Lab) -> None:
-    engine = lab.engine(watched=True)
+    engine = lab.engine(on_screen=True)
     start_and_pause(engine)
     second_client(lab, engine, **SHORTER)
     engine.resume()

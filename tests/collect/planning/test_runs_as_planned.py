@@ -86,7 +86,7 @@ def run(lab: Lab, protocol: str, extra: str = EXTRAS) -> None:
     """To its end; whoever jogs says at once that the tip touches."""
     lab.edit_rig("", extra)
     (lab.folder / "protocol.toml").write_text(protocol, encoding="utf-8")
-    answered_alike(lab.engine(watched=True), "t")
+    answered_alike(lab.engine(on_screen=True), "t")
 
 
 def hold_against_the_plan(lab: Lab, made: list[Made]) -> None:

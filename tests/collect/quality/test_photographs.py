@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from bench.brushes import DATA as SHARED
-from brushloop.collect.quality.checks import Failure, Verdict, check_capture
+from brushloop.collect.photograph.checks import Failure, Verdict, check_capture
 from brushloop.collect.rig.config_touch import QualityConfig
 from brushloop.collect.rig.paper import Patch
 from tests.calibrate.given import flat_plane

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from bench.quality import SPOTLESS_MM2, Bench, Blank, Sample, Score, score
-from brushloop.collect.quality.checks import Failure, check_capture, patch_is_blank
+from brushloop.collect.photograph.checks import Failure, check_capture, patch_is_blank
 from brushloop.collect.rig.config_touch import QualityConfig
 
 pytestmark = pytest.mark.xdist_group("quality")  # drawn once

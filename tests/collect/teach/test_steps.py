@@ -216,7 +216,7 @@ async def test_every_pose_of_the_proof_is_checked_before_the_arm_is_connected(
     text = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))
     low = re.sub(r"(?m)^z_mm = \[.*", "z_mm = [98.0, 170.0]", text, count=1)  # travel height is 180
     (tmp_path / "rig.toml").write_text(low)
-    monkeypatch.setattr(proof, "DryRunEngine" if dry else "Engine", no_engine)
+    monkeypatch.setattr(proof, "Engine", no_engine)
     day = Day(Refusing(), tmp_path / "rig.toml", HostClock(), armed=True)
     protocol = 'kind = "grid"\ndepths_mm = [11.0]\ntilts_deg = [0.0]\nrepeats = 2\n'
     with pytest.raises(ConfigError, match=r"robot\.limits: a planned pose is outside the limits: z = "):

@@ -15,12 +15,12 @@ from rich.console import Console  # noqa: TID251
 from textual.app import App
 from textual.pilot import Pilot
 
+from brushloop.collect.engine.capture import mark_of
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.snapshot import CellCount, LastCapture, Mark, Picture, SheetMap, Snapshot
-from brushloop.collect.engine.steps.capture import mark_of
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
-from brushloop.collect.quality.checks import Verdict
+from brushloop.collect.photograph.checks import Verdict
 from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.pictures import Pictures
 from brushloop.collect.tui.review_screen import Review, ReviewCapture, ReviewScreen

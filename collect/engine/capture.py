@@ -19,9 +19,7 @@ from brushloop.collect.engine.recorder import RunContext, StepContext, meanwhile
 from brushloop.collect.engine.snapshot import LastCapture
 from brushloop.collect.errors import BadPicture, NeedsOperator, StepError
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
-from brushloop.collect.photograph.frames import undistorted
-from brushloop.collect.protocols.steps import MARKING, CaptureStep
-from brushloop.collect.quality.checks import (
+from brushloop.collect.photograph.checks import (
     Failure,
     Verdict,
     check_capture,
@@ -29,6 +27,8 @@ from brushloop.collect.quality.checks import (
     check_frame,
     patch_is_blank,
 )
+from brushloop.collect.photograph.frames import undistorted
+from brushloop.collect.protocols.steps import MARKING, CaptureStep
 from brushloop.collect.rig.paper import Patch
 from brushloop.drivers.devices import Frame
 from brushloop.model.fitted import FittedPress

@@ -15,8 +15,8 @@ import numpy as np
 
 from brushloop.calibrate.board.pix2len import Plane
 from brushloop.calibrate.stroke import PX_PER_MM, Gray
-from brushloop.collect.quality import measure
-from brushloop.collect.quality.measure import (
+from brushloop.collect.photograph import measure
+from brushloop.collect.photograph.measure import (
     Ink,
     Mark,
     Point,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 from functools import partial
 
+from brushloop.collect.engine.capture import look_at_sheet
 from brushloop.collect.engine.recorder import RunContext, StepContext, within_limits
-from brushloop.collect.engine.steps.capture import look_at_sheet
 from brushloop.collect.errors import StepError
 from brushloop.collect.motion import TOUCH_TOLERANCE_MM
 from brushloop.collect.operator import Choice, Prompt
