@@ -17,6 +17,7 @@ from textual.pilot import Pilot
 
 from brushloop.collect.engine.capture import mark_of
 from brushloop.collect.engine.control import State
+from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.snapshot import CellCount, LastCapture, Mark, Picture, SheetMap, Snapshot
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
@@ -195,6 +196,8 @@ class FakeEngine:
     def request(self, request: OperatorRequest) -> None:
         self.calls.append(f"request {request.name}")
         self.now = replace(self.now, requests=(*self.now.requests, request))
+
+    obey = Engine.obey
 
     def park(self) -> None:
         self.calls.append("park")
