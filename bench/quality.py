@@ -22,8 +22,7 @@ from bench.harness import BenchError, Result, at_most, rounds_of
 from brushloop.calibrate.board.pix2len import Plane, see_board
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.collect.photograph.checks import Failure, check_capture, patch_is_blank
-from brushloop.collect.rig.config import PaperConfig
-from brushloop.collect.rig.config_touch import QualityConfig
+from brushloop.collect.rig.config import PaperConfig, QualityConfig
 from brushloop.collect.rig.paper import Patch, Sheet
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.brush.brush import BrushSpec, Flaw

@@ -127,7 +127,7 @@ def plan(
     from brushloop.collect.rig.paper import PaperPlane
 
     if picture is not None:
-        from brushloop.collect.rig.show import check_picture
+        from brushloop.collect.rig.check import check_picture
 
         check_picture(picture)
     rig, wanted = load_rig(config), load_protocol(protocol)
@@ -324,8 +324,8 @@ def show(
     picture: Annotated[Path | None, typer.Option(help="Draw it from above: .png, .svg, .pdf or .jpg.")] = None,
 ) -> None:
     """Show a rig: its box of limits and every place that the tip goes to. Asks no device."""
+    from brushloop.collect.rig.check import check_picture, draw_rig, rig_table
     from brushloop.collect.rig.config import load_rig
-    from brushloop.collect.rig.show import check_picture, draw_rig, rig_table
 
     if picture is not None:
         check_picture(picture)

@@ -23,8 +23,7 @@ from brushloop.collect.engine.open_or_resume import CollectRequest, Opening
 from brushloop.collect.photograph.measure import Mark
 from brushloop.collect.planning.walk import walk
 from brushloop.collect.protocols.steps import PressStep
-from brushloop.collect.rig.config import InkConfig, RigConfig
-from brushloop.collect.rig.config_touch import QualityConfig
+from brushloop.collect.rig.config import InkConfig, QualityConfig, RigConfig
 from brushloop.drivers.camera import CameraTable, OpenCvCamera
 from brushloop.drivers.devices import Ink, Stamp
 from brushloop.drivers.host import HostClock

@@ -13,7 +13,7 @@ from brushloop.collect.operator import Choice, Prompt
 from brushloop.collect.planning.limit_check import check_poses, check_step
 from brushloop.collect.planning.walk import touch_of
 from brushloop.collect.protocols.steps import DrawStep, PressStep, TouchStep, ZeroTouchStep
-from brushloop.collect.rig.config_touch import TouchConfig
+from brushloop.collect.rig.config import TouchConfig
 from brushloop.collect.rig.paper import PaperPlane, Patch
 from brushloop.collect.touch.force import ForceTap
 from brushloop.collect.touch.heights import PlaneResult, kept

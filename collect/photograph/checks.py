@@ -28,7 +28,7 @@ from brushloop.collect.photograph.measure import (
     take,
     tell_apart,
 )
-from brushloop.collect.rig.config_touch import QualityConfig
+from brushloop.collect.rig.config import QualityConfig
 from brushloop.collect.rig.paper import Patch
 from brushloop.sessions.records import Check
 

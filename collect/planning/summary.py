@@ -19,10 +19,10 @@ from brushloop.collect.motion import park_moves
 from brushloop.collect.planning.walk import StepMoves, Walked, marks_of, poses_of, sheet_of, walk
 from brushloop.collect.protocols.config import ProtocolConfig
 from brushloop.collect.protocols.steps import Drawn, DrawStep, Planned, PressStep, TouchStep
+from brushloop.collect.rig.check import BLUE, GREY, ORANGE, Axes, finish, from_above, shown_name
 from brushloop.collect.rig.config import BrushConfig, RigConfig
 from brushloop.collect.rig.devices import limits_of
 from brushloop.collect.rig.paper import Patch, Sheet, to_base
-from brushloop.collect.rig.show import BLUE, GREY, ORANGE, Axes, finish, from_above, shown_name
 from brushloop.collect.touch.selfcheck import partners
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import distance
@@ -253,7 +253,7 @@ MOST_SHEETS = 11
 
 
 def draw_plan(config: RigConfig, protocol: ProtocolConfig, plan: Plan, path: Path) -> None:
-    """Write the picture, in the format of the file's ending. `collect.rig.show.check_picture` must have passed.
+    """Write the picture, in the format of the file's ending. `collect.rig.check.check_picture` must have passed.
 
     Raises OSError if it cannot be written.
     """

@@ -37,8 +37,7 @@ from brushloop.collect.protocols.steps import (
     ZeroTouchStep,
     with_self_check,
 )
-from brushloop.collect.rig.config import RigConfig
-from brushloop.collect.rig.config_touch import TouchConfig
+from brushloop.collect.rig.config import RigConfig, TouchConfig
 from brushloop.collect.rig.paper import PaperPlane, Patch, Sheet
 from brushloop.collect.touch.camera import SPOTS_PER_DIP
 from brushloop.collect.touch.heights import EXTENT_MM, lowest_z_mm, patch_spots, touch_rects

@@ -1,25 +1,42 @@
-"""Whether the values of a `rig.toml` are plausible, contradict each other, or were never measured. Asks no device.
+"""What a `rig.toml` says: where the tip goes, as a table and a picture from above, and whether its values can be true.
 
-`brushloop rig check` goes over a file; the first day checks single values as soon as they are taught.
+`brushloop rig show` and `rig check` ask no device. The first day checks single values as soon as they are taught, and
+plans draw their sheets beside the same picture.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
+from rich.table import Table
 from rich.text import Text
 
 from brushloop.calibrate.board.spec import size_mm
+from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import limits_of
-from brushloop.collect.rig.paper import Sheet, to_paper
-from brushloop.collect.rig.show import places_of
+from brushloop.collect.rig.paper import to_base, to_paper
 
+Axes = Any
+"""Axes of matplotlib, whose types are incomplete."""
+ENDINGS = (".png", ".svg", ".pdf", ".jpg")
+BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
+"""From the palette of Okabe and Ito, which colour-blind people can tell apart; the marks differ in shape too."""
+PAPER = "#fbf7ea"
+MARKS = {
+    "well": ("o", BLUE),
+    "wipe, over the rim": ("v", BLUE),
+    "wash pot": ("s", BLUE),
+    "park": ("^", GREEN),
+    "touch point": ("x", ORANGE),
+}
+"""Marker and colour of each kind of place; the sheet is drawn as an area."""
+MARGIN_MM = 60.0
 Verdict = Literal["plausible", "contradicts", "not measured"]
 COLOURS: dict[Verdict, str] = {"plausible": "green", "contradicts": "red", "not measured": "yellow"}
 TOOL_MM = (40.0, 500.0)
@@ -30,6 +47,134 @@ LOOSE_MM = 250.0
 """Room beyond the outermost place, in mm, from which on the box no longer protects anything."""
 PARK_CLEAR_MM = 40.0
 """Half the width of a holder and a part of the wrist, which must be out of the picture."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where the tip of the upright brush goes."""
+
+    name: str
+    at_mm: tuple[float, float, float]
+    """In the base frame; z is the lowest height of the tip there."""
+    top_mm: float
+    """Height in the base frame from which the tip comes down to it."""
+
+
+def places_of(config: RigConfig) -> tuple[Place, ...]:
+    """Every place of `rig.toml`, the corners of the sheet first."""
+    paper, ink, motion = config.paper, config.ink, config.motion
+    deepest_mm = paper.touch_z_mm - config.brush.max_depth_mm
+    width, height = paper.size_mm
+    on_table = [
+        ("sheet lower left", (0.0, 0.0), deepest_mm),
+        ("sheet lower right", (width, 0.0), deepest_mm),
+        ("sheet upper right", (width, height), deepest_mm),
+        ("sheet upper left", (0.0, height), deepest_mm),
+        ("well", ink.well_mm, ink.dip_z_mm),
+    ]
+    if ink.wipe is not None:
+        on_table.append(("wipe, over the rim", ink.wipe.rim_mm, ink.wipe.z_mm))
+    if ink.wash is not None:
+        on_table.append(("wash pot", ink.wash.pot_mm, ink.wash.dip_z_mm))
+    for number, point_mm in enumerate(config.touch.points_mm or [paper.touch_point_mm], 1):
+        on_table.append((f"touch point {number}", point_mm, paper.touch_z_mm))
+    park = Place("park", motion.park_mm, max(motion.park_mm[2], motion.safe_z_mm))
+    return (*(Place(name, (*to_base(paper, *at), z_mm), motion.safe_z_mm) for name, at, z_mm in on_table), park)
+
+
+def rig_table(config: RigConfig) -> Table:
+    """A place a row, in the frames of the base and of the paper, in mm; then two corners of the box of limits."""
+    limits = limits_of(config)
+    table = Table("place", "base x", "y", "z", "paper x", "y", title=f"{config.name}: mm")
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for place in places_of(config):
+        paper_mm = to_paper(config.paper, *place.at_mm[:2])
+        table.add_row(place.name, *(f"{v:.1f}" for v in (*place.at_mm, *paper_mm)))
+    for end, *corner in zip(("lowest", "highest"), limits.x_mm, limits.y_mm, limits.z_mm, strict=True):
+        table.add_row(f"box, {end}", *(f"{v:.1f}" for v in corner))
+    return table
+
+
+# The picture from above
+
+
+def check_picture(path: Path) -> None:
+    """Raise `ConfigError` if no picture can be written to this path. Called before anything is computed."""
+    if path.suffix.lower() not in ENDINGS:
+        raise ConfigError("--picture", "", f"{path} must end in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}")
+    if not path.parent.is_dir():
+        raise ConfigError("--picture", "", f"{path}: there is no folder {path.parent}")
+    if path.is_dir():
+        raise ConfigError("--picture", "", f"{path} is a folder")
+
+
+def draw_rig(config: RigConfig, path: Path) -> None:
+    """Write the picture, in the format of the file's ending. `check_picture` must have passed.
+
+    Raises OSError if it cannot be written.
+    """
+    from matplotlib.figure import Figure as Picture
+
+    picture: Any = Picture(figsize=(7.2, 6.4), layout="constrained")
+    above = picture.subplots()
+    from_above(above, config)
+    handles, labels = above.get_legend_handles_labels()
+    picture.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
+    picture.suptitle(f"{shown_name(config.name)}: base frame, mm")
+    picture.savefig(path, dpi=110)
+
+
+def from_above(axes: Axes, config: RigConfig) -> None:
+    """Everything that stands on the table, and the box of limits."""
+    from matplotlib.patches import Polygon, Rectangle
+
+    limits, paper, places = limits_of(config), config.paper, places_of(config)
+    axes.plot(0.0, 0.0, "+", color="black", markersize=14, mew=2.0, label="base of the arm")
+    (left, right), (low, high) = limits.x_mm, limits.y_mm
+    box = Rectangle((left, low), right - left, high - low, fill=False, edgecolor=ORANGE, linewidth=1.6)
+    box.set_label("box of limits")
+    axes.add_patch(box)
+    board = _rectangle(config, config.board.origin_mm, size_mm(config.board))
+    axes.add_patch(Polygon(board, fill=False, edgecolor=GREY, linestyle="--", label="board"))
+    sheet = _rectangle(config, (0.0, 0.0), paper.size_mm)
+    axes.add_patch(Polygon(sheet, facecolor=PAPER, edgecolor="black", label="sheet"))
+    for name, tip in (("x", (40.0, 0.0)), ("y", (0.0, 40.0))):
+        axes.annotate("", to_base(paper, *tip), paper.origin_mm, arrowprops={"arrowstyle": "->", "color": "black"})
+        axes.annotate(name, to_base(paper, *(1.25 * v for v in tip)), ha="center", va="center", fontsize=9)
+    for kind, (marker, colour) in MARKS.items():
+        at = [place.at_mm[:2] for place in places if place.name.startswith(kind)]
+        if at:
+            axes.plot(*zip(*at, strict=True), marker, color=colour, markersize=9, mew=2.0, linestyle="none", label=kind)
+    ends = [(0.0, 0.0), (left, low), (right, high), *board, *(place.at_mm[:2] for place in places)]
+    for limit, along in zip((axes.set_xlim, axes.set_ylim), zip(*ends, strict=True), strict=True):
+        limit(min(along) - MARGIN_MM, max(along) + MARGIN_MM)
+    finish(axes, "from above", ("base x mm", "base y mm"))
+
+
+def _rectangle(
+    config: RigConfig, corner_mm: tuple[float, float], size_mm: Sequence[float]
+) -> list[tuple[float, float]]:
+    """The corners of a rectangle of the paper frame, in the base frame."""
+    (x, y), (width, height) = corner_mm, size_mm
+    return [to_base(config.paper, *at) for at in ((x, y), (x + width, y), (x + width, y + height), (x, y + height))]
+
+
+def finish(axes: Axes, title: str, along: tuple[str, str] = ("x mm", "y mm")) -> None:
+    """Equal scales, a title, and labels that say what runs `along` the axes."""
+    axes.set_aspect("equal")
+    axes.set_title(title, fontsize=10)
+    axes.set_xlabel(along[0], fontsize=8)
+    axes.set_ylabel(along[1], fontsize=8)
+    axes.tick_params(labelsize=8)
+
+
+def shown_name(name: str) -> str:
+    """A name that every font can show: characters beyond Latin as code points, and nothing that is read as TeX."""
+    return "".join(c if ord(c) < 0x250 else f"U+{ord(c):04X}" for c in name).replace("$", r"\$")
+
+
+# What can be true
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,11 +191,9 @@ class Check:
 
 def within(name: str, value: float, low: float, high: float, unit: str, remedy: str) -> Check:
     """A number that must lie in [low, high]; an infinite `high` is no limit."""
-    unit = f" {unit}" if unit else ""
-    allowed = f"{low:g}{unit} or more" if math.isinf(high) else f"{low:g} to {high:g}{unit}"
-    shown = f"{value:.{0 if isinstance(value, int) else 1}f}{unit}"
+    allowed = f"{low:g} {unit} or more" if math.isinf(high) else f"{low:g} to {high:g} {unit}"
     good = low <= value <= high
-    return Check(name, "plausible" if good else "contradicts", shown, allowed, "" if good else remedy)
+    return Check(name, "plausible" if good else "contradicts", f"{value:.1f} {unit}", allowed, "" if good else remedy)
 
 
 def unmeasured(name: str, value: str, remedy: str) -> Check:
@@ -85,8 +228,11 @@ def deepest_press(max_depth_mm: float, length_mm: float) -> Check:
 
 
 def check_rig(config: RigConfig) -> list[Check]:
-    """Every check, in the order in which the first day teaches the values."""
-    return [*_tool(config), *_camera_and_sheet(config), *_places(config), *_motion_and_force(config)]
+    """Every check, in the order in which the first day teaches the values.
+
+    What a protocol needs of the rig (speeds, poses, room on the sheet) is checked with the protocol.
+    """
+    return [*_tool(config), *_camera_and_sheet(config), *_places(config), *_force(config)]
 
 
 def contradictions(checks: list[Check]) -> int:
@@ -126,9 +272,6 @@ def _camera_and_sheet(config: RigConfig) -> Iterator[Check]:
         yield unmeasured("camera settings", value, remedy)
     if camera.optics is None:
         yield unmeasured("lens", "not calibrated", "brushloop camera intrinsics makes camera.lens_file.")
-    elif (set_to := (camera.locked.width, camera.locked.height)) not in ((None, None), camera.optics.size_px):
-        value = "calibrated at {} x {} px".format(*camera.optics.size_px)
-        yield Check("lens", "contradicts", value, "{} x {} px".format(*set_to), "Calibrate it at camera.locked's size.")
     measure = _metres(board.square_mm) or "Measure ten squares of the print with calipers and divide by ten."
     yield within("square of the board", board.square_mm, 3.0, 60.0, "mm", measure)
     # Corners must be seen on all sides of the sheet.
@@ -136,8 +279,6 @@ def _camera_and_sheet(config: RigConfig) -> Iterator[Check]:
     rim_mm = min(*(-o for o in board.origin_mm), *far_mm)
     remedy = "The sheet lies in the middle of a board that is larger than it: print a larger one, or teach the sheet."
     yield within("board around the sheet", rim_mm, 8.0, math.inf, "mm", remedy)
-    patches = Sheet(paper).capacity
-    yield within("patches on a sheet", patches, 1, math.inf, "", "paper.cell_mm does not fit on paper.size_mm.")
     points = len(touch.points_mm) or 1
     if touch.method == "taught" or points < 3:
         value = "taught by hand" if touch.method == "taught" else f"{points} touch points: taken as level"
@@ -157,15 +298,15 @@ def _places(config: RigConfig) -> Iterator[Check]:
     else:
         remedy = "Raise motion.safe_z_mm: a drop, or a tip bent by its ink, would catch the rim."
         yield within("travel above the rim", motion.safe_z_mm - ink.wipe.z_mm, 15.0, math.inf, "mm", remedy)
-    box_mm, places = (limits.x_mm, limits.y_mm, limits.z_mm), places_of(config)
-    ends = {place.name: (place.at_mm, (*place.at_mm[:2], place.top_mm)) for place in places}
+    box_mm = (limits.x_mm, limits.y_mm, limits.z_mm)
+    ends = {place.name: (place.at_mm, (*place.at_mm[:2], place.top_mm)) for place in places_of(config)}
+    margins_mm = {
+        name: min(min(v - low, high - v) for end in both for v, (low, high) in zip(end, box_mm, strict=True))
+        for name, both in ends.items()
+    }
+    outermost = min(margins_mm, key=lambda name: margins_mm[name])
     remedy = "Outside the box of limits: brushloop rig teach limits, or correct the place."
-    inside: list[Check] = []
-    for name, both in ends.items():
-        margin_mm = min(min(v - low, high - v) for end in both for v, (low, high) in zip(end, box_mm, strict=True))
-        inside.append(within(f"inside the box, {name}", margin_mm, 0.0, math.inf, "mm", remedy))
-    wrong = [check for check in inside if check.verdict == "contradicts"]
-    yield from wrong or [dataclasses.replace(inside[0], name=f"inside the box, {len(places)} places", value="all")]
+    yield within(f"inside the box, {outermost}", margins_mm[outermost], 0.0, math.inf, "mm", remedy)
     along = zip(*(end for both in ends.values() for end in both), strict=True)
     room_mm = max(max(min(v) - low, high - max(v)) for v, (low, high) in zip(along, box_mm, strict=True))
     remedy = "The box should enclose what was taught and little more: brushloop rig teach limits."
@@ -176,13 +317,8 @@ def _places(config: RigConfig) -> Iterator[Check]:
     yield within("park beside the board", outside_mm, PARK_CLEAR_MM, math.inf, "mm", remedy)
 
 
-def _motion_and_force(config: RigConfig) -> Iterator[Check]:
-    limits, motion, force = limits_of(config), config.motion, config.force
-    remedy = "The driver refuses every move at this speed: change it, or [robot.limits]."
-    yield within("travel speed", motion.travel_speed_mm_s, 0.1, limits.speed_mm_s, "mm/s", remedy)
-    yield within("press speed", motion.press_speed_mm_s, 0.1, limits.speed_mm_s, "mm/s", remedy)
-    yield within("touch speed", config.touch.speed_mm_s, 0.1, limits.speed_mm_s, "mm/s", remedy)
-    yield within("acceleration", motion.acc_mm_s2, 1.0, limits.acc_mm_s2, "mm/s2", remedy)
+def _force(config: RigConfig) -> Iterator[Check]:
+    force = config.force
     if force is None:
         yield unmeasured("force", "no sensor", "Only the arm itself stops a press that meets something hard.")
         return

@@ -25,7 +25,7 @@ import statistics
 import time
 import zipfile
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -61,7 +61,7 @@ class Finding:
 
     device: str
     address: str
-    answers: bool
+    answers: bool = False
     identity: str = ""
     firmware: str = ""
     latency_ms: float | None = None
@@ -79,49 +79,47 @@ class Finding:
         """Every field, and the verdict."""
         return {**asdict(self), "well": self.well}
 
+    def answered(
+        self, identity: Identity, latency_ms: float | None, notes: str, problem: str = "", remedy: str = ""
+    ) -> Finding:
+        """The same with what the device says of itself, and what is wrong with it."""
+        notes += ", simulated" if identity.simulated else ""
+        return Finding(
+            self.device,
+            self.address,
+            answers=True,
+            identity=identity.model,
+            firmware=identity.firmware,
+            latency_ms=latency_ms,
+            notes=notes,
+            problem=problem,
+            remedy=remedy,
+        )
+
 
 async def examine(config: RigConfig, clock: Clock) -> list[Finding]:
     """One finding for each configured device, in the order in which a session connects them."""
-    findings = [await _asked("camera", config.camera.source, lambda: _camera(config, clock))]
+    camera = Finding("camera", config.camera.source)
+    findings = [await _asked(camera, _camera(camera, config, clock))]
     if (force := config.force) is not None:
         gateway = "" if force.host is None else f" at {force.host}:{force.port}"
-        bus = f"{force.interface} {force.channel}{gateway}"
-        findings.append(await _asked("force", bus, lambda: _force(force, clock)))
+        sensor = Finding("force", f"{force.interface} {force.channel}{gateway}")
+        findings.append(await _asked(sensor, _force(sensor, force, clock)))
     if (ink := config.ink.device) is not None:
-        findings.append(await _asked("ink", ink.port, lambda: _ink(ink, clock)))
-    address = f"{config.robot.host}:{config.robot.port}"
-    findings.append(await _asked("robot", address, lambda: _robot(config, clock)))
+        station = Finding("ink", ink.port)
+        findings.append(await _asked(station, _ink(station, ink, clock)))
+    robot = Finding("robot", f"{config.robot.host}:{config.robot.port}")
+    findings.append(await _asked(robot, _robot(robot, config, clock)))
     return findings
 
 
-@dataclass(frozen=True, slots=True)
-class _Answer:
-    """What a device says of itself, and what is wrong with it."""
-
-    identity: Identity
-    latency_ms: float | None
-    notes: str
-    problem: str = ""
-    remedy: str = ""
-
-
-async def _asked(device: str, address: str, ask: Callable[[], Awaitable[_Answer]]) -> Finding:
+async def _asked(silent: Finding, answer: Awaitable[Finding]) -> Finding:
+    """The answer of a device, or why there is none."""
     try:
-        answer = await ask()
+        return await answer
     except DeviceError as error:
         remedy = error.remedy or "Check power, cable and address."
-        return Finding(device, address, answers=False, problem=f"{error.op}: {error.what}", remedy=remedy)
-    return Finding(
-        device,
-        address,
-        answers=True,
-        identity=answer.identity.model,
-        firmware=answer.identity.firmware,
-        latency_ms=answer.latency_ms,
-        notes=answer.notes + (", simulated" if answer.identity.simulated else ""),
-        problem=answer.problem,
-        remedy=answer.remedy,
-    )
+        return replace(silent, problem=f"{error.op}: {error.what}", remedy=remedy)
 
 
 async def _timed(calls: int, ask: Callable[[], Awaitable[T]]) -> tuple[T, float]:
@@ -135,7 +133,7 @@ async def _timed(calls: int, ask: Callable[[], Awaitable[T]]) -> tuple[T, float]
             return answer, statistics.median(waits_ms)
 
 
-async def _camera(config: RigConfig, clock: Clock) -> _Answer:
+async def _camera(finding: Finding, config: RigConfig, clock: Clock) -> Finding:
     notices: list[str] = []
     camera = OpenCvCamera(config.camera, clock, notices.append)
     try:
@@ -148,12 +146,12 @@ async def _camera(config: RigConfig, clock: Clock) -> _Answer:
         plane = await asyncio.to_thread(see_board, frame.image, config.board, lens=config.camera.optics)
     except CalibrationError as error:
         remedy = "Put the configured board into view, in focus and evenly lit."
-        return _Answer(identity, latency_ms, "; ".join(notices), f"board: {error.what}", remedy)
+        return finding.answered(identity, latency_ms, "; ".join(notices), f"board: {error.what}", remedy)
     board = f"board: {plane.corners} corners, residual {plane.rms_px:.2f} px, {plane.mm_per_px:.4f} mm/px"
-    return _Answer(identity, latency_ms, "; ".join([board, *notices]))
+    return finding.answered(identity, latency_ms, "; ".join([board, *notices]))
 
 
-async def _force(config: ForceTable, clock: Clock) -> _Answer:
+async def _force(finding: Finding, config: ForceTable, clock: Clock) -> Finding:
     sensor = SriM8123(config, clock)
     try:
         identity = await sensor.connect()
@@ -169,10 +167,12 @@ async def _force(config: ForceTable, clock: Clock) -> _Answer:
     elif force_n > config.max_n:
         problem = f"{force_n:.2f} N with nothing pressing, above the ceiling force.max_n = {config.max_n:g} N"
         remedy = "Remove what touches the brush; the bias at each start takes off the weight of the holder."
-    return _Answer(identity, age_ms, f"{health.rate_hz:.0f} rounds/s, {force_n:.3f} N before bias", problem, remedy)
+    return finding.answered(
+        identity, age_ms, f"{health.rate_hz:.0f} rounds/s, {force_n:.3f} N before bias", problem, remedy
+    )
 
 
-async def _ink(config: InkTable, clock: Clock) -> _Answer:
+async def _ink(finding: Finding, config: InkTable, clock: Clock) -> Finding:
     device = config.device(clock)
     try:
         identity = await device.connect()
@@ -180,11 +180,11 @@ async def _ink(config: InkTable, clock: Clock) -> _Answer:
     finally:
         await device.close()
     if level is None:
-        return _Answer(identity, None, "no gauge")
-    return _Answer(identity, latency_ms, f"well {level:.0%} full")
+        return finding.answered(identity, None, "no gauge")
+    return finding.answered(identity, latency_ms, f"well {level:.0%} full")
 
 
-async def _robot(config: RigConfig, clock: Clock) -> _Answer:
+async def _robot(finding: Finding, config: RigConfig, clock: Clock) -> Finding:
     notices: list[str] = []
     robot = make_robot(config, clock, notices.append)
     try:
@@ -198,7 +198,7 @@ async def _robot(config: RigConfig, clock: Clock) -> _Answer:
     elif state.mode not in (RobotMode.POWER_OFF, RobotMode.IDLE, RobotMode.RUNNING):
         problem, remedy = f"robot mode is {state.mode}", "Look at the pendant."
     notes = "; ".join([*notices, f"{state.mode}, safety {state.safety}"])
-    return _Answer(identity, state.latency_ms, notes, problem, remedy)
+    return finding.answered(identity, state.latency_ms, notes, problem, remedy)
 
 
 def doctor_table(findings: list[Finding]) -> Table:

@@ -12,9 +12,9 @@ from brushloop.calibrate.files import read_gray
 from brushloop.collect.errors import CannotTeach, ConfigError
 from brushloop.collect.photograph.frames import ARM_SHARE, Thumbnail, changed_share, thumbnail
 from brushloop.collect.planning.limit_check import ask_reach
+from brushloop.collect.rig.check import draw_rig
 from brushloop.collect.rig.config import TRAVEL_CLEARANCE_MM, PaperConfig, RigConfig
 from brushloop.collect.rig.paper import to_base, to_paper
-from brushloop.collect.rig.show import draw_rig
 from brushloop.collect.teach.arm import ArmReader, taught_arm, tip_of, touch
 from brushloop.collect.teach.camera import shown_live, side_by_side, still, taught_camera
 from brushloop.collect.teach.day import Asked, Day, Step, Target, TargetKind

@@ -18,8 +18,7 @@ from brushloop.calibrate.stroke.rectify import rectify
 from brushloop.collect.errors import StepError
 from brushloop.collect.motion import Dip, Move, Procedures, touching, up
 from brushloop.collect.photograph.frames import Gray, undistorted
-from brushloop.collect.rig.config import RigConfig
-from brushloop.collect.rig.config_touch import TouchConfig
+from brushloop.collect.rig.config import RigConfig, TouchConfig
 from brushloop.collect.rig.paper import PaperPlane, fit_plane
 from brushloop.collect.touch.force import Floats
 from brushloop.collect.touch.heights import (

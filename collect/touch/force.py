@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from brushloop.collect.errors import StepError
 from brushloop.collect.motion import Procedures
-from brushloop.collect.rig.config_touch import ForceTouchConfig, TouchConfig
+from brushloop.collect.rig.config import ForceTouchConfig, TouchConfig
 from brushloop.collect.touch.heights import Reach
 from brushloop.drivers.devices import ForceSample
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from brushloop.collect.errors import StepError
-from brushloop.collect.rig.config import PaperConfig
-from brushloop.collect.rig.config_touch import Method, TouchConfig
+from brushloop.collect.rig.config import Method, PaperConfig, TouchConfig
 from brushloop.collect.rig.paper import PaperPlane, Sheet, fit_plane
 from brushloop.sessions.events import TouchedPoint, ZeroTouchResult
 

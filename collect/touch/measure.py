@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from brushloop.collect.errors import JogGivenUp, StepError
 from brushloop.collect.motion import Dip, Procedures
 from brushloop.collect.operator import Asker, Choice, Prompt
-from brushloop.collect.rig.config_touch import TouchConfig
+from brushloop.collect.rig.config import TouchConfig
 from brushloop.collect.rig.paper import PaperPlane
 from brushloop.collect.touch.camera import FirstInkTouch
 from brushloop.collect.touch.force import ForceTap, RigProbe, Spring, touch_by_force

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from brushloop.collect.errors import StepError
 from brushloop.collect.motion import Dip, Procedures, mark_moves
-from brushloop.collect.rig.config_touch import SelfCheckConfig
+from brushloop.collect.rig.config import SelfCheckConfig
 from brushloop.collect.rig.devices import Rig
 from brushloop.collect.rig.paper import Patch, Sheet
 from brushloop.collect.touch.camera import before_and_after, new_marks

@@ -1,7 +1,7 @@
 """A quality check: a stroke whose ink is unusually dark.
 
 Put such a function into `collect/photograph/checks.py` and its name into `MARK_CHECKS` there. A finding of its own
-needs a name in `Failure` there, and its limit belongs in `QualityConfig` (`collect/rig/config_touch.py`), so that a rig
+needs a name in `Failure` there, and its limit belongs in `QualityConfig` (`collect/rig/config.py`), so that a rig
 can set it. `docs/quality.md` says what it measures.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from brushloop.collect.photograph.checks import Failure
 from brushloop.collect.photograph.measure import Mark
-from brushloop.collect.rig.config_touch import QualityConfig
+from brushloop.collect.rig.config import QualityConfig
 from brushloop.sessions.records import Check
 
 DARKEST_TONE = 0.97

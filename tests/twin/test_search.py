@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from brushloop.calibrate.compare import Field
 from brushloop.calibrate.fit.captures import Grid, Pressed, grid_of
-from brushloop.collect.rig.config_touch import QualityConfig
+from brushloop.collect.rig.config import QualityConfig
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 from brushloop.drivers.sim.brush.spec import ALLOWED, PAPER, load_brush
 from brushloop.twin.brush import HERE, SHAPE, SPREAD, Constant, draw, with_values

@@ -13,7 +13,7 @@ import pytest
 
 from bench.brushes import DATA as SHARED
 from brushloop.collect.photograph.checks import Failure, Verdict, check_capture
-from brushloop.collect.rig.config_touch import QualityConfig
+from brushloop.collect.rig.config import QualityConfig
 from brushloop.collect.rig.paper import Patch
 from tests.calibrate.given import flat_plane
 

@@ -17,7 +17,7 @@ from brushloop.calibrate.board.pix2len import Plane
 from brushloop.calibrate.stroke import PX_PER_MM
 from brushloop.collect.photograph.checks import Failure, check_capture, check_drawing, check_frame, patch_is_blank
 from brushloop.collect.photograph.measure import Ink, Window, blur_px, glare, measure_mark, paper_level
-from brushloop.collect.rig.config_touch import QualityConfig
+from brushloop.collect.rig.config import QualityConfig
 from brushloop.collect.rig.paper import Patch
 from tests.calibrate.given import flat_plane
 

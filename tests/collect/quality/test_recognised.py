@@ -9,7 +9,7 @@ import pytest
 
 from bench.quality import SPOTLESS_MM2, Bench, Blank, Sample, Score, score
 from brushloop.collect.photograph.checks import Failure, check_capture, patch_is_blank
-from brushloop.collect.rig.config_touch import QualityConfig
+from brushloop.collect.rig.config import QualityConfig
 
 pytestmark = pytest.mark.xdist_group("quality")  # drawn once
 EACH, SOUND = 2, 10

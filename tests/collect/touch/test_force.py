@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brushloop.collect.errors import StepError
-from brushloop.collect.rig.config_touch import ForceTouchConfig
+from brushloop.collect.rig.config import ForceTouchConfig
 from brushloop.collect.touch import force
 from brushloop.collect.touch.camera import first_ink
 from brushloop.collect.touch.force import Contact, Reading, find_contact, touch_by_force

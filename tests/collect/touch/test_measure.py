@@ -19,8 +19,7 @@ from brushloop.collect.operator import Asker
 from brushloop.collect.planning.limit_check import check_step
 from brushloop.collect.planning.walk import moves_of
 from brushloop.collect.protocols.steps import SelfCheckStep, ZeroTouchStep
-from brushloop.collect.rig.config import PaperConfig, RigConfig
-from brushloop.collect.rig.config_touch import TouchConfig
+from brushloop.collect.rig.config import PaperConfig, RigConfig, TouchConfig
 from brushloop.collect.rig.paper import PaperPlane, Sheet
 from brushloop.collect.touch.heights import PlaneResult, Touch, at_one_point, used_patches
 from brushloop.collect.touch.measure import Jogged, asked, measure_plane

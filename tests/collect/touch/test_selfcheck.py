@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from brushloop.collect.errors import StepError
-from brushloop.collect.rig.config import PaperConfig
-from brushloop.collect.rig.config_touch import SelfCheckConfig
+from brushloop.collect.rig.config import PaperConfig, SelfCheckConfig
 from brushloop.collect.rig.paper import Patch, Sheet, to_base
 from brushloop.collect.touch.selfcheck import (
     Triangle,

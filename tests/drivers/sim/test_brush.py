@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 import brushloop.__main__
 from bench.brushes import FROZEN
-from brushloop.collect.rig.config_touch import QualityConfig
+from brushloop.collect.rig.config import QualityConfig
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Flaw, Waypoint
 from brushloop.drivers.sim.brush.footprint import COHESIVE_LOAD, flaw_of_load, natural_split
 from brushloop.drivers.sim.brush.paper import Footprint
