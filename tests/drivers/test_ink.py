@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from brushloop.drivers.devices import Ink
 from brushloop.drivers.errors import (
     ConnectionLost,
     DeviceError,
@@ -80,7 +79,6 @@ async def test_a_session_reads_like_the_documented_one(clock: PatientClock):
     ]
     with scripted(exchanges, clock) as path:
         station = station_at(path)
-        assert isinstance(station, Ink)
         identity = await station.connect()
         assert (identity.model, identity.firmware, identity.simulated) == ("ink-station", "1.0.0", False)
         assert await station.light() == 0.5
@@ -292,7 +290,6 @@ async def pump(pump_line: PtyLine, rotor: PumpFirmware) -> AsyncIterator[ModbusP
 async def test_a_dose_sets_the_speed_starts_and_stops(clock: PatientClock):
     with scripted([*CONNECTED, (SPEED, SPEED), (START, START), (STOP, STOP), *BYE], clock) as path:
         pump = pump_at(path)
-        assert isinstance(pump, Ink)
         identity = await pump.connect()
         assert (identity.model, identity.simulated) == ("Modbus RTU pump, unit 1", False)
         began = time.monotonic()
