@@ -30,7 +30,6 @@ from brushloop.collect.rig.devices import limits_of
 from brushloop.collect.rig.paper import PaperPlane, Patch, Sheet
 from brushloop.collect.touch.selfcheck import triangle_in
 from brushloop.drivers.arcs.controller import Controller, six
-from brushloop.drivers.arcs.robot import AUBOPE_PORT
 from brushloop.drivers.arcs.wire import RpcConnection, open_arcs
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import LimitExceeded, ProtocolViolation
@@ -195,7 +194,7 @@ async def ask_reach(rig_path: Path, config: RigConfig, poses: Iterable[tuple[Pos
     robot = config.robot
     controller = Controller(RpcConnection(robot.host, robot.port, framing=robot.framing))
     try:
-        await open_arcs(controller.connection, AUBOPE_PORT)
+        await open_arcs(controller.connection)
         await controller.connection.login()
         [controller.robot, *_] = await controller.robot_names()
         offset = await _tool(controller)

@@ -13,7 +13,6 @@ from brushloop.collect.rig.config import RigConfig
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.camera import OpenCvCamera
 from brushloop.drivers.devices import Identity
-from brushloop.drivers.errors import noting_lateness
 from brushloop.drivers.force.sri_m8123 import SriM8123
 from brushloop.drivers.host import Claimed, Clock, claimed
 from brushloop.drivers.ink.port import InkDevice
@@ -84,7 +83,6 @@ async def connected(config: RigConfig, clock: Clock, on_notice: Callable[[str], 
     """
     async with contextlib.AsyncExitStack() as stack:
         stack.enter_context(sole_driver(config.robot.host, config.robot.port))
-        await stack.enter_async_context(noting_lateness())
         camera = OpenCvCamera(config.camera, clock, on_notice)
         stack.push_async_callback(camera.close)
         camera_identity = await camera.connect()

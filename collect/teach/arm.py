@@ -17,7 +17,6 @@ from brushloop.collect.rig.doctor import Finding, Scrubber, numbers_only, transc
 from brushloop.collect.teach.day import Asked, Day, Step, Target
 from brushloop.collect.teach.store import Notebook, touch_of
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, Controller, six
-from brushloop.drivers.arcs.robot import AUBOPE_PORT
 from brushloop.drivers.arcs.wire import DEVICE, Framing, RpcConnection, answers, numbers, open_arcs
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, ProtocolViolation, RpcError
@@ -162,7 +161,7 @@ async def reading(host: str, port: int, framing: Framing) -> AsyncGenerator[ArmR
     connection = RpcConnection(host, port, framing=framing)
     controller = Controller(connection)
     try:
-        await open_arcs(connection, AUBOPE_PORT)
+        await open_arcs(connection)
         await connection.login()
         [controller.robot, *_] = await controller.robot_names()
         yield ArmReader(controller)

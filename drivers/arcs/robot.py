@@ -29,7 +29,6 @@ from brushloop.drivers.limits import Limits
 
 __all__ = ["ArcsTable", "ArmState", "AuboArcs"]
 
-AUBOPE_PORT = 8899
 STOP_ACC_M_S2 = 2.0
 _R = TypeVar("_R")
 
@@ -82,7 +81,7 @@ class AuboArcs:
             raise
 
     async def _connect(self) -> Identity:
-        await open_arcs(self._state.connection, AUBOPE_PORT)
+        await open_arcs(self._state.connection)
         version = await self._state.connection.call("SystemInfo.getInterfaceVersionCode")
         await self._state.connection.login()
         for controller in (self._stop, self._motion):

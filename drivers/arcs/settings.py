@@ -25,7 +25,6 @@ from brushloop.drivers.errors import (
     NotConnected,
     NotPowered,
     ProtocolViolation,
-    RpcError,
     SettingsChanged,
 )
 from brushloop.drivers.geometry import distance, from_wire
@@ -66,14 +65,12 @@ class ArcsTable(BaseModel, frozen=True, extra="forbid"):
     """Centre of that mass, from the flange."""
 
 
-METHOD_NOT_FOUND = -32601
 POWER_S = 60.0
 """Longest wait for a mode: brakes take seconds, and a person may have to confirm on the pendant."""
 TOLERANCE = 1e-3
 """Largest difference in mm, deg and kg: a controller may keep single precision."""
 
-Value = tuple[float, ...] | str | None
-"""None if the controller has no such setting."""
+Value = tuple[float, ...] | str
 Settings = Mapping[str, Value]
 """By name, in the units of `SETTINGS`."""
 
@@ -144,10 +141,6 @@ async def read_back(controller: Controller) -> Settings:
     for setting in SETTINGS:
         try:
             values[setting.name] = setting.read(await controller.ask(setting.getter))
-        except RpcError as error:
-            if error.code != METHOD_NOT_FOUND:
-                raise
-            values[setting.name] = None
         except (TypeError, ValueError) as error:
             raise ProtocolViolation(DEVICE, setting.getter.rpartition(".")[2], str(error)) from None
     return values
@@ -190,7 +183,7 @@ def _tool(offset: tuple[float, ...]) -> Pose:
 def _in_words(setting: Setting, value: Value) -> str:
     """`(0, 0, 180) mm, (0, 0, 0) deg`."""
     if not isinstance(value, tuple):
-        return value or "unknown to the controller"
+        return value
     parts: list[str] = []
     for unit, group in itertools.groupby(zip(value, setting.units, strict=True), key=lambda pair: pair[1]):
         figures = [f"{round(number, 4) + 0.0:g}" for number, _ in group]
@@ -205,7 +198,11 @@ async def make_ready(controller: Controller, table: ArcsTable, on_notice: Callab
     Raises `WrongOperationalMode`, `MotionRefused` for a setting that the controller refuses, and `SettingsChanged` for
     one that it accepted but did not apply.
     """
-    _require_automatic((await read_back(controller))[OPERATIONAL_MODE], on_notice)
+    mode = (await read_back(controller))[OPERATIONAL_MODE]
+    if mode == "Disabled":
+        on_notice("operational modes are disabled on this cabinet")
+    elif mode != "Automatic":  # manual and unknown modes are for a person next to the arm
+        raise WrongOperationalMode(DEVICE, "power on", str(mode))
     wanted = configured(table)
     for setting in SETTINGS:
         if setting.setter is not None and setting.name in wanted:
@@ -213,8 +210,6 @@ async def make_ready(controller: Controller, table: ArcsTable, on_notice: Callab
             accepted(method, await controller.ask(f"RobotConfig.{method}", **params))
     settings = await read_back(controller)
     require_same("power on", wanted, settings)
-    for name in (name for name, value in settings.items() if value is None and name != OPERATIONAL_MODE):
-        on_notice(f"the controller does not report its {name}: a change would go unnoticed")
     return settings
 
 
@@ -245,16 +240,6 @@ async def _until_mode(controller: Controller, *wanted: RobotMode) -> None:
                 remedy="Look at the pendant: a confirmation may be waiting there.",
             )
         await asyncio.sleep(POLL_S)
-
-
-def _require_automatic(mode: Value, on_notice: Callable[[str], None]) -> None:
-    """Refuse manual and unknown modes: they are for a person next to the arm."""
-    if mode is None:
-        on_notice("the controller has no operational mode to check")
-    elif mode == "Disabled":
-        on_notice("operational modes are disabled on this cabinet")
-    elif mode != "Automatic":
-        raise WrongOperationalMode(DEVICE, "power on", str(mode))
 
 
 MOVED_MM, MOVED_DEG = 0.5, 0.5

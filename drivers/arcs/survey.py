@@ -7,7 +7,6 @@ from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from typing import Any
 
-from brushloop.drivers.arcs.robot import AUBOPE_PORT
 from brushloop.drivers.arcs.telemetry import JOINTS_SEGMENT, POSE_SEGMENT, RtdeStream
 from brushloop.drivers.arcs.wire import Framing, RpcConnection, open_arcs
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, RpcError
@@ -55,7 +54,7 @@ async def survey(host: str, port: int, framing: Framing) -> list[Exchange]:
 async def _asked(connection: RpcConnection) -> AsyncIterator[Exchange]:
     """Ask in the driver's order: version before login, then names of the robots, then everything about the first."""
     try:
-        await open_arcs(connection, AUBOPE_PORT)
+        await open_arcs(connection)
     except DeviceError as error:
         yield Exchange("connect", None, {"refused": str(error)}, 0.0)
         return

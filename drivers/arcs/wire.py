@@ -249,6 +249,8 @@ def named(method: str, values: list[object]) -> dict[str, object]:
 
 DEVICE = "robot"
 Framing = Literal["sof", "bare"]
+AUBOPE_PORT = 8899
+"""Where a cabinet of the generation before ARCS listens."""
 SDK_INTERFACE_VERSION = "0.24.0"
 # What the vendor's client 0.24.1 sends for the factory account; its obfuscation of other passwords is not known.
 FACTORY_LOGIN_TOKEN = "3353545435353664345433434443435463466335333566235443434253142434333426365553"
@@ -417,17 +419,16 @@ class RpcConnection:
             self._pending[2].set_exception(ConnectionLost(DEVICE, self._pending[1], why))
 
 
-async def open_arcs(connection: RpcConnection, aubope_port: int) -> None:
+async def open_arcs(connection: RpcConnection) -> None:
     """Open the connection. Raises `WrongGeneration` if only the older software's port answers."""
     try:
         await connection.open()
     except (ConnectionLost, DeviceTimeout):
-        if await answers(connection.host, aubope_port):
+        if await answers(connection.host, AUBOPE_PORT):
             raise WrongGeneration(
                 DEVICE,
                 "connect",
-                f"port {connection.port} does not answer but {aubope_port} does: this cabinet runs AUBOPE (V4)",
-                remedy="It needs the ARCS software; ask the maker for the upgrade.",
+                f"port {connection.port} does not answer but {AUBOPE_PORT} does: this cabinet runs AUBOPE (V4)",
             ) from None
         raise
 

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, RobotMode
-from brushloop.drivers.arcs.robot import AUBOPE_PORT
+from brushloop.drivers.arcs.wire import AUBOPE_PORT
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL
 from brushloop.drivers.geometry import of_vector, product, turned, unit, vector

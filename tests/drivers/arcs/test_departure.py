@@ -27,7 +27,6 @@ from brushloop.drivers.errors import (
     MotionRefused,
     NotPowered,
     RobotNotSafe,
-    RpcError,
     SettingsChanged,
 )
 from brushloop.drivers.geometry import brush_pose, distance, from_wire, lean
@@ -66,10 +65,7 @@ async def test_a_cabinet_without_operational_modes_is_reported(
 ):
     cabinet.cabinet.operational_mode = "Disabled"
     await enabled(make_arm)
-    del cabinet._methods["rob1.RobotManage.getOperationalMode"]
-    await enabled(make_arm)
-    assert [n for n in notices if "operational mode" in n] == notices
-    assert len(notices) == 2
+    assert notices == ["operational modes are disabled on this cabinet"]
 
 
 async def test_what_is_configured_is_set_in_the_wires_units_and_nothing_moves(make_arm: MakeArm, cabinet: ArcsServer):
@@ -130,18 +126,6 @@ async def test_without_a_message_it_is_just_a_failed_motion(make_arm: MakeArm, c
     with pytest.raises(MotionFailed) as caught:
         await arm.move(BEYOND, **QUICK)
     assert type(caught.value) is MotionFailed
-
-
-async def test_an_error_other_than_unknown_method_is_not_taken_for_an_old_controller(
-    make_arm: MakeArm, cabinet: ArcsServer
-):
-    def broken(_: object) -> object:
-        raise ValueError("broken")
-
-    cabinet._methods["rob1.RobotManage.getOperationalMode"] = broken
-    with pytest.raises(RpcError):
-        await enabled(make_arm)
-    assert cabinet.cabinet.power.mode == RobotMode.POWER_OFF
 
 
 # ---------------------------------------------------------------- the watchdog

@@ -8,8 +8,7 @@ from collections.abc import AsyncIterator, Callable
 
 import pytest
 
-from brushloop.drivers.arcs import robot as robot_module
-from brushloop.drivers.arcs import stopping
+from brushloop.drivers.arcs import stopping, wire
 from brushloop.drivers.arcs.controller import RobotMode, SafetyMode
 from brushloop.drivers.arcs.motion import planned_s
 from brushloop.drivers.arcs.robot import AuboArcs
@@ -102,10 +101,10 @@ async def test_a_cabinet_of_the_older_generation_is_named_as_such(
     arm_at: ArmAt, unused_tcp_port: int, monkeypatch: pytest.MonkeyPatch
 ):
     async with await asyncio.start_server(lambda _, writer: writer.close(), "127.0.0.1", 0) as older:
-        monkeypatch.setattr(robot_module, "AUBOPE_PORT", older.sockets[0].getsockname()[1])
+        monkeypatch.setattr(wire, "AUBOPE_PORT", older.sockets[0].getsockname()[1])
         with pytest.raises(WrongGeneration, match="AUBOPE"):
             await arm_at(unused_tcp_port).connect()
-    monkeypatch.setattr(robot_module, "AUBOPE_PORT", unused_tcp_port)
+    monkeypatch.setattr(wire, "AUBOPE_PORT", unused_tcp_port)
     with pytest.raises(ConnectionLost):
         await arm_at(unused_tcp_port).connect()
 

@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 
 import brushloop.__main__
 from brushloop.drivers.arcs.controller import Controller
-from brushloop.drivers.arcs.robot import AUBOPE_PORT
 from brushloop.drivers.arcs.wire import RpcConnection, open_arcs
 from brushloop.drivers.geometry import from_wire
 from brushloop.drivers.loopback import FaultRefused
@@ -41,7 +40,7 @@ async def lab() -> AsyncIterator[UnknownLab]:
 @pytest.fixture
 async def controller(lab: UnknownLab) -> AsyncIterator[Controller]:
     asked = Controller(RpcConnection(lab.host, ARCS_PORT, timeout_s=10.0))
-    await open_arcs(asked.connection, AUBOPE_PORT)
+    await open_arcs(asked.connection)
     await asked.connection.login()
     [asked.robot, *_] = await asked.robot_names()
     yield asked
