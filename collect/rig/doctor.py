@@ -38,8 +38,8 @@ from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.check import check_rig
 from brushloop.collect.rig.config import PREFIX, RigConfig
 from brushloop.collect.rig.devices import make_robot
-from brushloop.drivers.arcs.controller import MOVING_ALLOWED, RobotMode
-from brushloop.drivers.arcs.survey import rtde_answers, survey
+from brushloop.drivers.arcs.controller import MOVING_ALLOWED, RobotMode, survey
+from brushloop.drivers.arcs.telemetry import rtde_answers
 from brushloop.drivers.arcs.wire import Framing
 from brushloop.drivers.camera import OpenCvCamera
 from brushloop.drivers.devices import Identity, Stamp

@@ -1,5 +1,7 @@
 """Typed calls to the controller: what is sent over one connection, and what codes, modes and errors mean at the arm.
 
+`survey` is a transcript of untyped ones, which change nothing: what a cabinet answered, for a report of a defect.
+
 MotionError
  +-- WrongOperationalMode   the pendant's mode switch is not on Automatic
  +-- MotionRefused
@@ -12,21 +14,24 @@ from __future__ import annotations
 
 import asyncio
 import statistics
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from typing import Any
 
-from brushloop.drivers.arcs.wire import DEVICE, RpcConnection, numbers
+from brushloop.drivers.arcs.wire import DEVICE, Framing, RpcConnection, numbers, open_arcs
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import (
+    ConnectionLost,
     DeviceError,
+    DeviceTimeout,
     MotionError,
     MotionFailed,
     MotionRefused,
     NotPowered,
     ProtocolViolation,
     RobotNotSafe,
+    RpcError,
 )
 from brushloop.drivers.geometry import from_wire, to_wire
 
@@ -307,3 +312,96 @@ def accepted(op: str, code: object) -> None:
         error = QueueFull if code == ReturnCode.QUEUE_FULL else MotionRefused
         name, remedy = ("UNKNOWN", "") if known is None else (known.name, REFUSAL_REMEDY.get(known, ""))
         raise error(DEVICE, op, code, name, remedy)
+
+
+# ---------------------------------------------------------------- a transcript of questions that change nothing
+
+OF_THE_CONTROLLER = (
+    "SystemInfo.getControlSoftwareVersionCode",
+    "SystemInfo.getControlSoftwareFullVersion",
+    "RuntimeMachine.getRuntimeState",
+)
+OF_THE_ROBOT = (
+    *("RobotConfig.getRobotType", "RobotConfig.getRobotSubType", "RobotConfig.getControlBoxType", "RobotConfig.getDof"),
+    *("RobotConfig.getTcpOffset", "RobotConfig.getPayload", "RobotConfig.getCollisionLevel"),
+    *("RobotManage.getOperationalMode", "RobotManage.isSimulationEnabled", "MotionControl.getSpeedFraction"),
+    *("MotionControl.getExecId", "MotionControl.getQueueSize", "RobotState.getRobotModeType"),
+    *("RobotState.getSafetyModeType", "RobotState.isPowerOn", "RobotState.isSteady", "RobotState.getJointState"),
+    *("RobotState.getTcpPose", "RobotState.getJointPositions"),
+)
+"""Asked without parameters; then kinematics are asked where the arm is, and for the newest messages."""
+MESSAGES = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Exchange:
+    """One question and what came back."""
+
+    method: str
+    params: dict[str, Any] | None
+    answer: dict[str, Any]
+    """`result` or `error` as the controller sent it, else `silence`, `lost` or `refused`: why there is none."""
+    took_ms: float
+
+
+async def survey(host: str, port: int, framing: Framing) -> list[Exchange]:
+    """Ask everything on one connection. An answer that is missing or senseless is noted, and the next one asked.
+
+    Ends early where the controller does not connect or hangs up. Sets, powers and moves nothing.
+    """
+    connection = RpcConnection(host, port, framing=framing)
+    try:
+        return [exchange async for exchange in _asked(connection)]
+    finally:
+        await connection.close()
+
+
+async def _asked(connection: RpcConnection) -> AsyncIterator[Exchange]:
+    """Ask in the driver's order: version before login, then names of the robots, then everything about the first."""
+    try:
+        await open_arcs(connection)
+    except DeviceError as error:
+        yield Exchange("connect", None, {"refused": str(error)}, 0.0)
+        return
+    answers: dict[str, Any] = {}
+
+    async def ask(method: str, params: dict[str, Any] | None = None) -> Exchange:
+        exchange = await _exchange(connection, method, params)
+        answers[method.rpartition(".")[2]] = exchange.answer.get("result")
+        return exchange
+
+    yield await ask("SystemInfo.getInterfaceVersionCode")
+    try:
+        await connection.login()
+    except DeviceError as error:
+        yield Exchange("login", None, {"refused": str(error)}, 0.0)
+        if connection.lost:
+            return
+    yield await ask("getRobotNames")
+    names = answers["getRobotNames"]
+    robot = str(names[0]) if isinstance(names, list) and names else "rob1"  # pyright: ignore[reportUnknownArgumentType]
+    for method in (*OF_THE_CONTROLLER, *(f"{robot}.{name}" for name in OF_THE_ROBOT)):
+        if connection.lost:
+            return
+        yield await ask(method)
+    joints, pose = answers["getJointPositions"], answers["getTcpPose"]
+    if isinstance(joints, list) and isinstance(pose, list):
+        yield await ask(f"{robot}.RobotAlgorithm.forwardKinematics", {"q": joints})
+        yield await ask(f"{robot}.RobotAlgorithm.inverseKinematics", {"qnear": joints, "pose": pose})
+    yield await ask(f"{robot}.Trace.peek", {"num": MESSAGES, "last_time": 0})
+
+
+async def _exchange(connection: RpcConnection, method: str, params: dict[str, Any] | None) -> Exchange:
+    loop = asyncio.get_running_loop()
+    began = loop.time()
+    try:
+        answer: dict[str, Any] = {"result": await connection.call(method, params)}
+    except RpcError as error:
+        answer = {"error": {"code": error.code, "message": error.message}}
+    except DeviceTimeout as error:
+        answer = {"silence": error.what}
+    except ConnectionLost as error:
+        answer = {"lost": error.what}
+    except DeviceError as error:
+        answer = {"refused": error.what}
+    return Exchange(method, params, answer, (loop.time() - began) * 1e3)

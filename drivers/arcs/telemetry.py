@@ -112,6 +112,8 @@ def decode_message(payload: bytes, device: str) -> tuple[int, list[Any]]:
 
 STREAM = "robot telemetry"
 CHANNEL = 0
+POSE_SEGMENT = "R1_actual_TCP_pose"
+JOINTS_SEGMENT = "R1_actual_q"
 
 
 class RtdeStream:
@@ -192,6 +194,21 @@ class RtdeStream:
                 await writer.wait_closed()
 
 
+async def rtde_answers(host: str, port: int) -> dict[str, Any]:
+    """What RTDE offers by name, and the newest sample of pose and joints; `refused` says why something is missing."""
+    stream = RtdeStream(host, port)
+    answers: dict[str, Any] = {}
+    try:
+        await stream.open((POSE_SEGMENT, JOINTS_SEGMENT), 50.0)
+        answers["offered"] = stream.offered
+        answers["sample"] = await stream.newest()
+    except DeviceError as error:
+        answers |= {"offered": stream.offered, "refused": str(error)}
+    finally:
+        await stream.close()
+    return answers
+
+
 QUICK_S = 0.05
 """An answer that took longer, as on a busy computer, does not say well enough when the arm was there."""
 MOVED_MM = 0.2
@@ -250,8 +267,6 @@ class LagMeter:
         return max(0.0, round(1e3 * float(lags_s[best]), 1)) if misfit_mm[best] <= MISFIT_SHARE * extent_mm else None
 
 
-POSE_SEGMENT = "R1_actual_TCP_pose"
-JOINTS_SEGMENT = "R1_actual_q"
 RATE_HZ = 100.0
 STALE_MS = 500.0
 MOST_SILENCES = 3

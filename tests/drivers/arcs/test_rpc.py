@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from brushloop.drivers.arcs.controller import survey
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.arcs.settings import ArcsTable
-from brushloop.drivers.arcs.survey import survey
 from brushloop.drivers.arcs.wire import RpcConnection, encode
 from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation, RpcError
 from brushloop.drivers.limits import Limits
