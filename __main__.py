@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import sys
+from collections.abc import Callable
 from io import TextIOWrapper
 from pathlib import Path
 from traceback import format_exc
@@ -16,6 +17,7 @@ import brushloop.collect.cli
 import brushloop.sessions.cli
 from brushloop.calibrate import commands
 from brushloop.calibrate.commands import PathOrCommand, command
+from brushloop.collect import chains
 from brushloop.sessions.terminal import plain, say
 
 EXIT_CODES = {
@@ -86,6 +88,11 @@ def _print_version(asked: bool) -> None:
         raise typer.Exit
 
 
+def run_chain(chain: Callable[[Any], object], request: Any) -> None:
+    """Carry out a command whose stages show their own progress and results."""
+    chain(request)
+
+
 @app.callback()
 def options(
     version: Annotated[
@@ -118,7 +125,7 @@ loop = typer.Typer(
     cls=PathOrCommand,
     help="Recover the presses of a SESSION, press them again and compare (`brushloop loop SESSION`), or only compare.",
 )
-loop.command("session")(brushloop.collect.cli.loop)
+loop.command("session")(command(chains.LoopRequest, "collect.chains.loop:run_loop", run_chain))
 loop.command("compare")(command(commands.CompareLoopRequest, "calibrate.loop:compare"))
 app.add_typer(loop, name="loop")
 brushloop.sessions.cli.app.command("export")(command(commands.ExportRequest, "calibrate.export:export"))
@@ -127,7 +134,7 @@ write = typer.Typer(
     cls=PathOrCommand,
     help="Write characters on the rig and compare them (`brushloop write 字 --config ...`), or only plan or compare.",
 )
-write.command("characters")(brushloop.collect.cli.write)
+write.command("characters")(command(chains.WritingRequest, "collect.chains.writing:write", run_chain))
 write.command("plan")(command(commands.PlanRequest, "calibrate.writing.plan:plan"))
 write.command("compare")(command(commands.CompareWrittenRequest, "calibrate.writing.compare:compare"))
 write.command("learn")(command(commands.LearnRequest, "calibrate.writing.learn:learn"))
@@ -230,24 +237,7 @@ def hand(
     say(ask(control, {"do": "hand", **{name: value for name, value in wanted.items() if value is not None}})["says"])
 
 
-@app.command()
-def demo(
-    out: Annotated[Path, typer.Option(help="Folder for everything that the demo makes.")] = Path("demo-run"),
-    full: Annotated[
-        bool, typer.Option("--full", help="More presses, and a written character: all three tables.")
-    ] = False,
-    repeats: Annotated[int, typer.Option(min=1, max=2, help="Presses per (H, alpha); one sheet holds two.")] = 2,
-    rate: Annotated[float, typer.Option(min=0.01, max=1000, help="Simulated seconds per real second.")] = 60.0,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the rig and of the order of presses.")] = 1,
-    brush: Annotated[
-        Path, typer.Option(help="The rig's brush: `paper`, `loopback`, or one described in a brush.toml.")
-    ] = Path("paper"),
-) -> None:
-    """Press, calibrate, press again and validate on the loopback rig. Run it again to continue where it stopped."""
-    from brushloop.collect.chains.demo import FULL, QUICK, Demo
-
-    if code := Demo(out, FULL if full else QUICK, repeats, rate, seed, brush).run():
-        raise typer.Exit(code)
+app.command("demo")(command(chains.DemoRequest, "collect.chains.demo:demo", run_chain))
 
 
 def main() -> None:

@@ -53,13 +53,13 @@ def show_work(work: Callable[[Request, Progress], Result], request: Request) -> 
     return result
 
 
-def command(request: type[Any], work: str) -> Callable[..., None]:
-    """A command that fills a request and gives it to `work`, a function of brushloop as `module:name`."""
+def command(request: type[Any], work: str, carry_out: Callable[[Any, Any], object] = show_work) -> Callable[..., None]:
+    """A command that fills a request and carries out `work` on it, a function of brushloop as `module:name`."""
 
     def run(**options: Any) -> None:
         module, _, name = work.partition(":")
         values = {option: tuple(value) if option in repeated else value for option, value in options.items()}
-        show_work(getattr(import_module(f"brushloop.{module}"), name), request(**values))
+        carry_out(getattr(import_module(f"brushloop.{module}"), name), request(**values))
 
     hints = get_type_hints(request, include_extras=True)
     parameters, repeated = list[Parameter](), set[str]()

@@ -1,4 +1,4 @@
-"""The commands `collect`, `collect plan`, `doctor`, `loop`, `write` and those of `rig`, and the start screen.
+"""The commands `collect`, `collect plan`, `doctor` and those of `rig`, and the start screen.
 
 Imports wait until a command runs, so that `--help` loads nothing heavy.
 """
@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from brushloop.calibrate.commands import PathOrCommand
+from brushloop.collect.chains import Arm, Rig, Tui, on_screen
 from brushloop.sessions.terminal import say
 
 if TYPE_CHECKING:
@@ -17,28 +19,27 @@ if TYPE_CHECKING:
     from brushloop.collect.engine.open_or_resume import Opening
     from brushloop.collect.tui.teach_app import ScreenGuide
 
-app = typer.Typer(invoke_without_command=True, pretty_exceptions_enable=False)
+app = typer.Typer(
+    cls=PathOrCommand,
+    help="Collect strokes (`brushloop collect --config ... --protocol ...`), or only plan them.",
+    pretty_exceptions_enable=False,
+)
 rig_app = typer.Typer(
     help="Teach a rig on its first day; show and check its rig.toml.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
 
-Rig = Annotated[Path, typer.Option(help="The rig: addresses, frames, limits.")]
-Arm = Annotated[bool, typer.Option("--arm", help="Let real hardware move.")]
-Tui = Annotated[bool | None, typer.Option("--tui/--no-tui", help="Show the screen; default: if there is a terminal.")]
 RigFile = Annotated[Path, typer.Argument(help="The rig: addresses, frames, limits.")]
 TeachArm = Annotated[
     bool, typer.Option("--arm", help="Let the arm move where a step needs it; a key confirms each time.")
 ]
-NewSheet = Annotated[int | None, typer.Option(min=1, help="Confirm that sheet N is in, as for collect.")]
 
 
-@app.callback()
+@app.command("strokes")
 def collect(
-    ctx: typer.Context,
-    config: Annotated[Path | None, typer.Option(help="The rig: addresses, frames, limits; required.")] = None,
-    protocol: Annotated[Path | None, typer.Option(help="The protocol.toml to carry out; required.")] = None,
+    config: Rig,
+    protocol: Annotated[Path, typer.Option(help="The protocol.toml to carry out.")],
     out: Annotated[Path, typer.Option(help="Folder that holds sessions.")] = Path("sessions"),
     new: Annotated[bool, typer.Option("--new", help="Start a new session although one is open.")] = False,
     sheet: Annotated[
@@ -58,14 +59,11 @@ def collect(
     live_port: Annotated[int, typer.Option(min=0, max=65535, help="Port of --live; 0: any.")] = 8765,
 ) -> None:
     """Collect strokes. Ctrl-C stops the arm; run the same command again to resume."""
-    if ctx.invoked_subcommand is not None:
-        return
-    if config is None or protocol is None:
-        ctx.fail(f"Missing option '{'--config' if config is None else '--protocol'}'.")
     from brushloop.collect import start
     from brushloop.collect.engine.live import LiveView
+    from brushloop.collect.errors import StrokesLeftOut
 
-    on_screen = _on_screen(tui)
+    screen = on_screen(tui)
     request = start.CollectRequest(
         config,
         protocol,
@@ -73,18 +71,15 @@ def collect(
         new=new,
         sheet=sheet,
         armed=arm,
-        on_screen=on_screen,
-        guided=set_up and on_screen,
+        on_screen=screen,
+        guided=set_up and screen,
         live=LiveView(live_port) if live else None,
         dry_run_mm=dry_run,
     )
     if dry_run is not None:
         start.dry_run(request)
-        return
-    left_out = start.collect(request).left_out
-    if left_out:
-        say(f"finished; {left_out} strokes failed every time and were left out", err=True)
-        raise typer.Exit(3)
+    elif left_out := start.collect(request).left_out:
+        raise StrokesLeftOut(left_out)
 
 
 def browse() -> None:
@@ -200,82 +195,6 @@ def _first_report(config: Path, report: Path) -> bool:
     return True
 
 
-def loop(
-    session: Annotated[Path, typer.Argument(help="The session whose presses are recovered and made again.")],
-    config: Rig,
-    out: Annotated[Path | None, typer.Option(help="Folder for what the loop makes; <session>/loop by default.")] = None,
-    fit: Annotated[Path | None, typer.Option(help="Brush fit; default: the one in use, or a new one.")] = None,
-    presses: Annotated[
-        int | None, typer.Option(min=1, help="Only this many presses, spread evenly over the session.")
-    ] = None,
-    repeats: Annotated[int, typer.Option(min=1, max=100, help="How often each is pressed again.")] = 1,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the order.")] = 1,
-    sheet: NewSheet = None,
-    arm: Arm = False,
-    tui: Tui = None,
-) -> None:
-    """Recover every press from its image, press it again and compare both. Run the same command again to resume."""
-    from brushloop.collect.chains.loop import LoopRequest, run_loop
-    from brushloop.sessions.recording import Recording
-
-    folder = out if out is not None else Recording(session).path.parent / "loop"
-    request = LoopRequest(
-        session,
-        config,
-        folder,
-        fit=fit,
-        presses=presses,
-        repeats=repeats,
-        seed=seed,
-        sheet=sheet,
-        armed=arm,
-        on_screen=_on_screen(tui),
-    )
-    run_loop(request)
-
-
-def write(
-    what: Annotated[str, typer.Argument(help="Characters (字 子 永 are shipped), or a .csv trajectory.")],
-    config: Rig,
-    out: Annotated[Path, typer.Option(help="Folder for the plan and the report.")] = Path("written"),
-    sessions: Annotated[Path, typer.Option(help="Folder that holds sessions.")] = Path("sessions"),
-    count: Annotated[int, typer.Option(min=1, max=1000, help="How often each is written.")] = 10,
-    learn: Annotated[
-        int, typer.Option(min=0, max=20, help="First learn from the ink, in at most this many rounds.")
-    ] = 0,
-    learn_count: Annotated[int, typer.Option(min=1, max=100, help="How often each is written in such a round.")] = 2,
-    practice: Annotated[bool, typer.Option(help="First write a practice sheet, and fit the brush to it.")] = False,
-    data: Annotated[Path | None, typer.Option(help="Folder of hanzi-writer files.")] = None,
-    reference: Annotated[list[str] | None, typer.Option(help="字=picture.png: compare with this picture.")] = None,
-    cell_mm: Annotated[float, typer.Option(min=10, max=500, help="Side of the character's paper cell.")] = 70.0,
-    speed_mm_s: Annotated[float, typer.Option(min=1, max=100, help="Speed of the tip.")] = 15.0,
-    sheet: NewSheet = None,
-    arm: Arm = False,
-    tui: Tui = None,
-) -> None:
-    """Plan characters, write them on the rig, compare with simulation and reference. Run it again to resume."""
-    from brushloop.collect.chains.writing import Writing, WritingRequest
-
-    request = WritingRequest(
-        what=what,
-        config=config,
-        out=out,
-        sessions=sessions,
-        count=count,
-        learn=learn,
-        learn_count=learn_count,
-        practice=practice,
-        sheet=sheet,
-        data=data,
-        cell_mm=cell_mm,
-        speed_mm_s=speed_mm_s,
-        references=tuple(reference or ()),
-        armed=arm,
-        on_screen=_on_screen(tui),
-    )
-    Writing(request).run()
-
-
 @rig_app.command()
 def new(
     rig: Annotated[Path, typer.Argument(help="The rig.toml to make; what is taught is kept beside it.")] = Path(
@@ -357,10 +276,3 @@ def check(
         say(check_page(checks))
     if contradictions(checks):
         raise typer.Exit(5)
-
-
-def _on_screen(tui: bool | None) -> bool:
-    """Whether a collection has a screen: as asked for, else if there is a terminal."""
-    import sys
-
-    return tui if tui is not None else sys.stdin.isatty() and sys.stdout.isatty()

@@ -118,6 +118,15 @@ class CannotTeach(Exception):
         super().__init__(f"{what} {way_out}")
 
 
+class StrokesLeftOut(Exception):
+    """A collection is finished, but without some of its strokes, which failed every time."""
+
+    exit_code: ClassVar[int] = 3
+
+    def __init__(self, count: int) -> None:
+        super().__init__(f"finished; {count} strokes failed every time and were left out")
+
+
 class CollectAborted(Exception):
     """The run stopped before its end; the same command resumes it."""
 

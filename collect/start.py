@@ -1,4 +1,7 @@
-"""One run of `brushloop collect`: read, check and open the session, then run behind a screen or a progress bar."""
+"""One run of `brushloop collect`: read, check and open the session, then run behind a screen or a progress bar.
+
+Commands that collect among other things look here for the finished session of a protocol, calibrate it and fit it.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +13,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+from brushloop.calibrate.artefact import current
+from brushloop.calibrate.commands import CalibrateRequest, FitRequest, show_work
 from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.open_or_resume import CollectRequest, Opening, find_resumable
 from brushloop.collect.engine.snapshot import REFRESH_S, eta_text, no_pose_text
 from brushloop.collect.operator import stop_signals
 from brushloop.collect.planning.limit_check import check_protocol
+from brushloop.collect.protocols.config import load_protocol
+from brushloop.collect.rig.config import load_rig
 from brushloop.drivers.host import HostClock
 from brushloop.sessions.disk import check_writable
+from brushloop.sessions.errors import SessionError
+from brushloop.sessions.recording import Recording
 from brushloop.sessions.terminal import plain_console, say
 
 PRESSES = frozenset({"grid", "few-strokes", "list"})
@@ -145,3 +154,62 @@ def show_progress(engine: Engine) -> None:
             if over:
                 return
             time.sleep(REFRESH_S)
+
+
+# Stages of commands that collect among other things
+
+
+def finished_session(root: Path, config: Path, protocol: Path) -> Path | None:
+    """The newest finished session under `root` of exactly this protocol with the brush, ink and paper of `config`.
+
+    Raises `ConfigError` for a bad file.
+    """
+    if not root.is_dir():
+        return None
+    rig, wanted = load_rig(config), load_protocol(protocol).model_dump_json()
+    material = (rig.brush.name, rig.ink.name, rig.paper.name)
+    sessions: list[Path] = []
+    for folder in root.iterdir():
+        try:
+            header = Recording(folder).header
+            if header.protocol == wanted and (header.brush, header.ink, header.paper) == material:
+                sessions.append(folder)
+        except SessionError:
+            continue  # open, damaged, or no session
+    return max(sessions, key=lambda path: (path / f"{path.name}.mcap").stat().st_mtime_ns, default=None)
+
+
+def collected(request: CollectRequest) -> Collected:
+    """Collect a session, or go on with it. Raises `ConfigError` and what ended the collection."""
+    say(f"$ brushloop collect --config {request.config} --protocol {request.protocol} --out {request.out}")
+    return collect(request)
+
+
+def collected_session(request: CollectRequest) -> Path:
+    """The finished and calibrated session that is asked for; collected and calibrated if missing.
+
+    Raises `ConfigError` and what ended the collection.
+    """
+    session = finished_session(request.out, request.config, request.protocol) or collected(request).folder
+    calibrated(session)
+    return session
+
+
+def calibrated(session: Path) -> None:
+    """Calibrate a session that was not calibrated yet. Raises `CalibrationError`, `SessionError`."""
+    from brushloop.calibrate.calibrated import calibrate_session  # slow to import
+
+    if current(session) is None:
+        say(f"calibrate {session}")
+        show_work(calibrate_session, CalibrateRequest(session))
+
+
+def fitted(session: Path) -> Path:
+    """The brush fit in use of a session, made if there is none. Raises `CalibrationError`, `SessionError`."""
+    from brushloop.calibrate.fit.fit import FOLDER, fit_presses  # slow to import
+
+    fit = current(session, FOLDER)
+    if fit is None:
+        say(f"fit {session}")
+        fit = show_work(fit_presses, FitRequest(session)).path
+    return fit

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,10 +51,8 @@ class LoopbackRig:
         self.process.wait()
 
 
-def start(
-    config: Path, log: Path, *options: str, serves: Callable[[], bool] | None = None, detached: bool = False
-) -> LoopbackRig:
-    """Start `brushloop sim` and wait until it `serves`, by default until it has written `config`.
+def start(config: Path, log: Path, *options: str, detached: bool = False) -> LoopbackRig:
+    """Start `brushloop sim` and wait until it has written `config`, which must not exist yet.
 
     Detached, it is not reached by Ctrl-C in this terminal. Raises `RigDidNotStart`.
     """
@@ -65,7 +63,7 @@ def start(
         )
     rig = LoopbackRig(config, log.parent, process)
     deadline = time.monotonic() + START_S
-    while not (serves or config.exists)():
+    while not config.exists():
         if process.poll() is not None or time.monotonic() > deadline:
             rig.end()
             raise RigDidNotStart(f"the loopback rig did not start; {log} says: {log.read_text(errors='replace')}")

@@ -25,10 +25,11 @@ from tests.waiting import wait_until
 SMALL = """
 import sys
 from pathlib import Path
+from brushloop.collect.chains import DemoRequest
 from brushloop.collect.chains.demo import Demo, Size
 
 size = Size((11.0, 20.0), (0.0, 8.0), again=1, writings=0)
-sys.exit(Demo(Path(sys.argv[1]), size, repeats=1, rate=60.0, seed=1, brush=Path("paper")).run())
+Demo(DemoRequest(Path(sys.argv[1]), repeats=1), size).run()
 """
 """`brushloop demo` with as few presses as tell depth and tilt to the fit."""
 

@@ -1,1 +1,77 @@
-"""Commands that run other brushloop commands: the demo, the loop, and writing."""
+"""Commands that run other commands: the loop, writing, and the demo; and what is asked of each.
+
+The options of a command are the annotated fields of its request, as `calibrate.commands` says. Nothing heavy is
+imported here.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from typer import Argument, Option
+
+Rig = Annotated[Path, Option(help="The rig: addresses, frames, limits.")]
+Arm = Annotated[bool, Option("--arm", help="Let real hardware move.")]
+Tui = Annotated[bool | None, Option("--tui/--no-tui", help="Show the screen; default: if there is a terminal.")]
+NewSheet = Annotated[int | None, Option(min=1, help="Confirm that sheet N is in, as for collect.")]
+
+
+@dataclass(frozen=True, slots=True)
+class LoopRequest:
+    """Recover every press from its image, press it again and compare both. Run the same command again to resume."""
+
+    session: Annotated[Path, Argument(help="The session whose presses are recovered and made again.")]
+    config: Rig
+    out: Annotated[Path | None, Option(help="Folder for what the loop makes; <session>/loop by default.")] = None
+    fit: Annotated[Path | None, Option(help="Brush fit; default: the one in use, or a new one.")] = None
+    presses: Annotated[int | None, Option(min=1, help="Only this many presses, spread evenly over the session.")] = None
+    repeats: Annotated[int, Option(min=1, max=100, help="How often each is pressed again.")] = 1
+    seed: Annotated[int, Option(min=0, help="Seed of the order.")] = 1
+    sheet: NewSheet = None
+    armed: Arm = False
+    tui: Tui = None
+
+
+@dataclass(frozen=True, slots=True)
+class WritingRequest:
+    """Plan characters, write them on the rig, compare with simulation and reference. Run it again to resume."""
+
+    what: Annotated[str, Argument(help="Characters (字 子 永 are shipped), or a .csv trajectory.")]
+    config: Rig
+    out: Annotated[Path, Option(help="Folder for the plan and the report.")] = Path("written")
+    sessions: Annotated[Path, Option(help="Folder that holds sessions.")] = Path("sessions")
+    count: Annotated[int, Option(min=1, max=1000, help="How often each is written.")] = 10
+    learn: Annotated[int, Option(min=0, max=20, help="First learn from the ink, in at most this many rounds.")] = 0
+    learn_count: Annotated[int, Option(min=1, max=100, help="How often each is written in such a round.")] = 2
+    practice: Annotated[bool, Option(help="First write a practice sheet, and fit the brush to it.")] = False
+    data: Annotated[Path | None, Option(help="Folder of hanzi-writer files.")] = None
+    references: Annotated[
+        tuple[str, ...], Option("--reference", help="字=picture.png: compare with this picture.")
+    ] = ()
+    cell_mm: Annotated[float, Option(min=10, max=500, help="Side of the character's paper cell.")] = 70.0
+    speed_mm_s: Annotated[float, Option(min=1, max=100, help="Speed of the tip.")] = 15.0
+    sheet: NewSheet = None
+    armed: Arm = False
+    tui: Tui = None
+
+
+@dataclass(frozen=True, slots=True)
+class DemoRequest:
+    """Press, calibrate, press again and validate on the loopback rig. Run it again to continue where it stopped."""
+
+    out: Annotated[Path, Option(help="Folder for everything that the demo makes.")] = Path("demo-run")
+    full: Annotated[bool, Option("--full", help="More presses, and a written character: all three tables.")] = False
+    repeats: Annotated[int, Option(min=1, max=2, help="Presses per (H, alpha); one sheet holds two.")] = 2
+    rate: Annotated[float, Option(min=0.01, max=1000, help="Simulated seconds per real second.")] = 60.0
+    seed: Annotated[int, Option(min=0, help="Seed of the rig and of the order of presses.")] = 1
+    brush: Annotated[Path, Option(help="The rig's brush: `paper`, `loopback`, or one described in a brush.toml.")] = (
+        Path("paper")
+    )
+
+
+def on_screen(tui: bool | None) -> bool:
+    """Whether a collection has a screen: as asked for, else if there is a terminal."""
+    return tui if tui is not None else sys.stdin.isatty() and sys.stdout.isatty()

@@ -14,22 +14,21 @@ from pathlib import Path
 
 from brushloop.calibrate.commands import ValidateRequest, show_work
 from brushloop.calibrate.writing import PROTOCOL as WRITE
-from brushloop.collect.chains.commands import calibrated, collected, finished_session, fitted
+from brushloop.collect.chains import DemoRequest, LoopRequest, WritingRequest
 from brushloop.collect.chains.loop import PAGE as LOOP_PAGE
 from brushloop.collect.chains.loop import PROTOCOL as REPLAY
-from brushloop.collect.chains.loop import LoopRequest, run_loop
+from brushloop.collect.chains.loop import run_loop
 from brushloop.collect.chains.writing import PAGE as WRITTEN_PAGE
-from brushloop.collect.chains.writing import Writing, WritingRequest
-from brushloop.collect.engine.open_or_resume import open_sessions
+from brushloop.collect.chains.writing import write
+from brushloop.collect.engine.open_or_resume import CollectRequest, open_sessions
+from brushloop.collect.errors import StrokesLeftOut
 from brushloop.collect.rig.config import load_rig
-from brushloop.collect.start import CollectRequest
+from brushloop.collect.start import calibrated, collected, finished_session, fitted
 from brushloop.drivers.loopback import FaultRefused, LoopbackRig, ask, start
 from brushloop.model.generator import SHIPPED_GENERATOR
 from brushloop.sessions.terminal import say
 
 CHARACTER = "字"
-LEFT_OUT_CODE = 3
-"""Exit code of a demo whose collection finished but left strokes out."""
 IDLE_EXIT_S = 180.0
 """Longer than the evaluation between two collections takes on a busy computer."""
 FPS = 12
@@ -55,10 +54,11 @@ FULL = Size((11.0, 13.0, 15.0, 17.0, 20.0), (0.0, 5.0, 10.0), again=15, writings
 class DemoRig:
     """The loopback rig of a demo, started or found in the demo's folder."""
 
-    def __init__(self, folder: Path, *, rate: float, seed: int, brush: Path) -> None:
-        self.config = folder / "rig.toml"
-        self._folder = folder
-        self._options = ["--rate", str(rate), "--seed", str(seed), "--brush", str(brush)]
+    def __init__(self, request: DemoRequest) -> None:
+        self.config = request.out / "rig.toml"
+        self._folder = request.out
+        options = {"rate": request.rate, "seed": request.seed, "brush": request.brush, "fps": FPS}
+        self._options = [word for name, value in options.items() for word in (f"--{name}", str(value))]
         self._started: LoopbackRig | None = None
 
     def start(self) -> None:
@@ -66,14 +66,9 @@ class DemoRig:
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             port = int(probe.getsockname()[1])
-
-        def serves() -> bool:
-            # An earlier rig may have left its rig.toml here.
-            return self.config.exists() and f"port = {port}\n" in self.config.read_text(encoding="utf-8")
-
-        options = [*self._options, "--fps", str(FPS), "--idle-exit", str(IDLE_EXIT_S)]
-        options += ["--arcs-port", str(port), "--control", str(self._control(port))]
-        self._started = start(self.config, self._folder / "rig.log", *options, serves=serves, detached=True)
+        self.config.unlink(missing_ok=True)  # that of an earlier rig
+        options = ["--idle-exit", str(IDLE_EXIT_S), "--arcs-port", str(port), "--control", str(self._control(port))]
+        self._started = start(self.config, self._folder / "rig.log", *self._options, *options, detached=True)
 
     def ready(self) -> None:
         """Go on with the rig that `rig.toml` names; start one with a blank sheet if it has ended.
@@ -107,22 +102,20 @@ class DemoRig:
 class Demo:
     """Collect, calibrate, press again, write if asked, and validate, all under `out`."""
 
-    def __init__(self, out: Path, size: Size, repeats: int, rate: float, seed: int, brush: Path) -> None:
-        self._out = out
+    def __init__(self, request: DemoRequest, size: Size) -> None:
+        self._out, self._repeats, self._seed = request.out, request.repeats, request.seed
         self._size = size
-        self._repeats = repeats
-        self._seed = seed
-        self._protocol, self._sessions = out / "protocol.toml", out / "sessions"
-        self._rig = DemoRig(out, rate=rate, seed=seed, brush=brush)
+        self._protocol, self._sessions = self._out / "protocol.toml", self._out / "sessions"
+        self._rig = DemoRig(request)
         self._session: Path
         """What the first step collects, for every later step."""
-        self._exit_code = 0
+        self._left_out = 0
 
-    def run(self) -> int:
+    def run(self) -> None:
         """Run every step, and print the paths of the report and of the recording.
 
-        Returns the exit code, 3 if the collection left strokes out. A session without a report is continued; a new one
-        is started only when the last one has its report. Raises `ConfigError`, `SessionError`, `CollectAborted`.
+        A session without a report is continued; a new one is started only when the last one has its report. Raises
+        `ConfigError`, `SessionError`, `CollectAborted`, and at the end `StrokesLeftOut` if some were left out.
         """
         self._out.mkdir(parents=True, exist_ok=True)
         self._write_protocol()
@@ -138,7 +131,8 @@ class Demo:
         session = self._session
         say("", f"Done in {time.monotonic() - began_s:.0f} s, simulated: nothing here is a result on paper.")
         say(f"Report: {_report(session)}", f"MCAP:   {session / f'{session.name}.mcap'}")
-        return self._exit_code
+        if self._left_out:
+            raise StrokesLeftOut(self._left_out)
 
     def _steps(self) -> list[tuple[str, Callable[[], None]]]:
         """Title of each step, and what does the part of it that is not done yet."""
@@ -172,10 +166,8 @@ class Demo:
         say("the loopback rig starts in the background; its log is rig.log")
         (self._rig.start if earlier else self._rig.ready)()
         sheet = 1 if earlier else None
-        self._session, left_out = collected(
-            CollectRequest(self._rig.config, self._protocol, self._sessions, sheet=sheet)
-        )
-        self._exit_code = LEFT_OUT_CODE if left_out else 0
+        request = CollectRequest(self._rig.config, self._protocol, self._sessions, sheet=sheet)
+        self._session, self._left_out = collected(request)
 
     def _fit(self) -> None:
         calibrated(self._session)
@@ -187,7 +179,7 @@ class Demo:
             return
         self._blank_sheet(folder / REPLAY)
         presses, seed = self._size.again, self._seed
-        run_loop(LoopRequest(self._session, self._rig.config, folder, presses=presses, seed=seed, sheet=1))
+        run_loop(LoopRequest(self._session, self._rig.config, folder, presses=presses, seed=seed, sheet=1, tui=False))
 
     def _write(self) -> None:
         folder = self._session / "written"
@@ -195,7 +187,7 @@ class Demo:
             return
         self._blank_sheet(folder / "plan" / WRITE)
         config, count = self._rig.config, self._size.writings
-        Writing(WritingRequest(CHARACTER, config, folder, self._sessions, count=count, sheet=1)).run()
+        write(WritingRequest(CHARACTER, config, folder, self._sessions, count=count, sheet=1, tui=False))
 
     def _validate(self) -> None:
         from brushloop.calibrate.validate.command import validate  # slow to import
@@ -216,3 +208,8 @@ class Demo:
 
 def _report(session: Path) -> Path:
     return session / "validation" / "report.html"
+
+
+def demo(request: DemoRequest) -> None:
+    """Run the demo, as `Demo.run` does."""
+    Demo(request, FULL if request.full else QUICK).run()

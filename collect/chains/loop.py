@@ -8,19 +8,18 @@ from __future__ import annotations
 
 import csv
 import io
-from dataclasses import dataclass
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from brushloop.calibrate.commands import CompareLoopRequest, RecoverRequest, show_work
 from brushloop.calibrate.files import read_bounded, write_whole
-from brushloop.collect.chains.commands import calibrated, collected_session, fitted
-from brushloop.collect.engine.open_or_resume import check_fresh_sheet
+from brushloop.collect.chains import LoopRequest, on_screen
+from brushloop.collect.engine.open_or_resume import CollectRequest, check_fresh_sheet
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.config_file import read_text
-from brushloop.collect.start import CollectRequest
+from brushloop.collect.start import calibrated, collected_session, fitted
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import BareName
 from brushloop.sessions.terminal import say
@@ -31,40 +30,25 @@ LEAST_HEIGHT_MM = 2.0
 MAX_CSV_BYTES = 8 * 1024 * 1024
 
 
-@dataclass(frozen=True, slots=True)
-class LoopRequest:
-    """What the command line asked for."""
-
-    session: Path
-    """The original session's folder."""
-    config: Path
-    out: Path
-    fit: Path | None = None
-    """By default the current fit of the session; if there is none, it is fitted first."""
-    presses: int | None = None
-    """How many presses are recovered and made again, spread evenly over the session; None: all."""
-    repeats: int = 1
-    seed: int = 1
-    sheet: int | None = None
-    """Number of the sheet that the operator has put in."""
-    armed: bool = False
-    """Whether real hardware may move."""
-    on_screen: bool = False
-
-
 def run_loop(request: LoopRequest) -> Path:
     """Run the unfinished stages; return the report's path. Raises `ConfigError`, `SessionError`, `CollectAborted`."""
     recording = Recording(request.session)
     folder, root = recording.path.parent, recording.path.parent.parent
+    out = folder / "loop" if request.out is None else request.out
     rig = load_rig(request.config)
     header = recording.header
     if not header.source.imported and header.brush != rig.brush.name:
         # Another brush makes other marks: refused before anything moves.
         was = f"{rig.brush.name!r}: the original was pressed with {header.brush!r}"
         raise ConfigError(request.config, "brush.name", was)
-    if not (request.out / PROTOCOL).exists():
+    if not (out / PROTOCOL).exists():
         check_fresh_sheet(root, request.sheet)  # now, not after minutes of fitting
-    fit = _fit(request, recording)
+    if not header.source.imported:
+        calibrated(folder)
+    if (fit := request.fit) is None:
+        # The fit that the loop was begun with, even if another one was made since.
+        begun = begun_with(out)
+        fit = fitted(folder) if begun is None else folder / FITS / f"{begun.fit}.json"
     settings = Settings(
         original=header.session_id,
         original_sha256=recording.sha256,
@@ -75,51 +59,38 @@ def run_loop(request: LoopRequest) -> Path:
         repeats=request.repeats,
         seed=request.seed,
     )
-    keep_settings(settings, request.out)
-    protocol = _recover(request, folder, fit, settings)
-    wanted = CollectRequest(
-        request.config, protocol, root, sheet=request.sheet, armed=request.armed, on_screen=request.on_screen
+    keep_settings(settings, out)
+    if not (out / PROTOCOL).exists():  # it is written last: where it exists, this stage is done
+        _recover(folder, out / RECOVERED, fit, settings)
+    check_recovered(out / RECOVERED)
+    screen = on_screen(request.tui)
+    again = collected_session(
+        CollectRequest(request.config, out / PROTOCOL, root, sheet=request.sheet, armed=request.armed, on_screen=screen)
     )
-    again = collected_session(wanted)
 
     from brushloop.calibrate.loop import compare  # slow to import
 
-    command = f"brushloop loop compare {folder} {again} --fit {fit} --out {request.out}"
+    command = f"brushloop loop compare {folder} {again} --fit {fit} --out {out}"
     say(f"$ {command}")
-    return show_work(compare, CompareLoopRequest(folder, again, fit, out=request.out, command=command)).path
+    return show_work(compare, CompareLoopRequest(folder, again, fit, out=out, command=command)).path
 
 
-def _fit(request: LoopRequest, recording: Recording) -> Path:
-    folder = recording.path.parent
-    if not recording.header.source.imported:
-        calibrated(folder)
-    if request.fit is not None:
-        return request.fit
-    if (begun := begun_with(request.out)) is not None:
-        return folder / FITS / f"{begun.fit}.json"  # even if another fit was made since
-    return fitted(folder)
+def _recover(folder: Path, out: Path, fit: Path, settings: Settings) -> None:
+    """Recover depth and tilt of each press into a file, and write the protocol that presses them again beside it."""
+    from brushloop.calibrate.invert import recover  # slow to import
 
-
-def _recover(request: LoopRequest, folder: Path, fit: Path, settings: Settings) -> Path:
-    """Recover depth and tilt; the protocol is written last, so where it exists this stage is done."""
-    protocol = request.out / PROTOCOL
-    if not protocol.exists():
-        from brushloop.calibrate.invert import recover  # slow to import
-
-        wanted = RecoverRequest(
-            folder,
-            request.out / RECOVERED,
-            fit=fit,
-            depth_range_mm=settings.depth_range_mm,
-            tilt_range_deg=settings.tilt_range_deg,
-            presses=settings.presses,
-            repeats=settings.repeats,
-            seed=settings.seed,
-        )
-        say(f"invert {folder}")
-        show_work(recover, wanted)
-    check_recovered(request.out / RECOVERED)
-    return protocol
+    wanted = RecoverRequest(
+        folder,
+        out,
+        fit=fit,
+        depth_range_mm=settings.depth_range_mm,
+        tilt_range_deg=settings.tilt_range_deg,
+        presses=settings.presses,
+        repeats=settings.repeats,
+        seed=settings.seed,
+    )
+    say(f"invert {folder}")
+    show_work(recover, wanted)
 
 
 def check_recovered(path: Path) -> None:

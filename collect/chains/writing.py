@@ -6,7 +6,6 @@ Results of finished stages stay on disk and are reused. Every round is an ordina
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from brushloop.calibrate.artefact import current
@@ -19,47 +18,18 @@ from brushloop.calibrate.commands import (
     show_work,
 )
 from brushloop.calibrate.writing import PROTOCOL, load_plan
-from brushloop.collect.chains.commands import collected_session, finished_session
-from brushloop.collect.engine.open_or_resume import check_fresh_sheet
+from brushloop.collect.chains import WritingRequest, on_screen
+from brushloop.collect.engine.open_or_resume import CollectRequest, check_fresh_sheet
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.kinds import WriteConfig
 from brushloop.collect.rig.config import load_rig
-from brushloop.collect.start import CollectRequest
+from brushloop.collect.start import collected_session, finished_session
 from brushloop.sessions.terminal import say
 
 PAGE = "written.html"
 FOOTPRINT = "footprint"
 """Folder of a session that holds the footprints fitted to it."""
-
-
-@dataclass(frozen=True, slots=True)
-class WritingRequest:
-    """What the command line asked for."""
-
-    what: str
-    config: Path
-    out: Path
-    sessions: Path
-    """Folder that holds sessions."""
-    count: int = 10
-    learn: int = 0
-    """Rounds before the final writings; each writes a few copies and corrects the plan by them."""
-    learn_count: int = 2
-    """How often each character is written in such a round."""
-    practice: bool = False
-    """Whether a practice sheet comes first."""
-    sheet: int | None = None
-    """Number of the sheet that the operator has put in; valid for one collection, as the next needs a fresh sheet."""
-    data: Path | None = None
-    """Folder of hanzi-writer files, such as 字.json."""
-    cell_mm: float = 70.0
-    speed_mm_s: float = 15.0
-    references: tuple[str, ...] = ()
-    """Pictures to compare with instead of the plan's font, as `CHARACTER=FILE`."""
-    armed: bool = False
-    """Whether real hardware may move."""
-    on_screen: bool = False
 
 
 class Writing:
@@ -162,7 +132,12 @@ class Writing:
         if self._sheet is not None and finished_session(request.sessions, request.config, protocol) is None:
             sheet, self._sheet = self._sheet, None  # used up: the next session asks again
         wanted = CollectRequest(
-            request.config, protocol, request.sessions, sheet=sheet, armed=request.armed, on_screen=request.on_screen
+            request.config,
+            protocol,
+            request.sessions,
+            sheet=sheet,
+            armed=request.armed,
+            on_screen=on_screen(request.tui),
         )
         return collected_session(wanted)
 
@@ -173,3 +148,8 @@ class Writing:
         line = f"brushloop write compare {session} --plan {plan} --out {out}{options}"
         say(f"$ {line}")
         return show_work(compare.compare, CompareWrittenRequest(session, plan, references, out, line)).path
+
+
+def write(request: WritingRequest) -> None:
+    """Run the chain, as `Writing.run` does."""
+    Writing(request).run()

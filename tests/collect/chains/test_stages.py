@@ -1,20 +1,175 @@
-"""What a chain of commands keeps, and what it refuses before anything moves; no rig."""
+"""What the chains of commands do in which order, keep, and refuse before anything moves; no rig."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
-from brushloop.collect.chains.commands import finished_session
+import brushloop.__main__
+from brushloop.calibrate.commands import (
+    CompareWrittenRequest,
+    FitFootprintRequest,
+    LearnRequest,
+    PlanRequest,
+    PracticeRequest,
+    ValidateRequest,
+)
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import Written
+from brushloop.calibrate.validate import command
+from brushloop.calibrate.validate.command import ValidationOutput
+from brushloop.calibrate.writing import FILE as PLAN
+from brushloop.calibrate.writing import PROTOCOL, Figure, Plan, PlannedBy
+from brushloop.collect.chains import LoopRequest, WritingRequest, demo, writing
 from brushloop.collect.chains.loop import SETTINGS as FILE
 from brushloop.collect.chains.loop import Settings, begun_with, check_recovered, keep_settings
-from brushloop.collect.errors import ConfigError
+from brushloop.collect.chains.writing import FOOTPRINT, Writing
+from brushloop.collect.engine.open_or_resume import CollectRequest
+from brushloop.collect.errors import CollectAborted, ConfigError, StrokesLeftOut
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import load_rig
+from brushloop.collect.start import Collected, finished_session
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import Addresses, rig_toml
+from brushloop.sessions.journal import JOURNAL_NAME
 from tests.sessions.conftest import Make
+
+# The demo
+
+
+RIG = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))
+
+
+class Chain:
+    """Stands for rig and commands: notes them; `collect` makes a finished session, the others their reports."""
+
+    def __init__(self) -> None:
+        self.ran: list[str] = []
+        self.left_out = 0
+        self.validate_fails = False
+
+    def collected(self, request: CollectRequest) -> Collected:
+        self.ran.append("collect")
+        number = 1 + len(list(request.out.glob("*")))
+        return Collected(finished(request.config, request.protocol, request.out, number), self.left_out)
+
+    def validated(self, request: ValidateRequest, _progress: object) -> ValidationOutput:
+        self.ran.append("validate")
+        if self.validate_fails:
+            raise CalibrationError(request.places[0], "cannot be validated")
+        report = Path(request.places[0]) / "validation" / "report.html"
+        report.parent.mkdir()
+        report.write_text("report")
+        return ValidationOutput(report.parent)
+
+    def loop(self, request: LoopRequest) -> None:
+        assert request.out is not None
+        self.ran.append(f"loop {request.presses}")
+        request.out.mkdir()
+        (request.out / "loop.html").touch()
+
+    def write(self, request: WritingRequest) -> None:
+        self.ran.append(f"write {request.what} {request.count}")
+        request.out.mkdir()
+        (request.out / "written.html").touch()
+
+    def rig(self, what: str) -> None:
+        self.ran.append(what)
+
+
+class FakeRig:
+    """Stands for the rig's process."""
+
+    def __init__(self, chain: Chain, folder: Path) -> None:
+        self.config = folder / "rig.toml"
+        self.config.write_text(RIG)
+        self.start = lambda: chain.rig("rig starts")
+        self.ready = lambda: chain.rig("rig")
+        self.fresh_sheet = lambda: chain.rig("fresh sheet")
+        self.end = lambda: None
+
+
+@pytest.fixture
+def chain(monkeypatch: pytest.MonkeyPatch) -> Chain:
+    made = Chain()
+    monkeypatch.setattr(demo, "collected", made.collected)
+    monkeypatch.setattr(command, "validate", made.validated)
+    monkeypatch.setattr(demo, "calibrated", lambda _session: made.ran.append("calibrate"))
+    monkeypatch.setattr(demo, "fitted", lambda _session: made.ran.append("fit"))
+    monkeypatch.setattr(demo, "run_loop", made.loop)
+    monkeypatch.setattr(demo, "DemoRig", lambda request: FakeRig(made, request.out))
+    monkeypatch.setattr(demo, "write", made.write)
+    return made
+
+
+def finished(config: Path, protocol: Path, out: Path, number: int) -> Path:
+    """A finished session of this protocol with what that rig holds."""
+    rig = load_rig(config)
+    known = {"brush": rig.brush.name, "ink": rig.ink.name, "paper": rig.paper.name}
+    asked = {"session_id": f"grid-{number}", "protocol": load_protocol(protocol).model_dump_json()}
+    Make().session(out / f"grid-{number}", closed=True, **known, **asked)
+    return out / f"grid-{number}"
+
+
+EVALUATED = ["calibrate", "fit", "rig", "fresh sheet", "loop 6", "validate"]
+
+
+def run(folder: Path, *more: str) -> None:
+    """Run the command. Raises what ended it."""
+    CliRunner().invoke(brushloop.__main__.app, ["demo", "--out", str(folder), *more], catch_exceptions=False)
+
+
+def test_strokes_that_were_left_out_end_in_a_report_and_exit_code_3(chain: Chain, tmp_path: Path) -> None:
+    chain.left_out = 2
+    with pytest.raises(StrokesLeftOut, match="2 strokes failed") as left_out:
+        run(tmp_path)
+    assert left_out.value.exit_code == 3
+    assert chain.ran == ["rig", "collect", *EVALUATED]
+    assert (tmp_path / "sessions" / "grid-1" / "validation" / "report.html").is_file()
+
+
+def test_a_demo_that_ended_after_its_collection_goes_on_there_and_begins_no_new_session(
+    chain: Chain, tmp_path: Path
+) -> None:
+    chain.validate_fails = True
+    with pytest.raises(CalibrationError, match="cannot be validated"):
+        run(tmp_path)
+    chain.validate_fails = False
+    chain.ran.clear()
+    run(tmp_path)
+    # The presses that were made again are there: no rig, and no sheet, is needed.
+    assert chain.ran == ["calibrate", "fit", "validate"]
+    chain.ran.clear()
+    run(tmp_path)
+    assert chain.ran == ["rig starts", "collect", *EVALUATED]
+    assert sorted(path.name for path in (tmp_path / "sessions").iterdir()) == ["grid-1", "grid-2"]
+
+
+def test_the_full_demo_also_writes(chain: Chain, tmp_path: Path) -> None:
+    run(tmp_path, "--full")
+    again = ["calibrate", "fit", "rig", "fresh sheet", "loop 15"]
+    assert chain.ran == ["rig", "collect", *again, "rig", "fresh sheet", "write 字 4", "validate"]
+
+
+def test_the_sheet_is_not_changed_under_a_session_that_has_begun(chain: Chain, tmp_path: Path) -> None:
+    def killed(request: LoopRequest) -> None:
+        chain.ran.append("loop is killed")
+        Make().store(tmp_path / "sessions" / "replay-1", session_id="replay-1").release()
+        raise CollectAborted("the power failed")
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(demo, "run_loop", killed)
+        with pytest.raises(CollectAborted):
+            run(tmp_path)
+    chain.ran.clear()
+    run(tmp_path)
+    assert chain.ran == ["calibrate", "fit", "rig", "loop 6", "validate"]
+
+
+# The loop
+
 
 SETTINGS = Settings(
     original="grid-01",
@@ -59,15 +214,92 @@ def test_a_session_of_another_ink_is_not_the_one_that_a_chain_asks_for(tmp_path:
     protocol = tmp_path / "protocol.toml"
     protocol.write_text('kind = "grid"\ndepths_mm = [11.0]\ntilts_deg = [0.0]\nrepeats = 1\nseed = 1\n')
     rigs = {ink: tmp_path / f"{ink}.toml" for ink in ("sumi", "walnut", "red")}
-    text = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))
     for ink, path in rigs.items():
-        path.write_text(text.replace("simulated ink", ink), encoding="utf-8")
+        path.write_text(RIG.replace("simulated ink", ink), encoding="utf-8")
     root = tmp_path / "sessions"
     for number, ink in enumerate(("sumi", "walnut"), 1):
-        rig = load_rig(rigs[ink])
-        known = {"brush": rig.brush.name, "ink": rig.ink.name, "paper": rig.paper.name}
-        asked = {"session_id": f"grid-{number}", "protocol": load_protocol(protocol).model_dump_json()}
-        Make().session(root / f"grid-{number}", closed=True, **known, **asked)
+        finished(rigs[ink], protocol, root, number)
     assert finished_session(root, rigs["sumi"], protocol) == root / "grid-1"
     assert finished_session(root, rigs["walnut"], protocol) == root / "grid-2"
     assert finished_session(root, rigs["red"], protocol) is None
+
+
+# Writing
+
+
+CELL = 'kind = "write"\ncell_mm = [48.0, 48.0]\nrepeats = {repeats}\n[[figures]]\nname = "子"\n[[figures.strokes]]\n'
+POINTS = "points = [[10.0, 24.0, 3.0, 0.0, 0.0], [20.0, 24.0, 3.0, 0.0, 0.0]]\n"
+
+
+def plan_of(settled: bool) -> Plan:
+    figure = Figure(name="子", source="", settled=settled)
+    return Plan(model="", planned_by=PlannedBy(), cell_mm=48.0, software="", figures=(figure,))
+
+
+class Commands:
+    """Stands in for brushloop's commands: writes what each would leave."""
+
+    def __init__(self, settled_after: int, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.ran: list[str] = []
+        self._rounds, self._settled_after = 0, settled_after
+        for name in ("plan.plan", "compare.compare", "learn.learn", "learn.practice", "learn.fit"):
+            command = getattr(self, name.split(".")[1])
+            monkeypatch.setattr(f"brushloop.calibrate.writing.{name}", command)
+
+    def plan(self, request: PlanRequest, _: object) -> Written:
+        return self._planned("plan", request.out, request.repeats)
+
+    def practice(self, request: PracticeRequest, _: object) -> Written:
+        return self._planned("practice", request.out, 1)
+
+    def learn(self, request: LearnRequest, _: object) -> Written:
+        self._rounds += 1
+        settled = self._rounds >= self._settled_after
+        return self._planned("learn", request.out, (request.settled_repeats if settled else None) or request.repeats)
+
+    def fit(self, request: FitFootprintRequest, _: object) -> Written:
+        self.ran.append("fit")
+        return Written(request.session / FOOTPRINT / "0123456789abcdef.json", ())
+
+    def compare(self, request: CompareWrittenRequest, _: object) -> Written:
+        self.ran.append("compare")
+        return Written(request.out / "written.html", ())
+
+    def _planned(self, name: str, folder: Path, repeats: int) -> Written:
+        self.ran.append(name)
+        folder.mkdir(parents=True)
+        (folder / PROTOCOL).write_text(CELL.format(repeats=repeats) + POINTS, encoding="utf-8")
+        settled = self._rounds >= self._settled_after
+        (folder / PLAN).write_text(plan_of(settled).model_dump_json(), encoding="utf-8")
+        return Written(folder / PROTOCOL, ())
+
+
+@pytest.mark.parametrize(("settled_after", "rounds"), [(1, 1), (9, 3)])
+def test_practice_comes_first_and_learning_ends_when_all_is_settled(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    settled_after: int,
+    rounds: int,
+) -> None:
+    class Rig:
+        class brush:  # noqa: N801
+            radius_mm, length_mm = 6.0, 48.0
+
+    commands = Commands(settled_after, monkeypatch)
+    monkeypatch.setattr(writing, "load_rig", lambda _: Rig)
+    monkeypatch.setattr(writing, "collected_session", lambda *_: tmp_path / "session")
+    request = WritingRequest("子", tmp_path / "rig.toml", tmp_path / "out", tmp_path, count=10, learn=3, practice=True)
+    assert Writing(request).run() == tmp_path / "out" / "written.html"
+    assert commands.ran == ["practice", "fit", "plan", *["compare", "learn"] * rounds, "compare"]
+    assert ("No character gained" in capsys.readouterr().out) == (rounds < 3)
+
+
+def test_a_fresh_sheet_is_asked_for_before_anything_is_planned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    commands = Commands(1, monkeypatch)
+    (tmp_path / "2026-01-01-grid-01").mkdir()
+    (tmp_path / "2026-01-01-grid-01" / JOURNAL_NAME).write_text("damaged\n", encoding="utf-8")
+    request = WritingRequest("子", tmp_path / "rig.toml", tmp_path / "out", tmp_path, practice=True)
+    with pytest.raises(ConfigError, match="Put a fresh sheet in"):
+        Writing(request).run()
+    assert commands.ran == []
