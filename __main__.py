@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import gc
 import sys
 from collections.abc import Callable
 from io import TextIOWrapper
@@ -242,6 +243,8 @@ app.command("demo")(command(chains.DemoRequest, "collect.chains.demo:demo", run_
 
 def main() -> None:
     """Run the app; an error with an exit code becomes one line on stderr, any other a traceback."""
+    # Imports make many objects that stay: to search them for garbage again and again takes a sixth of every start.
+    gc.set_threshold(100_000, 50, 50)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # for a terminal that cannot show every character
