@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import io
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -25,14 +24,13 @@ from brushloop.calibrate.commands import CalibrateRequest, LensRequest
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written, read_gray
 from brushloop.calibrate.report import (
-    BLUE,
     Point,
     about,
     framed,
     photograph_uri,
     recording_facts,
+    round_values,
     source_point,
-    svg_uri,
     write_page,
 )
 from brushloop.calibrate.session import Calibration, board_of, rig_of
@@ -152,17 +150,16 @@ def _write_page(
     """Write the page of the calibration at `path`, which was measured on this photograph, beside it."""
     sheet_mm = rig_of(recording).sheet_mm
     sheet = None if sheet_mm is None else _outline(calibration, sheet_mm)
-    frame = about(recording.header)
     lens = f"{calibration.lens.source}; k1 {calibration.lens.distortion[0]:+.4f}"
     return write_page(
         path.with_suffix(".html"),
         "calibration.html.j2",
-        **frame,
+        **about(recording.header),
         session=recording.header.session_id,
         picture=_picture(calibration, image, view, sheet),
         verdict=list(_verdict(calibration)),
         trust=[source_point(recording.header.source), *_trust(calibration, moved)],
-        scale=_scale(calibration, image.shape[1], image.shape[0], sheet, frame["label"]),
+        contours=_contours(calibration, image.shape[1], image.shape[0]),
         facts=[
             *recording_facts(recording.header, recording.path.name, recording.sha256, calibration),
             ("board", describe(calibration.board)),
@@ -254,28 +251,12 @@ def _reach(calibration: Calibration) -> float:
     return (calibration.mm_per_px_high - calibration.mm_per_px_low) / (2.0 * calibration.mm_per_px)
 
 
-def _scale(calibration: Calibration, width: int, height: int, sheet: Floats | None, label: str) -> str:
-    """Contours of mm per pixel across the photograph."""
-    import matplotlib
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-    from matplotlib.figure import Figure
+def _contours(calibration: Calibration, width: int, height: int) -> list[tuple[str, list[list[float]]]]:
+    """Contours of mm per pixel across a photograph: the value and the (n, 2) points, in pixels, of each line."""
+    from contourpy import contour_generator
 
-    figure = Figure(figsize=(5.6, 4.4), layout="constrained")
-    axis: Any = figure.subplots()
     across, down = (np.linspace(0.0, side - 1.0, n) for side, n in zip((width, height), SCALE_GRID, strict=True))
     scale = np.array([[local_scale(calibration.to_paper, np.array([x, y])) for x in across] for y in down])
-    lines = axis.contour(across, down, scale, levels=8, colors=BLUE, linewidths=0.9)
-    axis.clabel(lines, fontsize=8, fmt="%.4f")
-    if sheet is not None:
-        axis.plot(*np.vstack([sheet, sheet[:1]]).T, color="0.5", lw=1.2)
-    axis.set_xlim(0, width)
-    axis.set_ylim(height, 0)
-    axis.set_aspect("equal")
-    axis.set_title(f"mm per pixel across the photograph ({label})", fontsize=10, parse_math=False)
-    axis.set_xlabel("px")
-    axis.set_ylabel("px")
-    buffer, canvas = io.BytesIO(), cast("Any", FigureCanvasSVG(figure))
-    with matplotlib.rc_context({"svg.hashsalt": "brushloop"}):  # pyright: ignore[reportUnknownMemberType]
-        # Not `savefig`, which lays out and draws every figure twice.
-        canvas.print_svg(buffer, metadata={"Date": None, "Creator": None})
-    return svg_uri(buffer.getvalue())
+    generator = contour_generator(across, down, scale)
+    values = round_values(float(scale.min()), float(scale.max())).items()
+    return [(text, np.round(line, 1).tolist()) for value, text in values for line in generator.lines(value)]

@@ -268,7 +268,7 @@ def _scale(
     """Where values lie along an axis, in pixels, and its ticks with their texts."""
     known = np.concatenate([np.asarray(part, np.float64) for part in values]) if values else np.ones(1)
     known = known[np.isfinite(known)] if np.isfinite(known).any() else np.ones(1)
-    ticks = axis.ticks or _ticks(float(known.min()), float(known.max()), log=axis.log)
+    ticks = axis.ticks or round_values(float(known.min()), float(known.max()), log=axis.log)
     shape = np.log10 if axis.log else np.positive
     ends = shape(np.array([*known, *ticks], np.float64))
     low, range_of = float(ends.min()), float(np.ptp(ends)) or 1.0
@@ -280,7 +280,7 @@ def _scale(
     return place, list(zip(place(np.array([*ticks], np.float64)).tolist(), ticks.values(), strict=True))
 
 
-def _ticks(low: float, high: float, *, log: bool) -> dict[float, str]:
+def round_values(low: float, high: float, *, log: bool = False) -> dict[float, str]:
     """Up to seven round values between two: powers of ten on a logarithmic axis that holds two of them."""
     if log and (powers := range(math.ceil(math.log10(low)), math.floor(math.log10(high)) + 1))[1:]:
         return {10.0**power: f"{10.0**power:g}" for power in powers}
