@@ -35,14 +35,8 @@ EXIT_CODES = {
 """What each exit code of every command means."""
 
 
-class OptionRefused(Exception):
-    """A number on the command line is not a number, or lies outside its range."""
-
-    exit_code = 2
-
-
-class NameRefused(Exception):
-    """A name on the command line, or of the working folder, cannot be used."""
+class ArgumentRefused(Exception):
+    """A number on the command line lies outside its range, or a name, or that of the working folder, is not UTF-8."""
 
     exit_code = 2
 
@@ -57,7 +51,7 @@ class FrontDoor(TyperGroup):
     """Reports the given number and both ends of its range; typer itself names only one end, and allows `nan`."""
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command. Raises `OptionRefused`, and `OutputClosed`, where typer itself would end with code 1."""
+        """Run the command. Raises `ArgumentRefused`, and `OutputClosed`, where typer itself would end with code 1."""
         try:
             return super().invoke(ctx)
         except BrokenPipeError:
@@ -69,7 +63,7 @@ class FrontDoor(TyperGroup):
             if param is None or cause is None or not allowed:
                 raise
             given = cast("Any", cause).errors()[0]["input"]  # pydantic's, which typer asks
-            raise OptionRefused(f"{param.opts[-1]} is {given!r}, allowed: a number {allowed}") from None
+            raise ArgumentRefused(f"{param.opts[-1]} is {given!r}, allowed: a number {allowed}") from None
 
 
 app = typer.Typer(
@@ -103,52 +97,64 @@ def options(
     """Take the options of brushloop itself."""
 
 
-app.add_typer(brushloop.collect.cli.app, name="collect")
-app.command("doctor")(brushloop.collect.cli.doctor)
-app.add_typer(brushloop.collect.cli.rig_app, name="rig")
-app.command("calibrate")(command(commands.CalibrateRequest, "calibrate.calibrated:calibrate_session"))
-camera = typer.Typer(help="Print a board, and calibrate the lens by photographs of it.", no_args_is_help=True)
-camera.command("board")(command(commands.PrintRequest, "calibrate.board.spec:print_board"))
-camera.command("intrinsics")(command(commands.LensRequest, "calibrate.calibrated:calibrate_lens"))
-app.add_typer(camera, name="camera")
-validate = typer.Typer(
-    cls=PathOrCommand,
-    help="Compare every stroke model with every captured stroke (`brushloop validate SESSION...`).",
+EVERY_DAY, SET_UP, RESEARCH, SIMULATOR = "Every day", "Set-up", "Research", "Simulator"
+GROUPS = {
+    "validate": (RESEARCH, "Compare every stroke model with every captured stroke (`brushloop validate SESSION...`)."),
+    "loop": (RESEARCH, "Recover the presses of a SESSION, press them again, and compare; or only compare."),
+    "write": (RESEARCH, "Write characters on the rig and compare them; or only plan, compare or learn."),
+    "train": (RESEARCH, "Train the neural stroke generator, or tune it on captures."),
+}
+"""Groups whose first command runs where no other is named: where the help lists them, and its words."""
+COMMANDS: tuple[tuple[str, str, type[Any], str], ...] = (
+    ("analyse", EVERY_DAY, commands.AnalyseRequest, "calibrate.analysis:analyse"),
+    ("calibrate", RESEARCH, commands.CalibrateRequest, "calibrate.calibrated:calibrate_session"),
+    ("camera board", "", commands.PrintRequest, "calibrate.board.spec:print_board"),
+    ("camera intrinsics", "", commands.LensRequest, "calibrate.calibrated:calibrate_lens"),
+    ("fit", RESEARCH, commands.FitRequest, "calibrate.fit.fit:fit"),
+    ("invert", RESEARCH, commands.RecoverRequest, "calibrate.invert:recover"),
+    ("loop compare", "", commands.CompareLoopRequest, "calibrate.loop:compare"),
+    ("sessions export", "", commands.ExportRequest, "calibrate.export:export"),
+    ("train generator", "", commands.TrainRequest, "calibrate.training:train"),
+    ("train tune", "", commands.TuneRequest, "calibrate.training:tune"),
+    ("twin", RESEARCH, commands.TwinRequest, "twin.run:twin"),
+    ("validate sessions", "", commands.ValidateRequest, "calibrate.validate.command:validate"),
+    ("validate diff", "", commands.DiffRequest, "calibrate.validate.diff:compare"),
+    ("validate captures", "", commands.CapturesRequest, "calibrate.validate.tuning:captures"),
+    ("write plan", "", commands.PlanRequest, "calibrate.writing.plan:plan"),
+    ("write compare", "", commands.CompareWrittenRequest, "calibrate.writing.compare:compare"),
+    ("write learn", "", commands.LearnRequest, "calibrate.writing.learn:learn"),
+    ("write practice", "", commands.PracticeRequest, "calibrate.writing.learn:practice"),
+    ("write fit", "", commands.FitFootprintRequest, "calibrate.writing.learn:fit"),
 )
-validate.command("sessions")(command(commands.ValidateRequest, "calibrate.validate.command:validate"))
-validate.command("diff")(command(commands.DiffRequest, "calibrate.validate.diff:compare"))
-validate.command("captures")(command(commands.CapturesRequest, "calibrate.validate.tuning:captures"))
-app.add_typer(validate, name="validate")
-app.command("fit")(command(commands.FitRequest, "calibrate.fit.fit:fit"))
-app.command("twin")(command(commands.TwinRequest, "twin.run:twin"))
-app.command("invert")(command(commands.RecoverRequest, "calibrate.invert:recover"))
-loop = typer.Typer(
-    cls=PathOrCommand,
-    help="Recover the presses of a SESSION, press them again and compare (`brushloop loop SESSION`), or only compare.",
-)
-loop.command("session")(command(chains.LoopRequest, "collect.chains.loop:run_loop", run_chain))
-loop.command("compare")(command(commands.CompareLoopRequest, "calibrate.loop:compare"))
-app.add_typer(loop, name="loop")
-brushloop.sessions.cli.app.command("export")(command(commands.ExportRequest, "calibrate.export:export"))
-app.add_typer(brushloop.sessions.cli.app, name="sessions")
-write = typer.Typer(
-    cls=PathOrCommand,
-    help="Write characters on the rig and compare them (`brushloop write 字 --config ...`), or only plan or compare.",
-)
-write.command("characters")(command(chains.WritingRequest, "collect.chains.writing:write", run_chain))
-write.command("plan")(command(commands.PlanRequest, "calibrate.writing.plan:plan"))
-write.command("compare")(command(commands.CompareWrittenRequest, "calibrate.writing.compare:compare"))
-write.command("learn")(command(commands.LearnRequest, "calibrate.writing.learn:learn"))
-write.command("practice")(command(commands.PracticeRequest, "calibrate.writing.learn:practice"))
-write.command("fit")(command(commands.FitFootprintRequest, "calibrate.writing.learn:fit"))
-app.add_typer(write, name="write")
-train = typer.Typer(cls=PathOrCommand, help="Train the neural stroke generator, or tune it on captures.")
-train.command("generator")(command(commands.TrainRequest, "calibrate.training:train"))
-train.command("tune")(command(commands.TuneRequest, "calibrate.training:tune"))
-app.add_typer(train, name="train")
+"""Commands of analysis: name, where the help lists it, what it takes, and the function that does it."""
 
 
-@app.command()
+def _mount() -> None:
+    """Mount the commands of every folder."""
+    camera = typer.Typer(help="Print a board, and calibrate the lens by photographs of it.", no_args_is_help=True)
+    groups = {"sessions": brushloop.sessions.cli.app, "camera": camera}
+    app.add_typer(brushloop.collect.cli.app, name="collect", rich_help_panel=EVERY_DAY)
+    app.add_typer(groups["sessions"], name="sessions", rich_help_panel=EVERY_DAY)
+    app.command("doctor", rich_help_panel=EVERY_DAY)(brushloop.collect.cli.doctor)
+    app.add_typer(brushloop.collect.cli.rig_app, name="rig", rich_help_panel=SET_UP)
+    app.add_typer(camera, name="camera", rich_help_panel=SET_UP)
+    for name, (panel, words) in GROUPS.items():
+        groups[name] = typer.Typer(cls=PathOrCommand, help=words)
+        app.add_typer(groups[name], name=name, rich_help_panel=panel)
+    groups["loop"].command("session")(command(chains.LoopRequest, "collect.chains.loop:run_loop", run_chain))
+    groups["write"].command("characters")(command(chains.WritingRequest, "collect.chains.writing:write", run_chain))
+    demo = command(chains.DemoRequest, "collect.chains.demo:demo", run_chain)
+    app.command("demo", rich_help_panel=EVERY_DAY)(demo)
+    for name, panel, request, work in COMMANDS:
+        *group, last = name.split()
+        parent = groups[group[0]] if group else app
+        parent.command(last, rich_help_panel=panel or None)(command(request, work))
+
+
+_mount()
+
+
+@app.command(rich_help_panel=SIMULATOR)
 def sim(
     write_rig: Annotated[Path | None, typer.Option(help="Write a rig.toml for this rig, then serve it.")] = None,
     rate: Annotated[float, typer.Option(min=0.01, max=1000, help="Simulated seconds per real second.")] = 1.0,
@@ -198,7 +204,7 @@ def sim(
     serve(config, write_rig, idle_exit, say, control=control)
 
 
-@app.command()
+@app.command(rich_help_panel=SIMULATOR)
 def fault(
     control: Annotated[Path, typer.Argument(help="Control socket of a rig: `brushloop sim --control PATH`.")],
     what: Annotated[str, typer.Argument(help="Device to break, or list, clear, state, release, fresh-sheet.")],
@@ -223,7 +229,7 @@ def fault(
     say(*dumps(ask(control, request), indent=2).split("\n"))
 
 
-@app.command()
+@app.command(rich_help_panel=SIMULATOR)
 def hand(
     control: Annotated[Path, typer.Argument(help="Control socket of a lab: `brushloop sim --unknown`.")],
     act: Annotated[str, typer.Argument(help="bring, measure, mend or plug.")],
@@ -236,9 +242,6 @@ def hand(
 
     wanted = {"act": act, "to": to, "index": index or None, "corner": corner}
     say(ask(control, {"do": "hand", **{name: value for name, value in wanted.items() if value is not None}})["says"])
-
-
-app.command("demo")(command(chains.DemoRequest, "collect.chains.demo:demo", run_chain))
 
 
 def main() -> None:
@@ -268,14 +271,14 @@ def main() -> None:
 
 
 def _check_names() -> None:
-    """Raise `NameRefused` where an argument or the working folder cannot be written into a report."""
+    """Raise `ArgumentRefused` where an argument or the working folder cannot be written into a report."""
     try:
         here = str(Path.cwd())
     except OSError:
-        raise NameRefused("the working folder no longer exists") from None
+        raise ArgumentRefused("the working folder no longer exists") from None
     for name in (*sys.argv, here):
         if any("\ud800" <= char <= "\udfff" for char in name):
-            raise NameRefused(f"{name}: is not UTF-8; give the file or folder another name")
+            raise ArgumentRefused(f"{name}: is not UTF-8; give the file or folder another name")
 
 
 def _told(error: Exception) -> tuple[int, str]:

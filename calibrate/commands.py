@@ -104,6 +104,13 @@ Written = Annotated[Path, Argument(help="The session in which a plan was written
 
 
 @dataclass(frozen=True, slots=True)
+class AnalyseRequest:
+    """Calibrate, fit and validate a session: from its photographs to the report, in one command."""
+
+    session: Annotated[Path, Argument(help="A session's folder or its .mcap file.")]
+
+
+@dataclass(frozen=True, slots=True)
 class CalibrateRequest:
     """Fit scale and paper plane from the board in view; writes an immutable calibration/<hash>.json and its page."""
 

@@ -56,6 +56,14 @@ def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> Non
         open_session(session, kind="drag")
 
 
+def test_one_command_leads_from_photographs_to_the_report(session: Path) -> None:
+    ran = CliRunner(env={"COLUMNS": "120"}).invoke(app, ["analyse", str(session)])
+    assert ran.exit_code == 0, ran.output
+    assert "CCD-BSMG" in ran.output
+    assert ran.output.splitlines()[-1] == f"Report: {session / 'validation' / 'report.html'}"
+    assert load_report(session / "validation" / "report.json").model(NAME) is not None
+
+
 def test_a_single_cell_gives_neither_intervals_nor_held_out_scores(tmp_path: Path) -> None:
     (tmp_path / "photos").mkdir()
     pressed = imported_presses(tmp_path / "photos", tmp_path / "presses", CELLS[:1], (300, 480), (380, 150))
