@@ -26,8 +26,7 @@ EXIT_CODES = {
     1: "a defect: please report it with its traceback",
     2: "input or configuration cannot be used; nothing half-written is left",
     3: "finished, but strokes were left out, or a repair lost something",
-    4: "stopped or aborted, also by a full disk, too little memory or an output that was closed; once the cause has "
-    "been removed, the same command continues",
+    4: "stopped or aborted, also by a full disk, too little memory or a closed output; the same command continues",
     5: "finished, but a required score was missed (`validate --gate`), or the rig's settings contradict each other",
     6: "a recording is damaged: `brushloop sessions repair`",
     130: "interrupted by Ctrl-C; `collect` and `sim` end in order instead, with a code from above",
@@ -128,30 +127,24 @@ COMMANDS: tuple[tuple[str, str, type[Any], str], ...] = (
 )
 """Commands of analysis: name, where the help lists it, what it takes, and the function that does it."""
 
-
-def _mount() -> None:
-    """Mount the commands of every folder."""
-    camera = typer.Typer(help="Print a board, and calibrate the lens by photographs of it.", no_args_is_help=True)
-    groups = {"sessions": brushloop.sessions.cli.app, "camera": camera}
-    app.add_typer(brushloop.collect.cli.app, name="collect", rich_help_panel=EVERY_DAY)
-    app.add_typer(groups["sessions"], name="sessions", rich_help_panel=EVERY_DAY)
-    app.command("doctor", rich_help_panel=EVERY_DAY)(brushloop.collect.cli.doctor)
-    app.add_typer(brushloop.collect.cli.rig_app, name="rig", rich_help_panel=SET_UP)
-    app.add_typer(camera, name="camera", rich_help_panel=SET_UP)
-    for name, (panel, words) in GROUPS.items():
-        groups[name] = typer.Typer(cls=PathOrCommand, help=words)
-        app.add_typer(groups[name], name=name, rich_help_panel=panel)
-    groups["loop"].command("session")(command(chains.LoopRequest, "collect.chains.loop:run_loop", run_chain))
-    groups["write"].command("characters")(command(chains.WritingRequest, "collect.chains.writing:write", run_chain))
-    demo = command(chains.DemoRequest, "collect.chains.demo:demo", run_chain)
-    app.command("demo", rich_help_panel=EVERY_DAY)(demo)
-    for name, panel, request, work in COMMANDS:
-        *group, last = name.split()
-        parent = groups[group[0]] if group else app
-        parent.command(last, rich_help_panel=panel or None)(command(request, work))
-
-
-_mount()
+camera = typer.Typer(help="Print a board, and calibrate the lens by photographs of it.", no_args_is_help=True)
+groups = {"sessions": brushloop.sessions.cli.app, "camera": camera}
+app.add_typer(brushloop.collect.cli.app, name="collect", rich_help_panel=EVERY_DAY)
+app.add_typer(groups["sessions"], name="sessions", rich_help_panel=EVERY_DAY)
+app.command("doctor", rich_help_panel=EVERY_DAY)(brushloop.collect.cli.doctor)
+app.add_typer(brushloop.collect.cli.rig_app, name="rig", rich_help_panel=SET_UP)
+app.add_typer(camera, name="camera", rich_help_panel=SET_UP)
+for name, (panel, words) in GROUPS.items():
+    groups[name] = typer.Typer(cls=PathOrCommand, help=words)
+    app.add_typer(groups[name], name=name, rich_help_panel=panel)
+groups["loop"].command("session")(command(chains.LoopRequest, "collect.chains.loop:run_loop", run_chain))
+groups["write"].command("characters")(command(chains.WritingRequest, "collect.chains.writing:write", run_chain))
+demo = command(chains.DemoRequest, "collect.chains.demo:demo", run_chain)
+app.command("demo", rich_help_panel=EVERY_DAY)(demo)
+for name, panel, request, work in COMMANDS:
+    *group, last = name.split()
+    parent = groups[group[0]] if group else app
+    parent.command(last, rich_help_panel=panel or None)(command(request, work))
 
 
 @app.command(rich_help_panel=SIMULATOR)

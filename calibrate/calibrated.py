@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -258,5 +258,8 @@ def _contours(calibration: Calibration, width: int, height: int) -> list[tuple[s
     across, down = (np.linspace(0.0, side - 1.0, n) for side, n in zip((width, height), SCALE_GRID, strict=True))
     scale = np.array([[local_scale(calibration.to_paper, np.array([x, y])) for x in across] for y in down])
     generator = contour_generator(across, down, scale)
-    values = round_values(float(scale.min()), float(scale.max())).items()
-    return [(text, np.round(line, 1).tolist()) for value, text in values for line in generator.lines(value)]
+    contours: list[tuple[str, list[list[float]]]] = []
+    for value, text in round_values(float(scale.min()), float(scale.max())).items():
+        lines = cast("list[Floats]", generator.lines(value))
+        contours += ((text, line.round(1).tolist()) for line in lines)
+    return contours
