@@ -4,13 +4,15 @@ The options of a command are the annotated fields of its request, and its help i
 are not annotated are for callers in Python only. Nothing heavy is imported before a command runs.
 """
 
+from __future__ import annotations
+
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import MISSING, dataclass, field, fields
 from importlib import import_module
 from inspect import Parameter, Signature
 from pathlib import Path
-from typing import Annotated, Any, Protocol, TypeVar, get_args, get_origin, runtime_checkable
+from typing import Annotated, Any, Protocol, TypeVar, get_args, get_origin, get_type_hints, runtime_checkable
 
 from typer import Argument, Option
 from typer.core import TyperGroup
@@ -59,10 +61,11 @@ def command(request: type[Any], work: str, carry_out: Callable[[Any, Any], objec
         values = {option: tuple(value) if option in repeated else value for option, value in options.items()}
         carry_out(getattr(import_module(f"brushloop.{module}"), name), request(**values))
 
+    hints = get_type_hints(request, include_extras=True)
     parameters, repeated = list[Parameter](), set[str]()
     for each in fields(request):
-        if get_origin(each.type) is Annotated:
-            kind, option = get_args(each.type)
+        if get_origin(hints[each.name]) is Annotated:
+            kind, option = get_args(hints[each.name])
             if get_origin(kind) is tuple and get_args(kind)[1:] == (...,):
                 repeated.add(each.name)
                 kind = list[get_args(kind)[0]]
