@@ -16,7 +16,7 @@ from brushloop.collect.protocols.steps import DrawStep, PressStep, TouchStep, Ze
 from brushloop.collect.rig.config import TouchConfig
 from brushloop.collect.rig.paper import PaperPlane, Patch
 from brushloop.collect.touch.force import ForceTap
-from brushloop.collect.touch.heights import PlaneResult, kept
+from brushloop.collect.touch.heights import Touch, plane_of, untouched
 from brushloop.collect.touch.measure import asked, measure_plane
 from brushloop.collect.touch.selfcheck import self_check, triangle_on
 from brushloop.drivers.devices import PoseSample, Well
@@ -155,32 +155,32 @@ async def zero_touch(context: StepContext, step: ZeroTouchStep) -> ZeroTouchResu
     if rig.force is not None and rig.config.force is not None:
         await rig.force.bias(rig.config.force.bias_s)
     if step.method == "kept":
-        measured = kept(run.procedures.plane, rig.config.paper.touch_point_mm)
+        at_mm, plane = rig.config.paper.touch_point_mm, run.procedures.plane
+        measured = untouched(plane, "kept", Touch(*at_mm, plane.touch_z_mm(*at_mm)))
     else:
         if step.method is not None:
             await within_limits(check_step, "", rig.config, run.procedures.plane, step)
         measured = await _measured(context, touch_of(rig.config, step))
-    await within_limits(check_poses, "over the paper as it was touched, ", rig.config, run.protocol, measured.plane)
+    plane = plane_of(measured)
+    await within_limits(check_poses, "over the paper as it was touched, ", rig.config, run.protocol, plane)
     moved_mm = _moved_mm(measured, run.procedures.plane)
     if measured.method == "kept":
         run.progress.log(f"zero touch was given up: {_height(run)} is kept", warning=True)
     elif measured.method != "taught":
-        run.progress.log(
-            f"zero touch by {measured.method}: {_compared(moved_mm, measured.plane, run.procedures.plane)}"
-        )
+        run.progress.log(f"zero touch by {measured.method}: {_compared(moved_mm, plane, run.procedures.plane)}")
     if step.between_strokes:
         await _accepted(context, moved_mm)
-    run.procedures.plane = measured.plane
-    origin_mm, quaternion = measured.plane.frame(rig.config.paper)
+    run.procedures.plane = plane
+    origin_mm, quaternion = plane.frame(rig.config.paper)
     context.recorder.paper(origin_mm, quaternion)
     if (optics := rig.config.camera.optics) is not None:
         context.recorder.optics(optics)
-    return measured.result(moved_mm)
+    return measured.model_copy(update={"moved_mm": moved_mm})
 
 
-def _moved_mm(measured: PlaneResult, before: PaperPlane) -> float:
+def _moved_mm(measured: ZeroTouchResult, before: PaperPlane) -> float:
     """How far the paper lies above where it was before, at the touched point where it moved most."""
-    away = [point.mean[2] - before.touch_z_mm(point.mean[0], point.mean[1]) for point in measured.points]
+    away = [point.z_mm - before.touch_z_mm(point.x_mm, point.y_mm) for point in measured.points]
     return max(away, key=abs)
 
 
@@ -207,8 +207,8 @@ async def touch(context: StepContext, step: TouchStep) -> TouchResult:
         z_mm = await context.guard.guarded(visited)
         return TouchResult(method="taught", x_mm=step.x_mm, y_mm=step.y_mm, z_mm=z_mm)
     measured = await _measured(context, config)
-    x_mm, y_mm, z_mm = measured.points[0].mean
-    return TouchResult(method=measured.method, x_mm=x_mm, y_mm=y_mm, z_mm=z_mm, span_mm=measured.points[0].span_mm)
+    [point] = measured.points
+    return TouchResult(method=measured.method, x_mm=point.x_mm, y_mm=point.y_mm, z_mm=point.z_mm, span_mm=point.span_mm)
 
 
 async def check_rig(context: StepContext) -> SelfCheckResult:
@@ -226,7 +226,7 @@ async def _fill_for_touch(context: StepContext) -> None:
     context.run.left_ink_ns = None
 
 
-async def _measured(context: StepContext, config: TouchConfig) -> PlaneResult:
+async def _measured(context: StepContext, config: TouchConfig) -> ZeroTouchResult:
     run = context.run
     tap = ForceTap()
     with context.guard.also(tap.take):

@@ -28,7 +28,6 @@ from brushloop.collect.touch.heights import (
     FINE_STEP_MM,
     PITCH_MM,
     KnownHeights,
-    PointTouches,
     Reach,
     SpotGrid,
     Touch,
@@ -37,6 +36,7 @@ from brushloop.collect.touch.heights import (
     lowest_z_mm,
 )
 from brushloop.drivers.devices import Frame
+from brushloop.sessions.events import TouchedPoint
 
 DARK_SHARE = 0.5
 """Pixels darker than this share of the paper are not paper, and are ignored in measuring the change of light."""
@@ -144,18 +144,8 @@ def _mark(
     return Mark(float(x_mm), float(y_mm), total * local_scale(lambda at: apply(image_to_paper, at), pixel) ** 2)
 
 
-@dataclass(frozen=True, slots=True)
-class FirstInk:
-    """The two spots of a row between which the ink begins."""
-
-    clean: int
-    """Index of the last spot without ink."""
-    inked: int
-    """Index of the first one with ink; every spot after it has ink."""
-
-
-def first_ink(ink_mm2: Floats, least_mm2: float) -> FirstInk:
-    """Find where the ink begins in a row of spots, (m,) from the highest to the lowest.
+def first_ink(ink_mm2: Floats, least_mm2: float) -> int:
+    """Index of the first spot with ink in a row of spots, (m,) from the highest to the lowest.
 
     Raises `StepError` if the first spot has ink, if none has, or if a spot below an inked one has none: otherwise a
     brush that ran dry would be mistaken for one that did not touch.
@@ -169,7 +159,7 @@ def first_ink(ink_mm2: Floats, least_mm2: float) -> FirstInk:
     if not seen[first:].all():
         missing = first + int(np.argmin(seen[first:]))
         raise StepError(f"spot {missing + 1} of the row left no ink though a higher one did: is the brush dry?")
-    return FirstInk(first - 1, first)
+    return first
 
 
 Spot = tuple[float, float, float]
@@ -195,7 +185,7 @@ class FirstInkTouch:
         self._since_dip: int | None = None
         self._last: Frame | None = None
 
-    async def measure(self, points_mm: list[tuple[float, float]]) -> list[PointTouches]:
+    async def measure(self, points_mm: list[tuple[float, float]]) -> list[TouchedPoint]:
         """Touch every point coarsely, then finely in rounds, each along the plane fitted to the previous round.
 
         Without that plane, the sheet's lean along a row would be mistaken for height. Raises `StepError`.
@@ -246,8 +236,8 @@ class FirstInkTouch:
 
     def _between(self, spots: list[Spot], ink_mm2: NDArray[np.float64], step_mm: float) -> Touch:
         """Half way between the last clean spot and the first inked one; every height between them is equally likely."""
-        edge = first_ink(ink_mm2, LEAST_INK_MM2)
-        x, y, z = (0.5 * (a + b) for a, b in zip(spots[edge.clean], spots[edge.inked], strict=True))
+        first = first_ink(ink_mm2, LEAST_INK_MM2)
+        x, y, z = (0.5 * (a + b) for a, b in zip(spots[first - 1], spots[first], strict=True))
         return Touch(x, y, z, step_mm / math.sqrt(12.0))
 
     async def _touch(self, spot: Spot) -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from brushloop.collect.errors import StepError
-from brushloop.collect.rig.config import Method, PaperConfig, TouchConfig
+from brushloop.collect.rig.config import PaperConfig, TouchConfig
 from brushloop.collect.rig.paper import PaperPlane, Sheet, fit_plane
 from brushloop.sessions.events import TouchedPoint, ZeroTouchResult
 
@@ -77,61 +77,8 @@ class Touch:
     sigma_mm: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class PointTouches:
-    """The touches at one point of the sheet, and their mean."""
-
-    touches: tuple[Touch, ...]
-    span_mm: float
-    """Largest minus smallest height; for touches that lie apart, heights above the first plane."""
-
-    @property
-    def mean(self) -> tuple[float, float, float]:
-        """x, y in the paper frame, z in the base frame."""
-        return (
-            statistics.fmean(t.x_mm for t in self.touches),
-            statistics.fmean(t.y_mm for t in self.touches),
-            statistics.fmean(t.z_mm for t in self.touches),
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class PlaneResult:
-    """The plane from which H is counted, and the touches that it was fitted to."""
-
-    plane: PaperPlane
-    method: Method | Literal["kept"]
-    """`kept`: nothing was touched, and the previous plane still holds."""
-    points: tuple[PointTouches, ...]
-    residuals_mm: tuple[float, ...]
-    """Point minus plane, in the order of the points; zeros for three points, which a plane always fits."""
-
-    def result(self, moved_mm: float) -> ZeroTouchResult:
-        """The result of a zero touch; `moved_mm` is how far the paper lies above where it was before."""
-        return ZeroTouchResult(
-            method=self.method,
-            touch_z_mm=self.plane.z0_mm,
-            slope_x=self.plane.slope_x,
-            slope_y=self.plane.slope_y,
-            slope_deg=self.plane.slope_deg,
-            residuals_mm=self.residuals_mm,
-            points=tuple(
-                TouchedPoint(
-                    x_mm=point.mean[0],
-                    y_mm=point.mean[1],
-                    z_mm=point.mean[2],
-                    span_mm=point.span_mm,
-                    touches_mm=tuple(touch.z_mm for touch in point.touches),
-                    sigma_mm=tuple(touch.sigma_mm for touch in point.touches),
-                )
-                for point in self.points
-            ),
-            moved_mm=moved_mm,
-        )
-
-
-def at_one_point(touches: list[Touch], config: TouchConfig, guide: PaperPlane | None = None) -> PointTouches:
-    """Compare the touches of one point. Raises `StepError` if they span more than their own errors explain.
+def at_one_point(touches: list[Touch], config: TouchConfig, guide: PaperPlane | None = None) -> TouchedPoint:
+    """The mean of the touches of one point. Raises `StepError` if they span more than their own errors explain.
 
     `guide` is the known lean of the sheet, for touches that lie some millimetres apart.
     """
@@ -145,25 +92,53 @@ def at_one_point(touches: list[Touch], config: TouchConfig, guide: PaperPlane | 
             f"zero touch does not repeat at ({touches[0].x_mm:.0f}, {touches[0].y_mm:.0f}) mm: the heights {listed} mm "
             f"span {span_mm:.3f} mm, limit {limit_mm:.3g} mm. Is the paper flat and the brush firm?"
         )
-    return PointTouches(tuple(touches), span_mm)
+    return TouchedPoint(
+        x_mm=statistics.fmean(t.x_mm for t in touches),
+        y_mm=statistics.fmean(t.y_mm for t in touches),
+        z_mm=statistics.fmean(t.z_mm for t in touches),
+        span_mm=span_mm,
+        touches_mm=tuple(t.z_mm for t in touches),
+        sigma_mm=tuple(t.sigma_mm for t in touches),
+    )
 
 
-def kept(plane: PaperPlane, at_mm: tuple[float, float]) -> PlaneResult:
-    """The previous plane as a result, after touching was given up; `at_mm` is where its height is stated."""
-    point = PointTouches((Touch(*at_mm, plane.touch_z_mm(*at_mm)),), 0.0)
-    return PlaneResult(plane, "kept", (point,), (0.0,))
+def untouched(plane: PaperPlane, method: Literal["taught", "kept"], touch: Touch) -> ZeroTouchResult:
+    """A plane that no touch has measured: the taught one, visited, or the previous one, after touching was given up.
+
+    `touch` is where its height is stated.
+    """
+    return _result(plane, method, [at_one_point([touch], TouchConfig())], (0.0,))
 
 
-def through(points: list[PointTouches], config: TouchConfig) -> PlaneResult:
+def through(points: list[TouchedPoint], config: TouchConfig) -> ZeroTouchResult:
     """The plane through the points. Raises `StepError` if one lies too far from it, or it leans too much."""
-    fit = fit_plane([point.mean for point in points])
+    fit = fit_plane([(point.x_mm, point.y_mm, point.z_mm) for point in points])
     if fit.worst_mm > config.residual_mm:
         listed = ", ".join(f"{r:+.3f}" for r in fit.residuals_mm)
         raise StepError(
             f"the touched points do not lie in a plane: residuals {listed} mm, limit {config.residual_mm:g} mm. "
             "Does the sheet lie flat?"
         )
-    return PlaneResult(fit.plane, config.method, tuple(points), fit.residuals_mm)
+    return _result(fit.plane, config.method, points, fit.residuals_mm)
+
+
+def _result(
+    plane: PaperPlane, method: str, points: list[TouchedPoint], residuals_mm: tuple[float, ...]
+) -> ZeroTouchResult:
+    return ZeroTouchResult(
+        method=method,
+        touch_z_mm=plane.z0_mm,
+        slope_x=plane.slope_x,
+        slope_y=plane.slope_y,
+        slope_deg=plane.slope_deg,
+        residuals_mm=residuals_mm,
+        points=tuple(points),
+    )
+
+
+def plane_of(touched: ZeroTouchResult) -> PaperPlane:
+    """The plane from which H is counted after that zero touch."""
+    return PaperPlane(touched.touch_z_mm, touched.slope_x, touched.slope_y)
 
 
 COARSE_STEP_MM, FINE_STEP_MM = 0.5, 0.08

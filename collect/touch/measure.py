@@ -12,7 +12,8 @@ from brushloop.collect.rig.config import TouchConfig
 from brushloop.collect.rig.paper import PaperPlane
 from brushloop.collect.touch.camera import FirstInkTouch
 from brushloop.collect.touch.force import ForceTap, RigProbe, Spring, touch_by_force
-from brushloop.collect.touch.heights import KnownHeights, PlaneResult, PointTouches, Reach, Touch, at_one_point, through
+from brushloop.collect.touch.heights import KnownHeights, Reach, Touch, at_one_point, through, untouched
+from brushloop.sessions.events import TouchedPoint, ZeroTouchResult
 
 
 async def measure_plane(
@@ -23,7 +24,7 @@ async def measure_plane(
     tap: ForceTap | None = None,
     next_jog: NextJog | None = None,
     tell: Callable[[str], None] = lambda _words: None,
-) -> PlaneResult:
+) -> ZeroTouchResult:
     """Touch as configured and fit the plane. The arm begins and ends at travel height.
 
     `dip` fills the brush. `tap` receives every sample of the force sensor, which must have been set to zero with
@@ -34,7 +35,7 @@ async def measure_plane(
     points_mm = config.points_mm or [paper.touch_point_mm]
     if config.method == "taught":
         touch = Touch(*paper.touch_point_mm, await procedures.zero_touch())
-        return PlaneResult(PaperPlane(paper.touch_z_mm), "taught", (PointTouches((touch,), 0.0),), (0.0,))
+        return untouched(PaperPlane(paper.touch_z_mm), "taught", touch)
     async with procedures.lifted_after():
         match config.method:
             case "camera":
@@ -53,15 +54,16 @@ TouchPoint = Callable[[int, Point, Reach], Awaitable[list[Touch]]]
 
 async def _at_points(
     procedures: Procedures, config: TouchConfig, points_mm: list[Point], touch: TouchPoint
-) -> list[PointTouches]:
-    known, points = KnownHeights(procedures.rig.config.paper, config), list[PointTouches]()
+) -> list[TouchedPoint]:
+    known, points = KnownHeights(procedures.rig.config.paper, config), list[TouchedPoint]()
     for number, point in enumerate(points_mm):
         reach = known.reach(*point)
         await procedures.approach(*point, reach.start_z_mm)
         touches = await touch(number, point, reach)
         await procedures.lift()
-        points.append(at_one_point(touches, config))
-        known.add(*points[-1].mean)
+        mean = at_one_point(touches, config)
+        points.append(mean)
+        known.add(mean.x_mm, mean.y_mm, mean.z_mm)
     return points
 
 

@@ -73,9 +73,8 @@ def test_no_rise_is_no_contact(force_n: np.ndarray) -> None:
         find_contact(np.arange(120.7, 119.95, -0.1)[:8], force_n, np.full(8, 10), HINGE_NOISE_N)
 
 
-def test_first_ink_is_between_the_last_clean_spot_and_the_first_inked_one() -> None:
-    edge = first_ink(np.array([0.01, -0.02, 0.9, 1.1]), 0.25)
-    assert (edge.clean, edge.inked) == (1, 2)
+def test_first_ink_is_at_the_first_spot_from_which_on_each_has_ink() -> None:
+    assert first_ink(np.array([0.01, -0.02, 0.9, 1.1]), 0.25) == 2
 
 
 @pytest.mark.parametrize(
