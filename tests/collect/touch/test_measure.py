@@ -69,16 +69,17 @@ async def test_the_plane_of_a_leaning_sheet_is_found_by_force(
 async def test_touches_by_camera_lie_within_150_um_of_the_truth_at_3_sigma(
     make_bench: MakeBench, monkeypatch: pytest.MonkeyPatch, sheets: int
 ) -> None:
-    rng, errors = np.random.default_rng(0), list[float]()
+    rng, errors, touches = np.random.default_rng(0), list[float](), list[Touch]()
+    monkeypatch.setattr(
+        camera, "at_one_point", lambda point, *rest: (touches.extend(point), at_one_point(point, *rest))[1]
+    )
     for seed in range(sheets):
         towards = rng.uniform(0.0, 2.0 * math.pi)
         lean_deg = 1.0 if seed % 2 else rng.uniform(0.0, 1.0)
         slope_deg = (lean_deg * math.cos(towards), lean_deg * math.sin(towards))
         bench = make_bench(slope_deg, paper_z_mm=120.0 + rng.uniform(-1.5, 1.5), seed=seed)
         places = [(2.0, 2.0), (76.0, 2.0), (39.0, 31.0)]
-        touches: list[Touch] = []
-        noted = lambda point, *rest: touches.extend(point) or at_one_point(point, *rest)  # noqa: E731
-        monkeypatch.setattr(camera, "at_one_point", noted)
+        touches.clear()
         await measured(bench, method="camera", touches=8, points_mm=places)
         errors += [touch.z_mm - bench.truth_mm(touch.x_mm, touch.y_mm) for touch in touches]
     assert len(errors) == 24 * sheets
