@@ -2,8 +2,8 @@
 steps of each, and their order over the sheet.
 
 Conditions are spread over the sheet. Its patches are used in order, so a stroke's number determines its place. The
-sheet is cut into three bands of rows and three of columns; within each round, pairs of strokes change places wherever
-that evens out how often each (H, alpha) lies in each band. Rounds stay whole, so a drift of ink still affects every
+sheet is cut into three bands of rows and three of columns; within each round, strokes are assigned to places so that
+each (H, alpha) lies about equally often in each band. Rounds stay whole, so a drift of ink still affects every
 condition alike. A void press shifts what follows by one patch: only the plan stays balanced.
 """
 
@@ -12,11 +12,13 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import itertools
-import random
-from collections.abc import Generator, Hashable, Iterable, Sequence
+from collections import defaultdict
+from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, get_args
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter
 
 from brushloop.collect.rig.paper import Layout
@@ -247,65 +249,35 @@ def takes(stroke: Planned) -> Protocol:
 
 
 BANDS = 3
-TRIALS_PER_STROKE = 60
-"""Pairs tried for each stroke of a round; more hardly changes the result."""
 
 
-def balanced(rounds: Sequence[Sequence[Hashable]], layout: Layout, seed: int) -> list[list[int]]:
+def balanced(rounds: Sequence[Sequence[Condition]], layout: Layout, seed: int) -> list[list[int]]:
     """The order of each round, as indices into it.
 
     `rounds` holds the condition of every stroke. The same arguments give the same order in every process.
     """
-    rng = random.Random(f"balance {seed}")
-    share = _shares(layout)
-    seen: dict[Hashable, list[int]] = {}
+    from scipy.optimize import linear_sum_assignment
+
+    rng, capacity = np.random.default_rng(seed), layout.capacity
+    rows, columns = np.divmod(np.arange(capacity), layout.columns)
+    bands = np.arange(BANDS)[:, None]
+    # (2 * BANDS, capacity): the bands in which each patch lies.
+    lies_in = np.concatenate((BANDS * rows // layout.rows == bands, BANDS * columns // layout.columns == bands))
+    weights = 1.0 / np.maximum(lies_in.mean(axis=1), 1.0 / capacity)
+    counts: dict[Condition, NDArray[np.float64]] = defaultdict(lambda: np.zeros(2 * BANDS))
     orders: list[list[int]] = []
-    places = itertools.count()
+    first = 0
     for conditions in rounds:
-        order = list(range(len(conditions)))
-        bands = [_bands(layout, next(places)) for _ in order]
-        for condition, at in zip(conditions, bands, strict=True):
-            _count(seen.setdefault(condition, [0] * (2 * BANDS)), at, 1)
-        for _ in range(TRIALS_PER_STROKE * len(order) if len(order) > 1 else 0):
-            i, k = rng.sample(range(len(order)), 2)
-            a, b = conditions[order[i]], conditions[order[k]]
-            if a == b or bands[i] == bands[k]:
-                continue
-            before = _unevenness(seen[a], share) + _unevenness(seen[b], share)
-            _exchange(seen[a], seen[b], bands[i], bands[k])
-            if _unevenness(seen[a], share) + _unevenness(seen[b], share) < before - 1e-9:
-                order[i], order[k] = order[k], order[i]
-            else:
-                _exchange(seen[a], seen[b], bands[k], bands[i])
-        orders.append(order)
+        order = rng.permutation(len(conditions))
+        for start in range(0, len(order), capacity):  # of a round larger than a sheet, one sheet after the other
+            strokes = order[start : start + capacity].copy()
+            here = lies_in[:, (first + start + np.arange(len(strokes))) % capacity]
+            # By how much (count^2 / share), summed over the bands, grows if a stroke is made on a patch.
+            growths = [(weights * (2.0 * counts[conditions[stroke]] + 1.0)) @ here for stroke in strokes]
+            _, chosen = linear_sum_assignment(np.array(growths) + 1e-6 * rng.random((len(strokes), len(strokes))))
+            order[start + chosen] = strokes
+            for stroke, patch in zip(strokes, chosen, strict=True):
+                counts[conditions[stroke]] += here[:, patch]
+        orders.append(order.tolist())
+        first += len(order)
     return orders
-
-
-def _bands(layout: Layout, place: int) -> tuple[int, int]:
-    """(row band, column band) of the stroke with that number; column bands are numbered after the row bands."""
-    row, column = divmod(place % layout.capacity, layout.columns)
-    return BANDS * row // layout.rows, BANDS + BANDS * column // layout.columns
-
-
-def _shares(layout: Layout) -> list[float]:
-    """Share of the sheet that each band holds; bands that hold nothing count as one patch."""
-    counts = [0] * (2 * BANDS)
-    for place in range(layout.capacity):
-        _count(counts, _bands(layout, place), 1)
-    return [max(count, 1) / layout.capacity for count in counts]
-
-
-def _count(counts: list[int], bands: tuple[int, int], by: int) -> None:
-    for band in bands:
-        counts[band] += by
-
-
-def _exchange(a: list[int], b: list[int], from_bands: tuple[int, int], to_bands: tuple[int, int]) -> None:
-    for counts, out, into in ((a, from_bands, to_bands), (b, to_bands, from_bands)):
-        _count(counts, out, -1)
-        _count(counts, into, 1)
-
-
-def _unevenness(counts: list[int], share: list[float]) -> float:
-    """Measure of unevenness: smallest if the counts are in proportion to the shares."""
-    return sum(count * count / part for count, part in zip(counts, share, strict=True))
