@@ -35,7 +35,6 @@ class Topic(StrEnum):
     WRENCH = "/force/wrench"
     INK = "/ink/state"  # InkState
     QUALITY = "/quality"
-    CADENCE = "/cadence"
     STEP = "/step"  # StepEvent, in events.py
     STROKE = "/stroke"
 
@@ -140,20 +139,6 @@ class Quality(Event):
         """`passed`, or `failed: ` and the names of the checks that failed."""
         failed = ", ".join(check.name for check in self.checks if not check.passed)
         return f"failed: {failed}" if failed else "passed"
-
-
-class Cadence(Event):
-    """Regularity of a topic's messages during one step."""
-
-    topic: str
-    expected_hz: float = Field(gt=0.0)
-    received: int = Field(ge=0)
-    missed: int = Field(ge=0)
-    """Intervals of 1 / `expected_hz` without a message."""
-    longest_gap_ms: float | None = Field(default=None, ge=0.0)
-    """None for fewer than two messages."""
-    lag_ms: float | None = Field(default=None, ge=0.0)
-    """How late poses arrived while the arm moved; None for other topics, and where it is not known."""
 
 
 class Header(Event):

@@ -63,6 +63,7 @@ class DipToTouch:
         self._context = context
         self._left_ns: int | None = None
         self._waits_s: list[float] = []
+        context.recorder.listeners.append(self._pose)
 
     @property
     def longest_s(self) -> float | None:
@@ -80,7 +81,7 @@ class DipToTouch:
                 await asyncio.sleep(max(left_s, 0.0))
         self._left_ns = left_ns
 
-    def pose(self, sample: PoseSample) -> None:
+    def _pose(self, sample: PoseSample) -> None:
         """Take a pose: the first one on the paper counts, and the step's moves come down nowhere else before it."""
         if self._left_ns is None:
             return
@@ -94,9 +95,8 @@ async def press(context: StepContext, step: PressStep) -> PressResult:
     """The PRESS step."""
     patch, procedures = await _ready(context), context.run.procedures
     timing = DipToTouch(context)
-    with context.recorder.also(timing.pose):
-        pressing = procedures.press(patch, step.press.condition, step.dwell_s, timing.hold)
-        reached_mm = await context.guard.guarded(pressing)
+    pressing = procedures.press(patch, step.press.condition, step.dwell_s, timing.hold)
+    reached_mm = await context.guard.guarded(pressing)
     pressed = _as_made(context, step.press, reached_mm, timing)
     return PressResult(press=pressed, peak_force_n=_peak_n(context, context.guard.peak_n))
 
@@ -108,13 +108,12 @@ async def draw(context: StepContext, step: DrawStep) -> PressResult:
     depths_mm: list[float] = []
     peaks_n: list[float] = []
     timing = DipToTouch(context)
-    with context.recorder.also(timing.pose):
-        for number in range(len(drawn.strokes)):
-            if number > 0:
-                await fill_brush(context)
-            drawing = run.procedures.stroke(patch, drawn, number, timing.hold)
-            depths_mm.append(await context.guard.guarded(drawing))
-            peaks_n.append(context.guard.peak_n)
+    for number in range(len(drawn.strokes)):
+        if number > 0:
+            await fill_brush(context)
+        drawing = run.procedures.stroke(patch, drawn, number, timing.hold)
+        depths_mm.append(await context.guard.guarded(drawing))
+        peaks_n.append(context.guard.peak_n)
     pressed = _as_made(context, step.press, max(depths_mm), timing)
     return PressResult(
         kind=StepKind.DRAW, press=pressed, peak_force_n=_peak_n(context, max(peaks_n)), depths_mm=tuple(depths_mm)
@@ -228,16 +227,15 @@ async def _fill_for_touch(context: StepContext) -> None:
 
 async def _measured(context: StepContext, config: TouchConfig) -> ZeroTouchResult:
     run = context.run
-    tap = ForceTap()
-    with context.guard.also(tap.take):
-        jog = asked(run.asker, _height(run))
+    tap, jog = ForceTap(), asked(run.asker, _height(run))
+    context.guard.listeners.append(tap.take)
 
-        def tell(doing: str) -> None:
-            run.progress.doing(f"zero touch by {config.method}: {doing}")
+    def tell(doing: str) -> None:
+        run.progress.doing(f"zero touch by {config.method}: {doing}")
 
-        dip = partial(_fill_for_touch, context)
-        measured = measure_plane(run.procedures, config, dip=dip, tap=tap, next_jog=jog, tell=tell)
-        return await context.guard.guarded(measured)
+    dip = partial(_fill_for_touch, context)
+    measured = measure_plane(run.procedures, config, dip=dip, tap=tap, next_jog=jog, tell=tell)
+    return await context.guard.guarded(measured)
 
 
 def _height(run: RunContext) -> str:

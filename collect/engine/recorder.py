@@ -1,12 +1,11 @@
-"""What one attempt at a step works with: what it records, how steadily samples came, and the guard on the force."""
+"""What one attempt at a step works with: what it records, and the guard on the force."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import math
-from collections.abc import Callable, Coroutine, Generator
-from contextlib import contextmanager
+from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
@@ -33,7 +32,7 @@ from brushloop.drivers.host import Clock, finished
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.mcap_writer import Outgoing, SegmentWriter
 from brushloop.sessions.messages import encode_png, image_message, pose_message
-from brushloop.sessions.records import Cadence, Event, InkState, Quality, Stroke, Topic, Wrench
+from brushloop.sessions.records import Event, InkState, Quality, Stroke, Topic, Wrench
 from brushloop.sessions.store import Attempt, SessionStore
 
 if TYPE_CHECKING:
@@ -51,32 +50,14 @@ _R = TypeVar("_R")
 class ForceGuard:
     """Passes on the force sensor's samples, and compares them with `force.max_n`; does nothing without a sensor."""
 
-    def __init__(self, rig: Rig, on_sample: Callable[[ForceSample], None] | None = None) -> None:
+    def __init__(self, rig: Rig, *listeners: Callable[[ForceSample], None]) -> None:
+        """`listeners` are called with every sample."""
         self._rig = rig
-        self._listeners = [] if on_sample is None else [on_sample]
+        self.listeners = list(listeners)
         self._over: asyncio.Event = asyncio.Event()
         self._guarding = False
         self.peak_n = 0.0
         """Largest force since `guarded` began."""
-
-    def listen(self) -> None:
-        """Begin to accept samples."""
-        if self._rig.force is not None:
-            self._rig.force.listen(self._sample)
-
-    @contextmanager
-    def also(self, on_sample: Callable[[ForceSample], None]) -> Generator[None]:
-        """Within the block, pass every sample to one more listener."""
-        self._listeners.append(on_sample)
-        try:
-            yield
-        finally:
-            self._listeners.remove(on_sample)
-
-    def deafen(self) -> None:
-        """Stop accepting samples."""
-        if self._rig.force is not None:
-            self._rig.force.listen(None)
 
     async def guarded(self, procedure: Coroutine[Any, Any, _R]) -> _R:
         """Run the procedure while the force is watched.
@@ -118,17 +99,16 @@ class ForceGuard:
                 continue
             raise ForceTooHigh(self.peak_n, self._rig.config.force.max_n)
 
-    def _sample(self, sample: ForceSample) -> None:
+    def sample(self, sample: ForceSample) -> None:
+        """Accept one sample of the sensor."""
         if self._guarding and self._rig.config.force is not None:
             self.peak_n = max(self.peak_n, math.hypot(*sample.force_n))
             if self.peak_n > self._rig.config.force.max_n:
                 self._over.set()
-        for listener in self._listeners:
+        for listener in self.listeners:
             listener(sample)
 
 
-POSE_HZ = 100.0
-"""Rate at which the driver asks the arm for its pose."""
 CLOCK_STEP_NS = 1_000_000_000
 """A sample that seems to have taken longer to arrive shows that the device's clock was set or began again."""
 
@@ -140,34 +120,22 @@ class Recorder:
         self,
         writer: SegmentWriter,
         clock: Clock,
-        force_hz: float | None = None,
         show: Callable[[Outgoing], None] | None = None,
     ) -> None:
         """`show` is called with every message as well; it must neither block nor raise."""
         self._writer = writer
         self._show = show
         self._clock = clock
-        self._poses = Arrivals(Topic.TCP, POSE_HZ)
-        self._forces = None if force_hz is None else Arrivals(Topic.WRENCH, force_hz)
-        self._listeners: list[Callable[[PoseSample], None]] = []
+        self.listeners: list[Callable[[PoseSample], None]] = []
+        """Called with every pose."""
         self._offset_ns: int | None = None
         """Of the host's clock from the force sensor's."""
-
-    @contextlib.contextmanager
-    def also(self, on_sample: Callable[[PoseSample], None]) -> Generator[None]:
-        """Within the block, pass every pose to one more listener."""
-        self._listeners.append(on_sample)
-        try:
-            yield
-        finally:
-            self._listeners.remove(on_sample)
 
     def pose(self, sample: PoseSample) -> None:
         """Record a pose, and the joint angles if they came with it, stamped when the host received them."""
         stamp = sample.stamp
-        for listener in self._listeners:
+        for listener in self.listeners:
             listener(sample)
-        self._poses.arrived(stamp.host_ns)
         self._sample(Topic.TCP, stamp, pose_message(stamp.host_ns, sample.pose.position_mm, sample.pose.quaternion))
         if sample.joints_rad is not None:
             joints = JointStates()
@@ -178,8 +146,6 @@ class Recorder:
 
     def force(self, sample: ForceSample) -> None:
         """Record a sample of the force sensor, stamped when the host received it."""
-        if self._forces is not None:
-            self._forces.arrived(sample.stamp.host_ns)
         (fx, fy, fz), (mx, my, mz) = sample.force_n, sample.torque_nm
         wrench = Wrench(fx_n=fx, fy_n=fy, fz_n=fz, mx_nm=mx, my_nm=my, mz_nm=mz)
         self._sample(Topic.WRENCH, sample.stamp, wrench)
@@ -221,13 +187,6 @@ class Recorder:
         """Record the checks of the stroke on still `number`."""
         self._now(Topic.QUALITY, quality, number)
 
-    def cadence(self, lag_ms: float | None) -> None:
-        """Record how steadily samples came, and how late poses; call it once, at the end of the step."""
-        now_ns = self._clock.now_ns()
-        for report in (self._poses.report(lag_ms), self._forces.report() if self._forces is not None else None):
-            if report is not None:
-                self._put(Topic.CADENCE, now_ns, now_ns, 0, report)
-
     def still(self, frame: Frame, number: int) -> None:
         """Record a lossless still; `number` is unique in the session. Encoding takes tens of ms: call in a thread."""
         stamp = frame.stamp
@@ -268,41 +227,6 @@ class Recorder:
         self._writer.write(outgoing)
         if self._show is not None:
             self._show(outgoing)
-
-
-class Arrivals:
-    """Counts the samples of one topic, and the slots of 1 / `expected_hz` without a sample."""
-
-    def __init__(self, topic: Topic, expected_hz: float) -> None:
-        self._topic = topic
-        self._expected_hz = expected_hz
-        self._received = 0
-        self._missed = 0
-        self._last_ns: int | None = None
-        self._longest_ns = 0
-
-    def arrived(self, host_ns: int) -> None:
-        """Count a sample that came at `host_ns`."""
-        self._received += 1
-        if self._last_ns is not None:
-            gap_ns = host_ns - self._last_ns
-            self._longest_ns = max(self._longest_ns, gap_ns)
-            # Half a slot late is late, not missed.
-            self._missed += max(0, round(gap_ns * self._expected_hz / 1e9) - 1)
-        self._last_ns = host_ns
-
-    def report(self, lag_ms: float | None = None) -> Cadence | None:
-        """The counts, to be recorded with `lag_ms`; None if no sample came."""
-        if not self._received:
-            return None
-        return Cadence(
-            topic=self._topic,
-            expected_hz=self._expected_hz,
-            received=self._received,
-            missed=self._missed,
-            longest_gap_ms=self._longest_ns / 1e6 if self._received > 1 else None,
-            lag_ms=lag_ms,
-        )
 
 
 @dataclass(slots=True, kw_only=True)

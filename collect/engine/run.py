@@ -254,8 +254,7 @@ class Run(RunContext):
         try:
             with self._observed(attempt) as (recorder, guard):
                 result = await self._do(step, StepContext(self, patches, attempt, recorder, guard))
-                lag_ms = await self._checked_lag_ms(step)
-            recorder.cadence(lag_ms)
+                await self._check_heights(step)
         except BaseException as error:
             self.left_ink_ns = None
             why = "stopped by the operator" if isinstance(error, asyncio.CancelledError) else describe(error)
@@ -274,31 +273,31 @@ class Run(RunContext):
     def _observed(self, attempt: Attempt) -> Generator[tuple[Recorder, ForceGuard]]:
         """Within the block, record the poses and forces of an attempt, and show them to whoever watches."""
         rig, show = self.rig, None if self.live is None else self.live.offer
-        force = rig.config.force
-        recorder = Recorder(attempt.writer, rig.clock, None if force is None else force.rate_hz, show)
+        recorder = Recorder(attempt.writer, rig.clock, show)
         if show is not None:
             show(step_message(attempt.begin))
-        guard = ForceGuard(rig, recorder.force)
+        guard = ForceGuard(rig, recorder.force, self.telemetry.force)
         try:
             rig.robot.listen(recorder.pose)
-            guard.listen()
-            with guard.also(self.telemetry.force):
-                yield recorder, guard
+            if rig.force is not None:
+                rig.force.listen(guard.sample)
+            yield recorder, guard
         finally:
-            guard.deafen()
+            if rig.force is not None:
+                rig.force.listen(None)
             rig.robot.listen(None)
 
-    async def _checked_lag_ms(self, step: Step) -> float | None:
-        """How late poses came, in ms. Raises `PosesLate` if the heights of the step do not count for that, and
-        `DeviceError` if the tool is not the one that was set."""
+    async def _check_heights(self, step: Step) -> None:
+        """After a step whose heights count: raise `PosesLate` if poses came too late for that, and `DeviceError` if the
+        tool is not the one that was set."""
+        if step.kind not in HEIGHTS:
+            return
         robot, limit_ms = self.rig.robot, self.rig.config.robot.max_pose_lag_ms
-        if step.kind in HEIGHTS:
-            with contextlib.suppress(ArmMoved):  # where the arm is now does not change what was done
-                await robot.confirm()
+        with contextlib.suppress(ArmMoved):  # where the arm is now does not change what was done
+            await robot.confirm()
         lag_ms = robot.pose_lag_ms()
-        if step.kind in HEIGHTS and lag_ms is not None and lag_ms > limit_ms:
+        if lag_ms is not None and lag_ms > limit_ms:
             raise PosesLate(lag_ms, limit_ms)
-        return lag_ms
 
     async def _do(self, step: Step, context: StepContext) -> StepResult:
         match step:

@@ -20,7 +20,7 @@ from brushloop.drivers.host import HostClock
 from brushloop.sessions.events import PressResult
 from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.messages import image_message
-from brushloop.sessions.records import Cadence, Check, Event, InkState, Quality, Topic, Wrench
+from brushloop.sessions.records import Check, Event, InkState, Quality, Topic, Wrench
 
 
 @pytest.fixture
@@ -37,7 +37,6 @@ def each(make):
             stroke_id="H13-a05-r00",
             checks=(Check(name="sharp", score=0.2, threshold=0.4, passed=False, reason="out of focus"),),
         ),
-        Topic.CADENCE: Cadence(topic="/robot/tcp", expected_hz=100.0, received=990, missed=10, longest_gap_ms=50.0),
     }
     outgoing = [Outgoing(topic, t_ns, t_ns, n, message) for n, (topic, message) in enumerate(messages.items())]
     recorder = Recorder(SimpleNamespace(write=outgoing.append), HostClock())

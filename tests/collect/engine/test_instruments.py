@@ -58,11 +58,11 @@ def presses(lab: Lab) -> int:
 
 
 @pytest.mark.xdist_group("collected")
-def test_force_ink_and_their_cadence_are_recorded_beside_the_poses(collected: Collected) -> None:
+def test_force_and_ink_are_recorded_beside_the_poses(collected: Collected) -> None:
     folder = collected.folder
     with (folder / f"{folder.name}.mcap").open("rb") as file:
         seen = Counter(channel.topic for _, channel, _ in make_reader(file, validate_crcs=True).iter_messages())
-    assert min(seen[topic] for topic in (Topic.TCP, Topic.JOINTS, Topic.WRENCH, Topic.CADENCE)) > 10
+    assert min(seen[topic] for topic in (Topic.TCP, Topic.JOINTS, Topic.WRENCH)) > 10
     assert seen[Topic.INK] == 4
     peaks_n = [press.peak_force_n or 0.0 for press in state_of(collected.lab).results(PressResult)]
     assert len(peaks_n) == 4
@@ -196,7 +196,7 @@ class Cell:
         """Move down step by step, guarded, with 6 N from the third line on where 5 N are allowed."""
         rig: Any = SimpleNamespace(robot=self, force=self, config=SimpleNamespace(force=SimpleNamespace(max_n=5.0)))
         guard = ForceGuard(rig)
-        guard.listen()
+        self.listen(guard.sample)
 
         async def down_step_by_step() -> None:
             while True:
@@ -249,7 +249,7 @@ def delays_ms(ahead_ns: list[int], delays: list[int]) -> list[float]:
     The device's clock is this far ahead of the host's, and the samples took so many ms to arrive.
     """
     kept = Kept()
-    recorder = Recorder(cast(Any, kept), HostClock(), 1000.0)
+    recorder = Recorder(cast(Any, kept), HostClock())
     for number, (ahead, delay_ms) in enumerate(zip(ahead_ns, delays, strict=True)):
         taken_ns = 1_700_000_000 * SECOND + number * 10 * MS
         stamp = Stamp(taken_ns + delay_ms * MS, taken_ns + ahead, number)
