@@ -19,7 +19,7 @@ from pathlib import Path
 from brushloop.collect.engine.control import FINAL, RunControl, State
 from brushloop.collect.engine.live import Telemetry, each_frame
 from brushloop.collect.engine.open_or_resume import Opening, open_store
-from brushloop.collect.engine.policy import board_first, resume_question
+from brushloop.collect.engine.policy import resume_question
 from brushloop.collect.engine.recorder import uninterrupted
 from brushloop.collect.engine.run import Run
 from brushloop.collect.engine.snapshot import Progress, Snapshot
@@ -31,9 +31,8 @@ from brushloop.collect.errors import (
     describe,
     rest_is_unknown,
 )
-from brushloop.collect.motion import Procedures
 from brushloop.collect.operator import Asker, Choice, OperatorRequest, OperatorRequests, Prompt
-from brushloop.collect.planning.walk import sheet_of, steps_on
+from brushloop.collect.planning.walk import sheet_of
 from brushloop.collect.rig.devices import Rig, connected
 from brushloop.drivers.errors import DeviceError, NotConnected, Stale
 from brushloop.drivers.host import Clock
@@ -76,7 +75,7 @@ class Engine:
         self._task: asyncio.Task[None] | None = None
         self._stopper: asyncio.Task[None] | None = None
         self._rig: Rig | None = None
-        self._procedures: Procedures | None = None
+        self._run: Run | None = None
         self._store: SessionStore | None = None
         self._stop_failure: DeviceError | None = None
         self._rest_unknown = False
@@ -117,7 +116,7 @@ class Engine:
             tip_mm=tip_mm,
             force_n=force_n,
             prompt=self._asker.prompt,
-            target_mm=None if self._procedures is None else self._procedures.target_mm,
+            target_mm=None if self._run is None else self._run.procedures.target_mm,
             parked=self._parked(),
             rest_unknown=self._rest_unknown,
             trace_n=self._telemetry.trace_n(),
@@ -284,24 +283,19 @@ class Engine:
             self._control.go_on()
 
     async def _protocol(self, rig: Rig, store: SessionStore) -> None:
-        self._procedures = Procedures(rig)
-        protocol = self._opening.protocol
-        run = Run(
+        self._run = Run(
             rig=rig,
+            protocol=self._opening.protocol,
             store=store,
             progress=self._progress,
             asker=self._asker,
-            procedures=self._procedures,
-            sheet=sheet_of(self._rig_config, protocol),
-            protocol=protocol,
             requests=self._requests,
             control=self._control,
             telemetry=self._telemetry,
             live=self._request.live,
             guided=self._request.guided,
         )
-        steps = steps_on(self._rig_config, protocol)
-        await run.carry_out(board_first(steps) if self._request.guided else steps)
+        await self._run.carry_out()
 
     def _end(self, state: State, error: Exception) -> None:
         """End with `error`, whose message says so if the arm may move or the brush may be down. The session keeps it

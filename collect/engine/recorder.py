@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import math
 from collections.abc import Callable, Coroutine
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
@@ -22,6 +22,7 @@ from brushloop.collect.engine.snapshot import Progress
 from brushloop.collect.errors import BadPicture, ConfigError, ForceTooHigh, StepError, describe
 from brushloop.collect.motion import Procedures
 from brushloop.collect.operator import Asker, OperatorRequests
+from brushloop.collect.planning.walk import sheet_of
 from brushloop.collect.protocols.config import ProtocolConfig
 from brushloop.collect.rig.devices import Rig
 from brushloop.collect.rig.paper import Patch, Sheet
@@ -237,13 +238,13 @@ class RunContext:
     """
 
     rig: Rig
+    protocol: ProtocolConfig
     store: SessionStore
     progress: Progress
     asker: Asker
-    procedures: Procedures
-    sheet: Sheet
-    protocol: ProtocolConfig
     requests: OperatorRequests
+    procedures: Procedures = field(init=False)
+    sheet: Sheet = field(init=False)
     left_ink_ns: int | None = None
     """Host time at which the brush left the ink; None if it has marked since or may have lost its ink."""
     view: Plane | None = None
@@ -258,6 +259,10 @@ class RunContext:
     """Times that the well was filled up for a dip since the run began."""
     light: float | None = None
     """Light of the ink station as it was set; None without one."""
+
+    def __post_init__(self) -> None:
+        self.procedures = Procedures(self.rig)
+        self.sheet = sheet_of(self.rig.config, self.protocol)
 
     def used_patches(self) -> set[int]:
         """Patches of the current sheet on which any mark was started, or which zero touch may ink."""

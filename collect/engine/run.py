@@ -18,6 +18,7 @@ from brushloop.collect.engine.policy import (
     STOP,
     Action,
     accept_question,
+    board_first,
     by_method,
     decide,
     in_set_up,
@@ -34,7 +35,7 @@ from brushloop.collect.errors import (
     describe,
 )
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
-from brushloop.collect.planning.walk import patches_of
+from brushloop.collect.planning.walk import patches_of, steps_on
 from brushloop.collect.protocols import steps
 from brushloop.collect.protocols.steps import MARKING, Protocol, Step, press_of, takes
 from brushloop.drivers.errors import ArmMoved, DeviceError, LimitExceeded, MotionError
@@ -61,12 +62,13 @@ class Run(RunContext):
     done: set[str] = field(default_factory=set[str])
     """Keys of the steps that this process has done."""
 
-    async def carry_out(self, protocol: Protocol) -> None:
+    async def carry_out(self) -> None:
         """Power on, retreat, do every step that is not in the journal yet, repeat what was marked bad, park."""
+        protocol = steps_on(self.rig.config, self.protocol)
         self.progress.doing("power on")
         await self._once_arm_is_free(self.rig.robot.enable)
         await self._once_arm_is_free(self._recover)
-        await self._walk(protocol)
+        await self._walk(board_first(protocol) if self.guided else protocol)
         for number in itertools.count():
             step = steps.ReviewStep(number)
             if step.key not in self.store.state.done and not capture.marked_bad(self):

@@ -130,6 +130,7 @@ def test_the_peak_force_of_a_figure_is_that_of_its_deepest_stroke(sharp_lab: Lab
     folder = sharp_lab.session
     [drawn] = replay(folder / JOURNAL_NAME).results(PressResult)
     assert (drawn.peak_force_n or 0.0) > 0.02, "the shallow stroke comes last and reaches 0.007 N"
+    assert drawn.depths_mm == pytest.approx((5.0, 1.0), abs=0.1)
 
 
 def test_a_figure_without_ink_is_drawn_again(sharp_lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -221,48 +222,22 @@ def test_what_is_no_lens_file_is_refused_in_one_line(bent_lab: Lab) -> None:
         load_rig(rig)
 
 
-def test_a_changed_lens_file_is_a_changed_configuration(bent_lab: Lab) -> None:
-    rig = named(bent_lab, lens_file(bent_lab.folder))
-    before = load_rig(rig).model_dump_json()
-    other = lens_file(bent_lab.folder, -0.07)
-    rig.write_text(rig.read_text().replace(lens_file(bent_lab.folder).name, other.name))
-    assert load_rig(rig).model_dump_json() != before
-
-
-# Where the paper lies: the board is looked for once in each frame
-
-
-class Camera:
-    """Frames, and the planes that are found in them."""
-
-    def __init__(self, *planes: str | None) -> None:
-        self.frames: list[Any] = [np.zeros((2, 2), np.uint8) for _ in planes]
-        self.planes = planes
-        self.searched: list[int] = []
-
-    def see_board(self, image: Any, _spec: object) -> str:
-        [number] = [k for k, frame in enumerate(self.frames) if frame is image]
-        self.searched.append(number)
-        if (plane := self.planes[number]) is None:
-            raise CalibrationError("camera", "no board")
-        return plane
-
-
-def run_with(camera: Camera, monkeypatch: pytest.MonkeyPatch) -> RunContext:
-    monkeypatch.setattr(recorder, "see_board", camera.see_board)
-    nothing: Any = SimpleNamespace()
-    rig: Any = SimpleNamespace(config=SimpleNamespace(board=None))
-    names = "store", "progress", "asker", "procedures", "sheet", "protocol", "requests"
-    return RunContext(rig=rig, **dict.fromkeys(names, nothing))
-
-
 def test_a_hidden_board_is_taken_from_the_newest_frame_that_showed_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    camera = Camera(None, "seen", None)
-    run = run_with(camera, monkeypatch)
+    hidden, shown, hidden_again = frames = [np.zeros((2, 2), np.uint8) for _ in range(3)]
+    searched: list[object] = []
+
+    def see_board(image: object, _spec: object) -> str:
+        searched.append(image)
+        if image is not shown:
+            raise CalibrationError("camera", "no board")
+        return "seen"
+
+    monkeypatch.setattr(recorder, "see_board", see_board)
+    run: Any = SimpleNamespace(view=None, view_of=None, rig=SimpleNamespace(config=SimpleNamespace(board=None)))
     with pytest.raises(BadPicture, match="no board"):
-        run.image_plane(camera.frames[0])
-    assert [run.image_plane(camera.frames[k]) for k in (1, 2, 2)] == ["seen"] * 3
-    assert camera.searched == [0, 1, 2]
+        RunContext.image_plane(run, hidden)
+    assert [RunContext.image_plane(run, image) for image in (shown, hidden_again, hidden_again)] == ["seen"] * 3
+    assert len(searched) == len(frames), "the board is looked for once in each frame"
 
 
 # What a screen shows of a capture, without torch
@@ -270,8 +245,7 @@ def test_a_hidden_board_is_taken_from_the_newest_frame_that_showed_one(monkeypat
 BRUSH = FittedPress(6.0, 48.0)
 
 
-@pytest.mark.parametrize("depth_mm", [11.0, 15.0, 20.0])
-@pytest.mark.parametrize("tilt_deg", [0.0, 5.0, 10.0])
+@pytest.mark.parametrize(("depth_mm", "tilt_deg"), [(11.0, 0.0), (15.0, 5.0), (20.0, 10.0)])
 def test_the_mark_is_the_one_of_the_closed_form(depth_mm: float, tilt_deg: float) -> None:
     mark = mark_of(BRUSH, Condition(depth_mm, tilt_deg))
     model = stroke_model("ccd-bsm", BRUSH)

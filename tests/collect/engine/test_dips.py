@@ -6,8 +6,7 @@ from __future__ import annotations
 import asyncio
 import math
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
@@ -110,17 +109,6 @@ def test_a_brush_that_waited_with_its_ink_dips_again(
     run(lab)
     assert targets.count("ink") == 2
     assert screen[screen.index("press H11-a0-r01") :][:3] == ["press H11-a0-r01", "dip", "press H11-a0-r01"]
-
-
-async def test_a_dip_of_zero_touch_or_the_self_check_is_none_for_a_press(monkeypatch: pytest.MonkeyPatch) -> None:
-    run = SimpleNamespace(left_ink_ns=None)
-
-    async def dipped(_context: Any) -> None:
-        run.left_ink_ns = 1
-
-    monkeypatch.setattr(brush_steps, "fill_brush", dipped)
-    await brush_steps._fill_for_touch(cast(Any, SimpleNamespace(run=run)))
-    assert run.left_ink_ns is None
 
 
 @pytest.mark.parametrize(("protocol", "kind"), [(LIST, "press"), (FIGURE, "draw")])

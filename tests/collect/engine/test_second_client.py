@@ -11,7 +11,7 @@ from brushloop.collect.engine.control import State
 from brushloop.drivers.arcs.controller import Controller
 from brushloop.drivers.arcs.motion import until_settled
 from brushloop.drivers.arcs.wire import RpcConnection
-from brushloop.drivers.errors import MotionFailed, NotPowered, PathDisturbed, SettingsChanged
+from brushloop.drivers.errors import MotionFailed, PathDisturbed, SettingsChanged
 from brushloop.drivers.geometry import brush_pose, from_wire, lean, to_wire
 from tests.journal_lines import read_lines
 from tests.runs import question, until, wait_for_end
@@ -146,16 +146,6 @@ def test_an_arm_that_was_switched_off_in_a_pause_is_asked_about_and_powered_agai
     engine.answer(prompt.number, "g")
     wait_for_end(engine)
     assert engine.snapshot().strokes_done == 2
-
-
-def test_where_nobody_watches_an_arm_that_was_switched_off_ends_the_run_with_the_reason(lab: Lab) -> None:
-    engine = lab.engine()
-    start_and_pause(engine)
-    second_client(lab, engine, RobotManage_poweroff={})
-    engine.resume()
-    with pytest.raises(NotPowered, match="robot mode is not Running"):
-        wait_for_end(engine)
-    assert not engine.snapshot().rest_unknown
 
 
 def test_an_arm_that_was_left_outside_its_limits_is_not_moved_until_it_is_jogged_back(lab: Lab) -> None:

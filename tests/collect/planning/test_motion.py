@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
 
-from brushloop.collect.errors import ConfigError, StepVoid
-from brushloop.collect.motion import Procedures, press_moves, stroke_moves
-from brushloop.collect.planning.limit_check import check_step
+from brushloop.collect.errors import StepVoid
+from brushloop.collect.motion import Procedures, stroke_moves
 from brushloop.collect.planning.walk import sheet_of, walk
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.steps import Drawn, DrawStep
 from brushloop.collect.rig.config import RigConfig, load_rig
-from brushloop.collect.rig.devices import Rig, limits_of, make_robot
+from brushloop.collect.rig.devices import Rig
 from brushloop.collect.rig.paper import PaperPlane, Sheet
 from brushloop.drivers.devices import Identity, Pose, QueuedLine
-from brushloop.drivers.host import HostClock
-from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import Addresses, rig_toml
-from brushloop.drivers.sim.world import World
-from brushloop.sessions.events import Press
 from brushloop.sessions.records import Condition
 
 NOBODY = Identity("robot", "made up", "", True)
@@ -97,63 +92,14 @@ async def test_a_depth_that_nobody_saw_is_not_believed(config: RigConfig, seen: 
         await pressed(config, MadeUpRobot(seen=seen))
 
 
-def test_every_move_of_a_press_lies_within_the_limits_and_ends_high(config: RigConfig):
-    before, pressing = press_moves(
-        config, made(config, MadeUpRobot()).plane, Sheet(config.paper).patch(0), Condition(20.0, 15.0)
-    )
-    for move in before + pressing:
-        limits_of(config).check("robot", move.target, speed_mm_s=move.speed_mm_s, acc_mm_s2=config.motion.acc_mm_s2)
-    assert pressing[-1].target.z_mm == config.motion.safe_z_mm
-
-
 # Drawn strokes
 
 WRITE = Path(__file__).parents[3] / "examples" / "protocol-write.toml"
 PLANE = PaperPlane(120.0)
 
 
-@dataclass
-class Desk:
-    procedures: Procedures
-    world: World
-    config: RigConfig
-
-
-@pytest.fixture
-async def desk(config: RigConfig) -> AsyncIterator[Desk]:
-    world = World(SimConfig(rate=20.0))
-    server = ArcsServer(world)
-    await server.start("127.0.0.1", 0)
-    here = config.robot.model_copy(update={"port": server.port, "rtde_port": None})
-    arm = make_robot(config.model_copy(update={"robot": here}), HostClock(), lambda _: None)
-    await arm.connect()
-    await arm.enable()
-    nothing = cast("Any", None)
-    procedures = Procedures(Rig(config, HostClock(), arm, nothing, nothing, nothing))
-    yield Desk(procedures, world, config)
-    await arm.close()
-    await server.stop()
-
-
 def first_drawn(config: RigConfig) -> Drawn:
     return next(w.step.drawn for w in walk(config, load_protocol(WRITE)) if isinstance(w.step, DrawStep))
-
-
-async def test_a_drawn_stroke_is_one_drag_through_its_points(desk: Desk) -> None:
-    drawn = first_drawn(desk.config)
-    patch = sheet_of(desk.config, load_protocol(WRITE)).patch(0)
-    depth_mm = await desk.procedures.stroke(patch, drawn, 0)
-    assert depth_mm == pytest.approx(drawn.strokes[0][0][2], abs=0.05)
-    [drag] = desk.world.drags
-    assert not desk.world.presses
-    for x_mm, y_mm, depth_mm, *_ in drawn.strokes[0]:
-        near = min(
-            abs(w.x_mm - patch.x_mm - x_mm) + abs(w.y_mm - patch.y_mm - y_mm) + abs(w.depth_mm - depth_mm)
-            for w in drag.path
-        )
-        assert near < 0.8
-    assert drag.heading_deg % 360.0 == pytest.approx(180.0, abs=0.1)
-    assert desk.world.tool().z_mm == pytest.approx(desk.config.motion.safe_z_mm, abs=0.05)
 
 
 def test_a_stroke_may_come_down_on_its_way(config: RigConfig) -> None:
@@ -169,12 +115,3 @@ def test_the_wrist_turns_where_the_brush_is_upright_and_high(config: RigConfig) 
     patch = sheet_of(config, load_protocol(WRITE)).patch(0)
     [high, clear, *_] = stroke_moves(config, PLANE, patch, first_drawn(config).strokes[1], 15.0)
     assert high.target.quaternion == pytest.approx(clear.target.quaternion)
-
-
-def test_all_of_a_figure_is_checked(config: RigConfig) -> None:
-    drawn, patch = first_drawn(config), sheet_of(config, load_protocol(WRITE)).patch(0)
-    step = DrawStep(0, Press(stroke_id="yong", condition=Condition(10.0, 0.0)), drawn)
-    check_step(Path("rig.toml"), config, PLANE, step, [patch])
-    drawn.strokes[1][-1] = (40.0, 12.0, 1.0, 20.0, 90.0)
-    with pytest.raises(ConfigError, match="tilt"):
-        check_step(Path("rig.toml"), config, PLANE, step, [patch])

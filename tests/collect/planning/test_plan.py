@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import itertools
-import json
 from pathlib import Path
 
 import pytest
 
 from brushloop.collect.errors import ConfigError
-from brushloop.collect.motion import Move
 from brushloop.collect.motion import Path as MotionPath
 from brushloop.collect.planning.limit_check import all_poses, check_poses, check_protocol
 from brushloop.collect.planning.summary import (
@@ -18,9 +16,8 @@ from brushloop.collect.planning.summary import (
     move_s,
     path_s,
     reach_of,
-    trapezoid_s,
 )
-from brushloop.collect.planning.walk import moves_of, sheet_of, walk
+from brushloop.collect.planning.walk import sheet_of, walk
 from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
 from brushloop.collect.protocols.steps import MARKING, DrawStep, PressStep, StepKind
 from brushloop.collect.rig.config import RigConfig, load_rig
@@ -62,12 +59,6 @@ def test_the_grid_of_the_paper_needs_four_sheets_and_a_dip_for_each_press(grid_p
     assert list(grid_plan.sheet_changes) == [grid_plan.placed[i].stroke_id for i in (42, 84, 126)]
     assert sum(grid_plan.seconds_by_kind.values()) == pytest.approx(grid_plan.seconds)
     assert grid_plan.warnings == ()
-
-
-def test_a_plan_as_json_is_json(grid_plan: Plan) -> None:
-    read = json.loads(json.dumps(grid_plan.as_json()))
-    assert read["sheets"] == 4
-    assert read["steps"] == {"zero_touch": 1, "board": 1, "dip": 150, "press": 150, "capture": 150}
 
 
 def test_every_example_passes_and_is_walked(tmp_path: Path) -> None:
@@ -186,7 +177,7 @@ def test_the_outermost_cells_stand_for_all(tmp_path: Path) -> None:
 def test_a_sheet_that_leans_is_checked_as_it_lies(tmp_path: Path) -> None:
     config, wanted = rig(tmp_path), example("protocol.toml")
     check_poses(tmp_path / "rig.toml", config, wanted, PaperPlane(120.0))
-    with pytest.raises(ConfigError, match=r"z = 88\.\d+ mm is outside .* on patch \d+\)"):
+    with pytest.raises(ConfigError, match=r"z = \d\d\.\d+ mm is outside .* on patch \d+\)"):
         check_poses(tmp_path / "rig.toml", config, wanted, PaperPlane(120.0, -0.05))
 
 
@@ -216,12 +207,6 @@ def test_a_drawn_stroke_goes_through_its_points_at_its_depths(tmp_path: Path) ->
         (460.0 - patch.y_mm - y_mm, -110.0 + patch.x_mm + x_mm, config.paper.touch_z_mm - depth_mm)
     )
     assert draw.moves.dips == 1
-
-
-def test_trapezoids_and_triangles() -> None:
-    assert trapezoid_s(100.0, 20.0, 200.0) == pytest.approx(5.1)
-    assert trapezoid_s(0.5, 20.0, 200.0) == pytest.approx(0.1)
-    assert trapezoid_s(2.0, 20.0, 200.0) == pytest.approx(0.2)
 
 
 def test_a_turn_on_the_spot_is_read_in_radians(tmp_path: Path) -> None:
@@ -271,11 +256,3 @@ def test_a_self_check_takes_a_cell_before_the_first_stroke(tmp_path: Path) -> No
     small = rig(tmp_path, "[motion]", "[self_check]\nenabled = true\nlegs_mm = [50.0, 15.0]\n\n[motion]")
     with pytest.raises(ConfigError, match=r"rig.toml: self_check.legs_mm: a triangle of 50 by 15 mm does not fit"):
         check_protocol(tmp_path / "rig.toml", EXAMPLES / "protocol.toml", small, example("protocol.toml"))
-
-
-def test_moves_of_a_touch_end_above_where_they_began(tmp_path: Path) -> None:
-    config = rig(tmp_path)
-    walked = next(w for w in walk(config, example("protocol-calibration.toml")) if w.step.kind == StepKind.TOUCH)
-    moves = [part for part in moves_of(config, PaperPlane(120.0), walked.step).segments if isinstance(part, Move)]
-    assert moves[0].target == moves[-1].target
-    assert min(move.target.z_mm for move in moves) == 120.0

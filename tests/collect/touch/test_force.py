@@ -15,7 +15,7 @@ from brushloop.collect.rig.config import ForceTouchConfig
 from brushloop.collect.touch import force
 from brushloop.collect.touch.camera import first_ink
 from brushloop.collect.touch.force import Contact, Reading, find_contact, touch_by_force
-from brushloop.collect.touch.heights import SPAN_SIGMAS, Reach
+from brushloop.collect.touch.heights import Reach
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.world import Reaction
@@ -109,19 +109,12 @@ class Felt:
         self.noise_n = NOISE_N
         self.samples = 0
         self.deepest_mm = -math.inf
-        self.rests = 0
-        self.way_mm = 0.0
-        self._z_mm: float | None = None
 
     async def rest(self, z_mm: float, samples: int) -> Reading:
         depth_mm = (self._touch_z_mm - z_mm) * math.cos(math.radians(self._lean_deg))
         self.deepest_mm = max(self.deepest_mm, depth_mm)
         push_n = self._reaction.push_n(depth_mm, self._lean_deg) + self.drift_n * self.samples
         self.samples += samples
-        self.rests += 1
-        if self._z_mm is not None:
-            self.way_mm += abs(z_mm - self._z_mm) + (2.0 if z_mm > self._z_mm else 0.0)
-        self._z_mm = z_mm
         drawn = self._rng.normal(push_n, self.noise_n, samples)
         return Reading(z_mm, float(drawn.mean()), samples, float(drawn.std(ddof=1)))
 
@@ -157,36 +150,6 @@ async def test_200_touches_lie_within_a_tenth_of_the_truth_at_3_sigma(reaction: 
     # what a touch says of its own error is true
     assert errors.std(ddof=1) == pytest.approx(float(np.mean([c.sigma_mm for _, c, _ in found])), rel=0.2)
     assert max(probe.deepest_mm for _, _, probe in found) < 2.0, "a touch is no press"
-
-
-SENSOR_HZ, TOUCH_MM_S, REST_S = 200.0, 5.0, 0.3
-"""Rounds of the sensor, speed of a touch, and what a rest takes beside its samples and its way."""
-
-
-async def test_three_touches_at_each_of_four_points_take_three_minutes(reaction: Reaction) -> None:
-    spans, centres, minutes = list[float](), list[float](), list[float]()
-    for seed in range(40):
-        rng, spring, found, took_s = np.random.default_rng(seed), None, list[float](), 0.0
-        for _ in range(4):
-            truth, near_z_mm, touches = 120.0 + rng.uniform(-1.0, 1.0), None, list[float]()
-            for _ in range(3):
-                probe = Felt(reaction, truth, rng, lean_deg=rng.uniform(0.0, 1.0))
-                contact = await touch_by_force(probe, REACH, ForceTouchConfig(), spring, near_z_mm)
-                spring, near_z_mm = contact.spring, contact.z_mm
-                touches.append(contact.z_mm - truth)
-                took_s += probe.samples / SENSOR_HZ + probe.way_mm / TOUCH_MM_S + probe.rests * REST_S
-            found.append(float(np.mean(touches)))
-            spans.append(max(touches) - min(touches))
-        centres.append(float(np.mean(found)))
-        minutes.append(took_s / 60.0)
-    sys.stdout.write(
-        f"{np.mean(minutes):.1f} min (most {max(minutes):.1f}); middle of the plane: bias {np.mean(centres):+.4f} mm, "
-        f"sd {np.std(centres):.4f} mm; largest span of three touches {max(spans):.3f} mm\n"
-    )
-    assert max(minutes) < 4.5
-    assert np.mean(minutes) < 3.5
-    assert max(abs(centre) for centre in centres) < 0.05
-    assert max(spans) < SPAN_SIGMAS * ForceTouchConfig().sigma_mm
 
 
 @pytest.mark.parametrize("moved_mm", [-0.7, -0.3, 0.3, 0.7])
