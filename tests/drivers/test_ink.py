@@ -23,7 +23,7 @@ from brushloop.drivers.ink import port as port_module
 from brushloop.drivers.ink import pump as pump_module
 from brushloop.drivers.ink import station as station_module
 from brushloop.drivers.ink.port import DoseLost, InkRefused
-from brushloop.drivers.ink.pump import ModbusPump, ModbusPumpConfig, exception, write_register
+from brushloop.drivers.ink.pump import ModbusPump, ModbusPumpConfig
 from brushloop.drivers.ink.simulator import PtyLine, PumpFirmware, StationFirmware
 from brushloop.drivers.ink.station import InkStation, InkStationConfig, seal
 from tests.drivers.failing import PatientClock, SetClock, fail_requests, heard, scripted
@@ -430,17 +430,3 @@ async def test_a_host_that_was_held_up_reports_the_excess(
             await pump.dose(0.01)
     assert ran == [True]
     assert not rotor.running
-
-
-def test_the_simulated_pump_pumps_by_the_clock_and_refuses_other_registers():
-    now_s = 0.0
-    rotor = PumpFirmware(ml_per_revolution=0.5, now_s=lambda: now_s)
-    rotor.answer(write_register(1, 1, 6000))
-    rotor.answer(write_register(1, 4, 1))
-    now_s = 10.0
-    assert rotor.pumped_ml == pytest.approx(5.0)
-    rotor.answer(write_register(1, 4, 0))
-    now_s = 20.0
-    assert rotor.pumped_ml == pytest.approx(5.0)
-    for request, code in ((write_register(1, 2, 1), 2), (write_register(1, 1, 60001), 3)):
-        assert rotor.answer(request) == exception(1, 6, code)

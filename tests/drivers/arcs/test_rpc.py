@@ -7,18 +7,22 @@ read its controller as it did in the lab: the same words, and what it makes of t
 from __future__ import annotations
 
 import asyncio
+import json
 import re
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from brushloop.drivers.arcs.controller import survey
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.arcs.settings import ArcsTable
-from brushloop.drivers.arcs.wire import RpcConnection, encode
+from brushloop.drivers.arcs.wire import BareDecoder, FrameDecoder, RpcConnection, encode
 from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation, RpcError
 from brushloop.drivers.limits import Limits
+from brushloop.drivers.sim.arcs_server import ArcsServer
+from brushloop.drivers.sim.rig import HOST
 from tests.drivers.arcs.transcript import (
     Answer,
     AnsweringByName,
@@ -166,6 +170,75 @@ async def test_closing_wakes_the_caller_that_still_waits(controller: Controller,
     await client.close()
     with pytest.raises(NotConnected, match="closed while waiting"):
         await waiting
+
+
+# ---------------------------------------------------------------- the loopback controller, asked byte by byte
+
+Ask = Callable[[bytes], Awaitable[dict[str, Any]]]
+STOP = "rob1.MotionControl.stopLine"
+
+
+@pytest.fixture(params=["sof", "short sof", "bare"])
+async def ask(request: pytest.FixtureRequest, cabinet: ArcsServer) -> AsyncIterator[Ask]:
+    """Send the bytes of a request in one framing, and hand back the reply."""
+    reader, writer = await asyncio.open_connection(HOST, cabinet.port)
+    decoder = BareDecoder() if request.param == "bare" else FrameDecoder()
+
+    async def exchange(payload: bytes) -> dict[str, Any]:
+        match request.param:
+            case "sof":
+                writer.write(encode(payload))
+            case "short sof":
+                writer.write(b"SOF\x00" + len(payload).to_bytes(2, "big") + payload)
+            case _:
+                writer.write(payload)
+        replies: list[bytes] = []
+        while not replies:
+            data = await reader.read(4096)
+            assert data, "hung up"
+            replies = decoder.feed(data)
+        return json.loads(replies[0])
+
+    yield exchange
+    writer.close()
+    await writer.wait_closed()
+
+
+def request(method: str, **body: Any) -> bytes:
+    return json.dumps({"jsonrpc": "2.0", "method": method, **body}).encode()
+
+
+@pytest.mark.parametrize(
+    ("payload", "code"),
+    [
+        (request("Nonsense", id="a"), -32601),
+        (request(STOP, id="a"), -32602),
+        (request(STOP, id="a", params={"acc": "fast", "acc_rot": 1.0}), -32602),
+        (request("rob1.MotionControl.moveLine", id="a", params={"pose": [1], "a": 1, "v": 1}), -32602),
+        (request("rob1.RobotAlgorithm.forwardKinematics", id="a", params=[[1e999] * 6]), -32602),
+    ],
+)
+async def test_nonsense_gets_the_codes_of_json_rpc_and_its_id_back(ask: Ask, payload: bytes, code: int):
+    reply = await ask(payload)
+    assert (reply["id"], reply["error"]["code"]) == ("a", code)
+    assert (await ask(request("getRobotNames", id=2)))["result"] == ["rob1"]
+
+
+async def test_a_bare_client_that_sends_no_json_gets_an_error_and_is_disconnected(cabinet: ArcsServer):
+    reader, writer = await asyncio.open_connection(HOST, cabinet.port)
+    writer.write(b"{]")
+    assert json.loads(await reader.read())["error"]["code"] == -32700
+    writer.close()
+    await writer.wait_closed()
+
+
+async def test_the_header_of_a_reply_comes_in_one_piece(cabinet: ArcsServer):
+    reader, writer = await asyncio.open_connection(HOST, cabinet.port)
+    for _ in range(50):
+        writer.write(encode(request("rob1.RobotState.getTcpPose", id="a")))
+        assert len(await reader.read(65536)) > 8
+    writer.close()
+    await writer.wait_closed()
 
 
 # ---------------------------------------------------------------- reports of labs

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
 import math
 import random
@@ -20,7 +21,7 @@ from brushloop.drivers.arcs.telemetry import (
     encode_sample,
     encode_topic,
 )
-from brushloop.drivers.arcs.wire import FrameDecoder, encode
+from brushloop.drivers.arcs.wire import FrameDecoder, encode, encode_short
 from brushloop.drivers.devices import Pose, PoseSample, QueuedLine, Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, ProtocolViolation, Stale
 from brushloop.drivers.geometry import brush_pose, distance
@@ -235,7 +236,75 @@ async def test_a_pose_that_is_none_ends_the_stream_not_the_arm(rtde: RtdeServer,
     arm.latest()
 
 
+# ---------------------------------------------------------------- what the loopback controller pushes
+
+
+class Client:
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.reader, self.writer = reader, writer
+        self.decoder = FrameDecoder()
+
+    async def greeting(self) -> bytes:
+        return await self.reader.readuntil(b"}\n\n")
+
+    async def pushes(self, seconds: float) -> list[Any]:
+        got: list[Any] = []
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                while data := await self.reader.read(65536):
+                    got += [cbor2.loads(p) for p in self.decoder.feed(data)]
+        return got
+
+
+@pytest.fixture
+async def client(rtde: RtdeServer) -> AsyncIterator[Client]:
+    it = Client(*await asyncio.open_connection(HOST, rtde.port))
+    yield it
+    it.writer.close()
+    await it.writer.wait_closed()
+
+
+async def test_the_makers_own_bytes_subscribe(client: Client):
+    await client.greeting()
+    client.writer.write(
+        b"SOF\x00\x00\\\x82\x18d\xa5fchanel\x00ifrequency\xfaBH\x00\x00hsegments\x82kR1_actual_qrR1_actual_TCP_poseito_server\xf4gtrigger\x1aAAAA"
+    )
+    chanel, q, pose = (await client.pushes(0.3))[-1]
+    assert (chanel, len(q)) == (0, 6)
+    assert pose[:3] == pytest.approx([0.25, -0.23, 0.44])
+    client.writer.write(
+        b"SOF\x00\x009\x82\x18d\xa5fchanel\x00ifrequency\xfa\x00\x00\x00\x00hsegments\x80ito_server\xf4gtrigger\x00"
+    )
+    await client.pushes(0.05)
+    assert await client.pushes(0.1) == []
+
+
+@pytest.mark.parametrize("junk", [b"GET /", b"SOF\x02\x00\x01x", encode_short(b"\xff"), encode_short(b"[100, 5]")])
+async def test_a_client_that_talks_nonsense_is_hung_up_on(client: Client, junk: bytes):
+    await client.greeting()
+    client.writer.write(junk)
+    assert await client.reader.read() == b""
+
+
+async def test_where_the_arm_rested_between_two_pushes_is_reported_where_time_runs_fast(
+    client: Client, cabinet: ArcsServer
+):
+    await client.greeting()
+    client.writer.write(encode_topic(0, ["R1_actual_TCP_pose", "timestamp"], 10.0))
+    await client.pushes(0.15)
+    motion, now_s = cabinet.cabinet.world.motion, cabinet.cabinet.now_s()
+    # The flange moves for a second of the arm's time, which is half of what lies between two pushes.
+    for z_mm in (250.0, 260.0):
+        motion.add(brush_pose(250.0, -230.0, z_mm), 100.0, 1000.0, now_s)
+    got = [(round(pose[2], 6), at_s) for _, pose, at_s in await client.pushes(0.3)]
+    assert 0.43 in [z_m for z_m, _ in got]
+    assert got == sorted(got, key=lambda sample: sample[1])
+
+
+# ---------------------------------------------------------------- the lag
+
 Path = Callable[[float], Pose]
+HIGH = brush_pose(400.0, 0.0, 140.0)
 
 
 def press(t_s: float) -> Pose:
@@ -249,16 +318,24 @@ def circle(t_s: float) -> Pose:
 
 
 def lag_ms(
-    path: Path, lag_s: float, *, answer_s: float = 0.004, silent: tuple[float, float] = (0.0, 0.0), seconds: float = 4.0
+    path: Path,
+    lag_s: float,
+    *,
+    answer_s: float = 0.004,
+    silent: tuple[float, float] = (0.0, 0.0),
+    shown: Path | None = None,
 ) -> float | None:
-    """What is measured where poses arrive this late, 100 times a second, and 40 questions a second are answered."""
+    """What is measured in 4 s where poses arrive this late, 100 times a second, and 40 questions a second are answered.
+
+    `shown` is the path of the poses that arrive, if it is another one.
+    """
     clock, rng = SetClock(), random.Random(7)
     meter = LagMeter(clock)
-    for tick in range(round((seconds + lag_s) * 100)):
+    for tick in range(round((4.0 + lag_s) * 100)):
         t_s = 0.01 * tick
         if not silent[0] < t_s < silent[1]:
-            meter.arrived(PoseSample(Stamp(round(1e9 * (100.0 + t_s))), path(t_s - lag_s)))
-    for tick in range(round(seconds * 40)):
+            meter.arrived(PoseSample(Stamp(round(1e9 * (100.0 + t_s))), (shown or path)(t_s - lag_s)))
+    for tick in range(160):
         t_s = tick / 40 + rng.uniform(0.0, 0.01)
         clock.s = 100.0 + t_s + rng.uniform(0.0, answer_s)
         meter.asked(path(t_s), answer_s)
@@ -271,20 +348,8 @@ def test_the_lag_is_measured_to_a_few_milliseconds(path: Path, lag_s: float):
     assert lag_ms(path, lag_s) == pytest.approx(1e3 * lag_s, abs=15.0)
 
 
-def test_a_computer_that_was_busy_for_a_while_does_not_count_as_a_lag():
+def test_nothing_is_concluded_from_a_silence_from_answers_that_took_long_from_rest_and_from_another_path():
     assert lag_ms(press, 0.0, silent=(0.3, 0.8)) == pytest.approx(0.0, abs=15.0)
-
-
-def test_from_answers_that_took_long_and_from_an_arm_at_rest_nothing_is_concluded():
     assert lag_ms(press, 0.0, answer_s=0.2) is None
-    assert lag_ms(lambda _: brush_pose(400.0, 0.0, 140.0), 0.8) is None
-
-
-def test_poses_of_another_path_are_not_compared():
-    clock = SetClock(100.0)
-    meter = LagMeter(clock)
-    for tick in range(400):
-        clock.s = 100.0 + 0.01 * tick
-        meter.arrived(PoseSample(Stamp(clock.now_ns()), brush_pose(400.0, 0.0, 140.0)))
-        meter.asked(circle(0.01 * tick), 0.001)
-    assert meter.lag_ms() is None
+    assert lag_ms(lambda _: HIGH, 0.8) is None
+    assert lag_ms(circle, 0.0, shown=lambda _: HIGH) is None
