@@ -1,18 +1,45 @@
-"""What a run on an arm is about to do, and the question whether it may."""
+"""How far and how fast the contract moves an arm, and the question whether it may.
+
+It goes a few millimetres straight up, slowly, and back.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import sys
 
 import pytest
 
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import make_robot, sole_driver
-from brushloop.drivers.arcs.robot import ArmState
+from brushloop.drivers.arcs.robot import ArmState, AuboArcs
 from brushloop.drivers.devices import Identity, Pose
 from brushloop.drivers.host import HostClock
-from tests.contract.motion import ACC_MM_S2, LIFT_MM, SPEED_MM_S
+
+LIFT_MM = 5.0
+"""No test sends the tip higher than this above where it stood, lower than that, or sideways."""
+SPEED_MM_S = 10.0
+SLOW_MM_S = 2.0
+"""For a move that is stopped on its way."""
+ACC_MM_S2 = 100.0
+SAME_PLACE_MM = 0.5
+"""Somebody moved the arm between two tests where it stands farther than this from where the first began."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Enabled:
+    """An arm that may move, where it stands, and the highest pose that a test may send it to."""
+
+    robot: AuboArcs
+    start: Pose
+    top: Pose
+
+
+def raised(pose: Pose, by_mm: float) -> Pose:
+    """The same attitude, straight above."""
+    return dataclasses.replace(pose, z_mm=pose.z_mm + by_mm)
+
 
 QUESTION = "Keep a hand at the emergency stop. May the arm move? [y/N] "
 

@@ -24,8 +24,7 @@ from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import HOST, Addresses, rig_toml
 from brushloop.drivers.sim.world import SimClock, World
-from tests.contract.asking import permission_refused
-from tests.contract.motion import ACC_MM_S2, LIFT_MM, SAME_PLACE_MM, SPEED_MM_S, Enabled, raised
+from tests.contract.asking import ACC_MM_S2, LIFT_MM, SAME_PLACE_MM, SPEED_MM_S, Enabled, permission_refused, raised
 from tests.simulated_time import SimulatedTimeLoop
 
 RATE = 5.0
