@@ -6,6 +6,7 @@ import asyncio
 import math
 import time
 from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
@@ -43,11 +44,22 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> PatientClock:
 
 HELLO = (b"000 identify*6A60\n", b"000 ok ink-station 1 1.0.0 real*8310\n")
 DOSE = b"001 dose 0.500*7A5F\n"
+LEVEL = b"001 level*243E\n"
 
 
 def station_at(path: str, clock: Clock | None = None) -> InkStation:
     table = InkStationConfig(kind="ink-station", port=path, dose_ml=2.0, light=0.5)
     return InkStation(table, clock or HostClock())
+
+
+@asynccontextmanager
+async def talking(clock: PatientClock, *exchanges: tuple[bytes, bytes]) -> AsyncIterator[InkStation]:
+    """A connected station that expects these requests and nothing else."""
+    with scripted([HELLO, *exchanges], clock) as path:
+        station = station_at(path)
+        await station.connect()
+        yield station
+        await station.close()
 
 
 @pytest.fixture
@@ -71,73 +83,55 @@ async def station(station_line: PtyLine) -> AsyncIterator[InkStation]:
 
 async def test_a_session_reads_like_the_documented_one(clock: PatientClock):
     exchanges = [
-        HELLO,
         (seal(1, "light 0.500"), seal(1, "ok")),
         (seal(2, "dose 1.250"), seal(2, "ok 1.250")),
         (seal(3, "level"), seal(3, "ok 0.730")),
         (seal(4, "dose 0.500"), seal(4, "err 4 reservoir is empty")),
     ]
-    with scripted(exchanges, clock) as path:
-        station = station_at(path)
-        identity = await station.connect()
-        assert (identity.model, identity.firmware, identity.simulated) == ("ink-station", "1.0.0", False)
+    async with talking(clock, *exchanges) as station:
         assert await station.light() == 0.5
         await station.dose(1.25)
         assert await station.level() == 0.73
         with pytest.raises(InkRefused, match=r"reservoir is empty.*Nothing was done.*Refill") as refusal:
             await station.dose(0.5)
         assert refusal.value.code == 4
-        await station.close()
 
 
 async def test_a_lost_reply_is_asked_for_again_with_the_same_line_and_then_says_what_may_have_happened(
     clock: PatientClock,
 ):
     again = seal(2, "dose 0.500")
-    exchanges = [HELLO, (DOSE, b""), (DOSE, b"001 ok 0.500*41C5\n"), (again, b""), (again, b"")]
-    with scripted(exchanges, clock) as path:
-        station = station_at(path)
-        await station.connect()
+    exchanges = [(DOSE, b""), (DOSE, b"001 ok 0.500*41C5\n"), (again, b""), (again, b"")]
+    async with talking(clock, *exchanges) as station:
         await station.dose(0.5)
         with pytest.raises(DeviceTimeout, match=r"Between 0 and 0.500 ml may be in the well"):
             await station.dose(0.5)
-        await station.close()
 
 
 @pytest.mark.parametrize(
-    ("reply", "error", "says"),
+    ("request_line", "reply", "error", "says"),
     [
-        (b"001 ok 1.5*CD6C\n", ProtocolViolation, "above 1"),
-        (b"001 ok nan*1429\n", ProtocolViolation, "not a decimal"),
-        (b"001 ok*C626\n", ProtocolViolation, "expected one number"),
-        (b"001 err 6 jammed*4073\n", InkRefused, "Look at the pump"),
+        (LEVEL, b"001 ok 1.5*CD6C\n", ProtocolViolation, "above 1"),
+        (LEVEL, b"001 ok nan*1429\n", ProtocolViolation, "not a decimal"),
+        (LEVEL, b"001 ok*C626\n", ProtocolViolation, "expected one number"),
+        (LEVEL, b"001 err 6 jammed*4073\n", InkRefused, "Look at the pump"),
+        (DOSE, b"001 ok 0.400*8194\n", DeviceError, r"gave 0.400 ml instead of 0.500 ml"),
     ],
 )
-async def test_a_level_that_makes_no_sense_is_refused(
-    clock: PatientClock, reply: bytes, error: type[DeviceError], says: str
+async def test_a_reply_that_makes_no_sense_is_an_error(
+    clock: PatientClock, request_line: bytes, reply: bytes, error: type[DeviceError], says: str
 ):
-    with scripted([HELLO, (b"001 level*243E\n", reply)], clock) as path:
-        station = station_at(path)
-        await station.connect()
+    async with talking(clock, (request_line, reply)) as station:
         with pytest.raises(error, match=says):
-            await station.level()
-        await station.close()
-
-
-async def test_a_dose_that_comes_out_smaller_is_an_error(clock: PatientClock):
-    with scripted([HELLO, (DOSE, b"001 ok 0.400*8194\n")], clock) as path:
-        station = station_at(path)
-        await station.connect()
-        with pytest.raises(DeviceError, match=r"gave 0.400 ml instead of 0.500 ml"):
-            await station.dose(0.5)
-        await station.close()
+            await (station.level() if request_line == LEVEL else station.dose(0.5))
 
 
 async def test_a_board_that_starts_slowly_is_waited_for_and_another_device_is_refused(clock: PatientClock):
     hello, answer = HELLO
     with scripted([(hello, b""), (hello, answer)], clock) as path:
         station = station_at(path)
-        await station.connect()
+        identity = await station.connect()
+        assert (identity.model, identity.firmware, identity.simulated) == ("ink-station", "1.0.0", False)
         await station.close()
     for other in (b"000 ok ink-station 2 9.0 real*24F2\n", b"000 ok gcode 1.1 real x*EE49\n"):
         with scripted([(hello, other)], clock) as path:
