@@ -29,8 +29,8 @@ from brushloop.collect.rig.config import BrushConfig, PaperConfig, RigConfig
 from brushloop.collect.rig.devices import limits_of
 from brushloop.collect.rig.paper import PaperPlane, Patch, Sheet
 from brushloop.collect.touch.selfcheck import triangle_in
-from brushloop.drivers.arcs.controller import Controller, six
-from brushloop.drivers.arcs.wire import RpcConnection, open_arcs
+from brushloop.drivers.arcs.controller import Controller
+from brushloop.drivers.arcs.wire import RpcConnection, numbers, open_arcs
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import LimitExceeded, ProtocolViolation
 from brushloop.drivers.geometry import from_wire, inverse, product, to_wire, turned
@@ -224,7 +224,7 @@ async def ask_reach(rig_path: Path, config: RigConfig, poses: Iterable[tuple[Pos
 async def _joints(controller: Controller, wire: list[float], near: list[float]) -> list[float] | None:
     match await controller.ask("RobotAlgorithm.inverseKinematics", qnear=near, pose=wire):
         case [list(joints), 0]:  # pyright: ignore[reportUnknownVariableType]
-            return six("inverseKinematics", joints)  # pyright: ignore[reportUnknownArgumentType]
+            return numbers("inverseKinematics", joints)  # pyright: ignore[reportUnknownArgumentType]
         case [_, int()]:
             return None
         case other:
@@ -233,7 +233,7 @@ async def _joints(controller: Controller, wire: list[float], near: list[float]) 
 
 async def _tool(controller: Controller) -> list[float]:
     """The tool offset that is set on the controller: x, y, z in m, rx, ry, rz in rad."""
-    return six("getTcpOffset", await controller.ask("RobotConfig.getTcpOffset"))
+    return numbers("getTcpOffset", await controller.ask("RobotConfig.getTcpOffset"))
 
 
 def _for_tool(tip: Pose, own_tool: list[float], set_tool: list[float]) -> Pose:

@@ -157,18 +157,19 @@ async def _force(finding: Finding, config: ForceTable, clock: Clock) -> Finding:
         identity = await sensor.connect()
         await asyncio.sleep(LISTEN_S)
         age_ms = (clock.now_ns() - sensor.latest().stamp.host_ns) / 1e6
-        force_n, health = math.hypot(*sensor.latest().force_n), sensor.health()
+        force_n, stream = math.hypot(*sensor.latest().force_n), sensor.stream
     finally:
         await sensor.close()
     problem = remedy = ""
-    if health.torn or health.refused or health.bus_errors:
-        problem = f"{health.torn} torn, {health.refused} refused rounds, {health.bus_errors} bus errors"
+    dropped = stream.assembler
+    if dropped.torn or dropped.refused or stream.bus_errors:
+        problem = f"{dropped.torn} torn, {dropped.refused} refused rounds, {stream.bus_errors} bus errors"
         remedy = "Check wiring, shielding and termination."
     elif force_n > config.max_n:
         problem = f"{force_n:.2f} N with nothing pressing, above the ceiling force.max_n = {config.max_n:g} N"
         remedy = "Remove what touches the brush; the bias at each start takes off the weight of the holder."
     return finding.answered(
-        identity, age_ms, f"{health.rate_hz:.0f} rounds/s, {force_n:.3f} N before bias", problem, remedy
+        identity, age_ms, f"{stream.rate_hz():.0f} rounds/s, {force_n:.3f} N before bias", problem, remedy
     )
 
 

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from brushloop.collect.rig.doctor import Finding, Scrubber, numbers_only, transcript, write_archive
 from brushloop.collect.teach.day import Asked, Day, Step, Target
 from brushloop.collect.teach.store import Notebook, touch_of
-from brushloop.drivers.arcs.controller import MOVING_ALLOWED, Controller, six
+from brushloop.drivers.arcs.controller import MOVING_ALLOWED, Controller
 from brushloop.drivers.arcs.wire import DEVICE, Framing, RpcConnection, answers, numbers, open_arcs
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, ProtocolViolation, RpcError
@@ -113,8 +113,8 @@ class ArmReader:
 
     async def _flange_now(self) -> Pose:
         """From the cabinet's tool pose, with its tool taken off again: whatever is set there does not matter."""
-        tool = six("getTcpOffset", await self._ask("RobotConfig.getTcpOffset"))
-        at = from_wire(six("getTcpPose", await self._ask("RobotState.getTcpPose")))
+        tool = numbers("getTcpOffset", await self._ask("RobotConfig.getTcpOffset"))
+        at = from_wire(numbers("getTcpPose", await self._ask("RobotState.getTcpPose")))
         turn = Rotation.from_quat(at.quaternion) * Rotation.from_euler("ZYX", tool[5:2:-1]).inv()
         x, y, z = np.array(at.position_mm) - turn.apply(1e3 * np.array(tool[:3]))
         qx, qy, qz, qw = (float(v) for v in turn.as_quat())
@@ -127,14 +127,14 @@ class ArmReader:
         with contextlib.suppress(RpcError):
             software += f", {await call('SystemInfo.getControlSoftwareFullVersion')}"
         model, box = await self._name("RobotConfig.getRobotType"), await self._name("RobotConfig.getControlBoxType")
-        tool = six("getTcpOffset", await self._ask("RobotConfig.getTcpOffset"))
+        tool = numbers("getTcpOffset", await self._ask("RobotConfig.getTcpOffset"))
         level = await self._ask("RobotConfig.getCollisionLevel")
         if type(level) is not int:
             raise ProtocolViolation(DEVICE, "getCollisionLevel", f"expected a whole number, got {level!r}")
         payload = await self._ask("RobotConfig.getPayload")
         try:
             mass_kg, cog_m, *_ = payload
-            [payload_kg], cog_mm = numbers([mass_kg], 1), tuple(1e3 * v for v in numbers(cog_m, 3))
+            payload_kg, *centre_m = numbers("getPayload", [mass_kg, *cog_m], 4)
         except (TypeError, ValueError):
             raise ProtocolViolation(DEVICE, "getPayload", f"expected mass and centre, got {payload!r}") from None
         return Cabinet(
@@ -144,7 +144,7 @@ class ArmReader:
             await self._name("RobotManage.getOperationalMode"),
             (*(1e3 * v for v in tool[:3]), *(math.degrees(v) for v in tool[3:])),
             payload_kg,
-            cog_mm,
+            tuple(1e3 * metres for metres in centre_m),
             level,
         )
 

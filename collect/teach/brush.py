@@ -207,7 +207,7 @@ class ForceStep(Step):
             sensor.listen(samples.append)
             await asyncio.sleep(REST_S)
             noise_n = _noise(samples)
-            await day.say(f"{identity.model}: {sensor.health().rate_hz:.0f} rounds/s, noise {noise_n:.4f} N")
+            await day.say(f"{identity.model}: {sensor.stream.rate_hz():.0f} rounds/s, noise {noise_n:.4f} N")
             samples.clear()
             how = (
                 "Push the tip of the brush gently up with a finger for a second, along the brush toward the flange, "

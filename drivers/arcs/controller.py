@@ -185,14 +185,14 @@ class Controller:
         """Where the tip is. Raises `ProtocolViolation`."""
         loop = asyncio.get_running_loop()
         asked_s = loop.time()
-        pose = from_wire(six("getTcpPose", await self.ask("RobotState.getTcpPose")))
+        pose = from_wire(numbers("getTcpPose", await self.ask("RobotState.getTcpPose")))
         if self.on_pose is not None:
             self.on_pose(pose, loop.time() - asked_s)
         return pose
 
     async def joint_positions(self) -> list[float]:
         """Six joints in rad. Raises `ProtocolViolation`."""
-        return six("getJointPositions", await self.ask("RobotState.getJointPositions"))
+        return numbers("getJointPositions", await self.ask("RobotState.getJointPositions"))
 
     async def mode(self) -> RobotMode:
         """The robot mode. Raises `ProtocolViolation` for an unknown name."""
@@ -291,14 +291,6 @@ class Controller:
             await self.connection.call("RuntimeMachine.abort")
             raise
         await self.connection.call("RuntimeMachine.abort")
-
-
-def six(op: str, answer: object) -> list[float]:
-    """A pose, a tool or joints, as the controller answered. Raises `ProtocolViolation` unless they are finite."""
-    try:
-        return numbers(answer, 6)
-    except ValueError as error:
-        raise ProtocolViolation(DEVICE, op, str(error)) from None
 
 
 def accepted(op: str, code: object) -> None:

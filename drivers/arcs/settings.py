@@ -77,78 +77,77 @@ Settings = Mapping[str, Value]
 
 Command = tuple[str, dict[str, Any]]
 """Name and parameters of a method of `RobotConfig`."""
+PER_WIRE_UNIT = {"mm": 1e3, "deg": 180.0 / math.pi, "kg": 1.0, "": 1.0}
+"""How many of a unit are one unit of the wire, which has m, rad and kg."""
 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """One setting of the controller."""
+    """One setting of the controller: numbers in `units`, or a text where there are none."""
 
     name: str
     units: tuple[str, ...]
     getter: str
-    read: Callable[[Any], Value]
-    setter: Callable[[tuple[float, ...]], Command] | None = None
-    """How it is set; None for one that is only read back."""
+    pick: Callable[[Any], Any] = lambda answer: [answer]
+    """Finds the numbers in an answer."""
+    setter: Callable[[list[float]], Command] | None = None
+    """How it is set, from numbers as on the wire; None for one that is only read back."""
+
+    def value(self, answer: Any) -> Value:
+        """What an answer says. Raises `ProtocolViolation` if it has another shape."""
+        if not self.units:
+            return str(answer)
+        op = self.getter.rpartition(".")[2]
+        try:
+            picked = self.pick(answer)
+        except (TypeError, ValueError) as error:
+            raise ProtocolViolation(DEVICE, op, str(error)) from None
+        wire = numbers(op, picked, len(self.units))
+        return tuple(number * PER_WIRE_UNIT[unit] for number, unit in zip(wire, self.units, strict=True))
+
+    def wire(self, value: tuple[float, ...]) -> list[float]:
+        """The numbers as they go over the wire."""
+        return [number / PER_WIRE_UNIT[unit] for number, unit in zip(value, self.units, strict=True)]
 
 
-def _offset(answer: Any) -> Value:
-    values = numbers(answer, 6)
-    return (*(v * 1e3 for v in values[:3]), *map(math.degrees, values[3:]))
-
-
-def _set_offset(value: tuple[float, ...]) -> Command:
-    return "setTcpOffset", {"offset": _metres(value)}
-
-
-def _metres(offset: tuple[float, ...]) -> list[float]:
-    """A tool offset in m and rad, from mm and deg."""
-    return [*(v / 1e3 for v in offset[:3]), *map(math.radians, offset[3:])]
-
-
-def _payload(answer: Any) -> Value:
+def _mass_and_centre(answer: Any) -> list[Any]:
     mass_kg, cog_m, *_ = answer
-    return (*numbers([mass_kg], 1), *(v * 1e3 for v in numbers(cog_m, 3)))
+    return [mass_kg, *cog_m]
 
 
-def _set_payload(value: tuple[float, ...]) -> Command:
-    mass_kg, *cog_mm = value
-    cog_m = [v / 1e3 for v in cog_mm]
-    return "setPayload", {"m": mass_kg, "cog": cog_m, "aom": [0.0] * 3, "inertia": [0.0] * 6}
+def _set_offset(wire: list[float]) -> Command:
+    return "setTcpOffset", {"offset": wire}
 
 
-def _number(answer: Any) -> Value:
-    return tuple(numbers([answer], 1))
+def _set_payload(wire: list[float]) -> Command:
+    return "setPayload", {"m": wire[0], "cog": wire[1:], "aom": [0.0] * 3, "inertia": [0.0] * 6}
 
 
-def _set_collision_level(value: tuple[float, ...]) -> Command:
-    return "setCollisionLevel", {"level": int(value[0])}
+def _set_collision_level(wire: list[float]) -> Command:
+    return "setCollisionLevel", {"level": int(wire[0])}
 
 
-TOOL_OFFSET, PAYLOAD, COLLISION_LEVEL = "tool offset", "payload", "collision level"
-OPERATIONAL_MODE = "operational mode"
+PAYLOAD, COLLISION_LEVEL, OPERATIONAL_MODE = "payload", "collision level", "operational mode"
+TOOL = Setting(
+    "tool offset", ("mm",) * 3 + ("deg",) * 3, "RobotConfig.getTcpOffset", lambda answer: answer, _set_offset
+)
 SETTINGS = (
-    Setting(TOOL_OFFSET, ("mm",) * 3 + ("deg",) * 3, "RobotConfig.getTcpOffset", _offset, _set_offset),
-    Setting(PAYLOAD, ("kg", "mm", "mm", "mm"), "RobotConfig.getPayload", _payload, _set_payload),
-    Setting(COLLISION_LEVEL, ("",), "RobotConfig.getCollisionLevel", _number, _set_collision_level),
-    Setting("speed fraction", ("",), "MotionControl.getSpeedFraction", _number),
-    Setting(OPERATIONAL_MODE, (), "RobotManage.getOperationalMode", str),
+    TOOL,
+    Setting(PAYLOAD, ("kg", "mm", "mm", "mm"), "RobotConfig.getPayload", _mass_and_centre, _set_payload),
+    Setting(COLLISION_LEVEL, ("",), "RobotConfig.getCollisionLevel", setter=_set_collision_level),
+    Setting("speed fraction", ("",), "MotionControl.getSpeedFraction"),
+    Setting(OPERATIONAL_MODE, (), "RobotManage.getOperationalMode"),
 )
 
 
 async def read_back(controller: Controller) -> Settings:
     """Read all settings from the controller. Raises `ProtocolViolation` for an answer of the wrong shape."""
-    values: dict[str, Value] = {}
-    for setting in SETTINGS:
-        try:
-            values[setting.name] = setting.read(await controller.ask(setting.getter))
-        except (TypeError, ValueError) as error:
-            raise ProtocolViolation(DEVICE, setting.getter.rpartition(".")[2], str(error)) from None
-    return values
+    return {setting.name: setting.value(await controller.ask(setting.getter)) for setting in SETTINGS}
 
 
 def configured(table: ArcsTable) -> dict[str, tuple[float, ...]]:
     """The settings that `table` gives; the others stay as they are on the pendant."""
-    wanted: dict[str, tuple[float, ...]] = {TOOL_OFFSET: (*table.tcp_offset_mm, *table.tcp_rotation_deg)}
+    wanted: dict[str, tuple[float, ...]] = {TOOL.name: (*table.tcp_offset_mm, *table.tcp_rotation_deg)}
     if table.payload_kg is not None:
         wanted[PAYLOAD] = (table.payload_kg, *table.payload_cog_mm)
     if table.collision_level is not None:
@@ -170,14 +169,9 @@ def require_same(op: str, wanted: Settings, current: Settings) -> None:
 def _same(setting: Setting, wanted: Value, current: Value) -> bool:
     if not isinstance(wanted, tuple) or not isinstance(current, tuple):
         return wanted == current
-    if setting.name == TOOL_OFFSET:  # one rotation has several sets of angles, such as 180 and -180 deg
-        return max(distance(_tool(wanted), _tool(current))) <= TOLERANCE
+    if setting is TOOL:  # one rotation has several sets of angles, such as 180 and -180 deg
+        return max(distance(from_wire(TOOL.wire(wanted)), from_wire(TOOL.wire(current)))) <= TOLERANCE
     return all(abs(a - b) <= TOLERANCE for a, b in zip(wanted, current, strict=True))
-
-
-def _tool(offset: tuple[float, ...]) -> Pose:
-    """The tool centre point on the flange."""
-    return from_wire(_metres(offset))
 
 
 def _in_words(setting: Setting, value: Value) -> str:
@@ -206,7 +200,7 @@ async def make_ready(controller: Controller, table: ArcsTable, on_notice: Callab
     wanted = configured(table)
     for setting in SETTINGS:
         if setting.setter is not None and setting.name in wanted:
-            method, params = setting.setter(wanted[setting.name])
+            method, params = setting.setter(setting.wire(wanted[setting.name]))
             accepted(method, await controller.ask(f"RobotConfig.{method}", **params))
     settings = await read_back(controller)
     require_same("power on", wanted, settings)

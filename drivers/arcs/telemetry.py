@@ -379,12 +379,9 @@ class Telemetry:
 
     async def _pushed(self, stream: RtdeStream) -> tuple[Pose, tuple[float, ...]]:
         pose, joints = await stream.newest()
-        try:
-            if self._seen is not None:
-                self._seen += [from_wire(numbers(older, 6)) for older, _ in stream.older]
-            return from_wire(numbers(pose, 6)), tuple(numbers(joints, 6))
-        except ValueError as error:
-            raise ProtocolViolation(DEVICE, "sample", str(error)) from None
+        if self._seen is not None:
+            self._seen += [from_wire(numbers("sample", older)) for older, _ in stream.older]
+        return from_wire(numbers("sample", pose)), tuple(numbers("sample", joints))
 
     async def _fall_back(self, error: DeviceError) -> None:
         await self._drop_stream()

@@ -173,19 +173,20 @@ class BareDecoder(_Decoder):
         return None
 
 
-def numbers(values: object, count: int) -> list[float]:
-    """`values` as floats. Raises ValueError unless it is a list of `count` finite numbers.
+def numbers(op: str, values: object, count: int = 6) -> list[float]:
+    """`values` of the answer to `op` as floats. Raises `ProtocolViolation` unless it is a list of finite numbers.
 
     JSON allows integers too large for a float, and a string of six digits is not a pose.
     """
     if not isinstance(values, list):
-        raise ValueError(f"expected {count} numbers, got {str(values)[:80]!r}")
+        raise ProtocolViolation(DEVICE, op, f"expected {count} numbers, got {str(values)[:80]!r}")
     try:
         floats = [float(v) if type(v) in (int, float) else math.nan for v in values]  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
     except OverflowError:
         floats = []
     if len(floats) != count or not all(map(math.isfinite, floats)):
-        raise ValueError(f"expected {count} finite numbers, got {str(values)[:80]}")  # pyright: ignore[reportUnknownArgumentType]
+        got = str(values)[:80]  # pyright: ignore[reportUnknownArgumentType]
+        raise ProtocolViolation(DEVICE, op, f"expected {count} finite numbers, got {got}")
     return floats
 
 

@@ -25,7 +25,6 @@ import struct
 import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, Field, model_validator
@@ -171,20 +170,6 @@ class ForceTable(BaseModel, frozen=True, extra="forbid"):
         return self
 
 
-@dataclass(frozen=True, slots=True)
-class ForceHealth:
-    """Statistics of the stream since `connect`."""
-
-    rate_hz: float
-    """Rate of the newest rounds; 0 before the second round."""
-    rounds: int
-    torn: int
-    """Dropped rounds in which a frame was missing, late or malformed."""
-    refused: int
-    """Dropped complete rounds with NaN, inf or a value beyond the sensor's range."""
-    bus_errors: int
-
-
 Round = tuple[Stamp, Wrench]
 
 
@@ -195,12 +180,13 @@ class RoundStream:
         """`on_round` gets each round, and None once the stream has ended by itself; in the reader's thread."""
         self._table = table
         self._name = f"{table.interface} {table.channel}"
-        self._assembler = RoundAssembler()
+        self.assembler = RoundAssembler()
+        """Counts the rounds that were dropped."""
         self._clock = clock
         self._on_round = on_round
         self._closing = threading.Event()
         self._arrivals_ns: deque[int] = deque(maxlen=RATE_WINDOW)
-        self._rounds = self._bus_errors = 0
+        self.rounds = self.bus_errors = 0
         self.newest: Round | None = None
         self.alike = 0
         """Number of newest rounds in a row that exactly equal the one before; a strain gauge is never that still."""
@@ -219,12 +205,11 @@ class RoundStream:
         self._closing.set()
         self._thread.join(timeout_s)
 
-    def health(self) -> ForceHealth:
-        """Rate and counters."""
+    def rate_hz(self) -> float:
+        """Rate of the newest rounds; 0 before the second round."""
         arrivals_ns = self._arrivals_ns.copy()
         span_ns = arrivals_ns[-1] - arrivals_ns[0] if len(arrivals_ns) > 1 else 0
-        rate_hz = (len(arrivals_ns) - 1) * 1e9 / span_ns if span_ns else 0.0
-        return ForceHealth(rate_hz, self._rounds, self._assembler.torn, self._assembler.refused, self._bus_errors)
+        return (len(arrivals_ns) - 1) * 1e9 / span_ns if span_ns else 0.0
 
     def _run(self) -> None:
         try:
@@ -249,8 +234,6 @@ class RoundStream:
                 quiet_s += RECEIVE_S
                 if heard and quiet_s > SILENT_S:
                     self._lose_bus(f"has been silent for {SILENT_S:g} s")
-                elif bus.state is can.BusState.ERROR:
-                    self._lose_bus("is off")
         except (can.CanError, OSError) as error:
             self._lose_bus(f"failed: {error}")
         finally:
@@ -278,20 +261,20 @@ class RoundStream:
 
     def _take(self, message: can.Message) -> None:
         if message.is_error_frame:
-            self._bus_errors += 1
+            self.bus_errors += 1
             if message.arbitration_id & BUS_OFF:
                 self._lose_bus("is off after too many errors")
             return
         if message.is_extended_id or message.is_remote_frame or message.is_fd:
             return
-        wrench = self._assembler.feed(message.arbitration_id, bytes(message.data), message.timestamp)
+        wrench = self.assembler.feed(message.arbitration_id, bytes(message.data), message.timestamp)
         if wrench is None:
             return
         device_ns = round(message.timestamp * 1e9) or None  # 0: the adapter has no clock
         now_ns = self._clock.now_ns()
         self._arrivals_ns.append(now_ns)
-        stamp = Stamp(now_ns, device_ns, self._rounds)
-        self._rounds += 1
+        stamp = Stamp(now_ns, device_ns, self.rounds)
+        self.rounds += 1
         if self.newest is not None and wrench == self.newest[1]:
             self.alike += 1
         else:
@@ -358,9 +341,9 @@ class SriM8123:
                 await begun.wait()
             self._require("connect")
         except TimeoutError:
-            health = stream.health()
             await self.close()
-            what = f"no whole round in {CONNECT_S:g} s ({health.torn} torn, {health.refused} refused)"
+            dropped = stream.assembler
+            what = f"no whole round in {CONNECT_S:g} s ({dropped.torn} torn, {dropped.refused} refused)"
             remedy = "Check power, wiring, termination and bit rate."
             raise DeviceTimeout(DEVICE, "connect", what, remedy=remedy) from None
         except BaseException:
@@ -410,11 +393,12 @@ class SriM8123:
             fx, fy, fz, mx, my, mz = (self._still_mean(name, axis) for name, axis in zip(AXES, axes, strict=True))
             self.bias_wrench = (fx, fy, fz, mx, my, mz)
 
-    def health(self) -> ForceHealth:
-        """Measured rate and counters since `connect`. Raises `NotConnected`; a lost connection still has them."""
+    @property
+    def stream(self) -> RoundStream:
+        """Rate and counters since `connect`. Raises `NotConnected`; a lost connection still has them."""
         if self._stream is None:
-            raise NotConnected(DEVICE, "health", "not connected")
-        return self._stream.health()
+            raise NotConnected(DEVICE, "stream", "not connected")
+        return self._stream
 
     async def close(self) -> None:
         """Stop the board, shut the bus down, join the reader; may be repeated."""

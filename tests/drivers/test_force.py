@@ -151,7 +151,7 @@ async def test_silence_and_what_is_no_number_make_the_sample_stale_until_it_meas
     board.next_fault = lambda: fault
     await until(lambda: isinstance(latest_error(sensor), Stale), "a stale sample")
     if fault != "silence":
-        await until(lambda: sensor.health().refused >= 2, "refused rounds")
+        await until(lambda: sensor.stream.assembler.refused >= 2, "refused rounds")
     board.next_fault = lambda: None
     await until(lambda: latest_error(sensor) is None, "a new sample")
     assert all(math.isfinite(value) for s in seen for value in (*s.force_n, *s.torque_nm))
@@ -165,7 +165,7 @@ async def test_a_sensor_that_says_the_same_again_and_again_is_named_as_stuck(
     with served(channel, ForceBoard(lambda _: WRENCH, noise_n=0.002, noise_nm=2e-4)) as board:
         sensor = sensor_on(channel)
         await sensor.connect()
-        await until(lambda: sensor.health().rounds > 50, "rounds")
+        await until(lambda: sensor.stream.rounds > 50, "rounds")
         assert sensor.latest().force_n == pytest.approx(WRENCH[:3], abs=0.02)
         board.next_fault = lambda: "stuck"
         await until(lambda: isinstance(latest_error(sensor), Stuck), "a stuck sensor")
@@ -180,7 +180,7 @@ async def test_bus_off_is_a_lost_connection_that_says_what_to_do_and_a_bus_error
     board: ForceBoard, sensor: SriM8123
 ):
     fail_rounds(board, "bus-error")
-    await until(lambda: sensor.health().bus_errors == 1, "the driver")
+    await until(lambda: sensor.stream.bus_errors == 1, "the driver")
     assert sensor.latest().force_n == WRENCH[:3]
     fail_rounds(board, "bus-off")
     await until(lambda: readers() == 0, "the driver")
@@ -209,16 +209,6 @@ async def test_an_adapter_that_goes_away_is_a_lost_connection(
         sensor.latest()
 
 
-async def test_a_controller_that_reports_bus_off_only_when_asked(
-    board: ForceBoard, sensor: SriM8123, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr("can.BusABC.state", can.BusState.ERROR)
-    board.next_fault = lambda: "silence"
-    await until(lambda: readers() == 0, "the driver")
-    with pytest.raises(ConnectionLost, match="is off"):
-        sensor.latest()
-
-
 async def test_where_no_board_answers_the_connection_times_out(channel: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sri_m8123, "CONNECT_S", 0.2)
     sensor = sensor_on(channel)
@@ -226,7 +216,7 @@ async def test_where_no_board_answers_the_connection_times_out(channel: str, mon
         await sensor.connect()
     assert readers() == 0
     with pytest.raises(NotConnected):
-        sensor.health()
+        sensor.latest()
 
 
 @pytest.mark.parametrize("interface", ["socketcan", "no-such-interface"])

@@ -18,7 +18,7 @@ from brushloop.drivers.arcs.controller import (
 )
 from brushloop.drivers.arcs.motion import until_settled
 from brushloop.drivers.arcs.robot import AuboArcs
-from brushloop.drivers.arcs.settings import TOOL_OFFSET, require_same
+from brushloop.drivers.arcs.settings import TOOL, require_same
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import (
     ArmMoved,
@@ -291,7 +291,7 @@ async def test_a_return_code_is_no_proof_that_the_tool_was_set(sleeping_arm: Aub
 
 def test_a_tool_that_is_read_back_in_other_angles_is_the_same_tool_and_one_turned_a_little_is_another():
     def tool(*turn_deg: float) -> dict[str, tuple[float, ...]]:
-        return {TOOL_OFFSET: (0.0, 0.0, 180.0, *turn_deg)}
+        return {TOOL.name: (0.0, 0.0, 180.0, *turn_deg)}
 
     require_same("enable", tool(180.0, 0.0, 0.0), tool(-180.0, 0.0, 0.0))
     require_same("enable", tool(180.0, 0.0, 30.0), tool(0.0, 180.0, -150.0))

@@ -175,8 +175,8 @@ async def test_a_force_sensor_that_was_silent_is_heard_again_as_soon_as_the_faul
     rig.faults.hang(Fault(device=Device.FORCE, kind="silence", count=ALWAYS))
     await until(lambda: rig.faults.hanging[0].struck > 10, "silent rounds")
     assert rig.faults.clear() == 1
-    rounds = sensor.health().rounds
-    await until(lambda: sensor.health().rounds > rounds, "a round")
+    rounds = sensor.stream.rounds
+    await until(lambda: sensor.stream.rounds > rounds, "a round")
     await sensor.close()
     bare = FaultBoard(rig.world, [Device.INK])
     with pytest.raises(ValueError, match="device = 'ink': this rig has none"):
