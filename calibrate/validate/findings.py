@@ -59,6 +59,15 @@ def measured(report: Report) -> str:
     )
 
 
+def headline(report: Report) -> Iterator[tuple[str, float]]:
+    """Name and average CSIM, in percent, of CCD-BSM as published, of the model shown, and of a perfect model."""
+    shown = "" if report.shown == "ccd-bsm" else report.shown
+    names = {"ccd-bsm": "CCD-BSM as published", shown: _label(report, shown), CEILING: "a perfect model (the ceiling)"}
+    for name, label in names.items():
+        if (csim := _csim(report, name)) is not None:
+            yield label, csim.avg
+
+
 def verdict(report: Report) -> Iterator[str]:
     """How well the model shown predicts, beside what, and how large the marks are."""
     shown, top, bezier, published = (
@@ -164,9 +173,8 @@ def _models(report: Report) -> Iterator[Point]:
     held, bezier = (_csim(report, name) for name in (FITTED_HELD_OUT, BEZIER_REFITTED))
     if held is not None and held.below_ceiling is not None:
         near = is_near(held.below_ceiling, held.below_interval)
-        how = {True: "within", False: "not within", None: "not certainly within"}[near]
-        words = f"{NEAR_POINTS} points of the ceiling (mm, binary, CSIM): {_points(held)}."
-        yield Point(near, f"The calibrated model is {how} {words}")
+        words = f"The calibrated model is {_points(held)} below the ceiling; the goal is {NEAR_POINTS:g}"
+        yield Point(near, f"{words} (CSIM, mm, binary).")
     elif held is None and not report.source.imported:
         yield Point(None, "No model was calibrated to this brush: run “brushloop fit”, then validate again.")
     if held is not None and bezier is not None and held.avg < bezier.avg:

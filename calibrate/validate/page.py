@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from brushloop.calibrate.artefact import FOLDER
-from brushloop.calibrate.compare import KEYS, TABLE_3
+from brushloop.calibrate.compare import KEYS, TABLE_3, Key
 from brushloop.calibrate.fit.fit import FOLDER as FITS
 from brushloop.calibrate.report import (
     recording_facts,
     render,
     source_note,
 )
-from brushloop.calibrate.scores import Stat
+from brushloop.calibrate.scores import MEASURES, Stat
 from brushloop.calibrate.stats import CEILING, Cell
 from brushloop.calibrate.validate import figures, findings
 from brushloop.calibrate.validate.models import (
@@ -63,6 +65,8 @@ def page_of(
         paper_three=list(TABLE_3.values()),
         plot=figures.distributions(outcome, report),
         keys=KEYS,
+        headline=list(findings.headline(report)),
+        scores=[(key, _scores(report, key)) for key in KEYS],
         cell_columns=columns,
         cells=[_cell(report, cell, columns) for cell in report.cells],
         samples=[figures.pictured(outcome, k, report.shown) for k in figures.first_of_cells(outcome, MAX_SAMPLES)],
@@ -99,6 +103,13 @@ def _table_three(report: Report) -> Iterator[tuple[str, list[TableRow]]]:
             yield f"{name}, {where} — {NORMAL[0]}, binary", table_3(record, name, NORMAL[0])
             title = f"{name}, {where} — {STRICT[0]}, binary: where size and place count"
             yield title, table_3(record, name, STRICT[0])
+
+
+def _scores(report: Report, key: Key) -> list[tuple[ModelInfo, Stat, int, int]]:
+    """Each model with its scores in one alignment and tone, and its rank by average CSIM and SSIM."""
+    rows = [(model, stat) for model in report.models if (stat := report.stat(model.name, key)) is not None]
+    by_csim, by_ssim = (np.argsort(np.argsort([-getattr(stat, of).avg for _, stat in rows])) for of in MEASURES)
+    return [(*row, int(first), int(second)) for row, first, second in zip(rows, by_csim, by_ssim, strict=True)]
 
 
 def _cell(report: Report, cell: Cell, columns: Sequence[ModelInfo]) -> tuple[Cell, int, list[Stat | None]]:
