@@ -9,12 +9,14 @@ from pathlib import Path
 
 import pytest
 
+from brushloop.collect.errors import Parked
 from brushloop.collect.start import CollectRequest, collect, ending
 from brushloop.drivers.sim.faults import Phase
 from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.recording import Recording
+from brushloop.sessions.store import SessionStore
 from tests.rigs import Lab
-from tests.runs import wait_for_end
+from tests.runs import until, wait_for_end
 from tests.waiting import PATIENCE_S, wait_until
 
 
@@ -60,6 +62,37 @@ def test_a_signal_ends_the_run(lab: Lab, number: signal.Signals, says: str) -> N
     if number == signal.SIGHUP:
         assert lab.rig.faults.phase() is Phase.PARKED
         assert not replay(lab.session / JOURNAL_NAME).cut
+
+
+def test_a_session_that_is_open_elsewhere_is_refused_before_anything_moves(lab: Lab) -> None:
+    engine = lab.engine()
+    engine.start()
+    until(engine, lambda now: now.strokes_done == 1)
+    engine.park()
+    with pytest.raises(Parked):
+        wait_for_end(engine)
+    elsewhere = SessionStore(lab.session, lab.rig.time.now_ns)
+    at = lab.rig.world.tool()
+    ran = lab.command()
+    assert (ran.returncode, lab.rig.world.tool()) == (2, at)
+    assert ran.stderr.splitlines()[-1].endswith("another brushloop has this session open")
+    elsewhere.release()
+    assert lab.command().returncode == 0
+
+
+def test_a_folder_that_may_not_be_written_is_refused_before_anything_is_connected(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr("brushloop.sessions.disk.os.access", lambda path, _mode: path != lab.folder)
+        ran = lab.command()
+    said = f"brushloop: {lab.folder}: may not be written: it is read-only, or another user's"
+    assert (ran.returncode, ran.stderr.splitlines()[-1]) == (2, said)
+    lab.sessions.write_text("not a folder", encoding="utf-8")
+    ran = lab.command()
+    said = f"brushloop: {lab.sessions}: is a file; a folder is needed"
+    assert (ran.returncode, ran.stderr.splitlines()[-1]) == (2, said)
+    assert lab.rig.arcs.cabinet.power.mode == "PowerOff"
 
 
 def test_the_recording_and_what_comes_next(tmp_path: Path) -> None:
