@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import contextlib
 import json
-import os
-import socket
 import struct
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,6 +37,7 @@ if TYPE_CHECKING:
     from tests.rigs import Lab
 
 pytest.importorskip("foxglove", reason="needs the extra [live]")
+aiohttp = pytest.importorskip("aiohttp", reason="a viewer is made with it")
 
 
 def pose(t_ns: int) -> Outgoing:
@@ -53,81 +52,41 @@ def frame(t_ns: int = 0, gray: int = 200) -> Frame:
     return Frame(Stamp(t_ns), t_ns, np.full((1536, 2048), gray, np.uint8))
 
 
-class HungUp(Exception):
-    """The server has closed the connection."""
-
-
 @dataclass
 class Viewer:
-    """Speaks as much websocket (RFC 6455) and of Foxglove's protocol as it takes to look on."""
+    """Speaks as much of Foxglove's protocol as it takes to look on."""
 
-    wire: socket.socket
-    rest: bytes = b""
+    socket: aiohttp.ClientWebSocketResponse
 
-    @classmethod
-    def connect(cls, port: int) -> Viewer:
-        viewer = cls(socket.create_connection((HOST, port), timeout=PATIENCE_S))
-        key = base64.b64encode(os.urandom(16)).decode()
-        head = f"GET / HTTP/1.1\r\nHost: {HOST}:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-        head += f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\n"
-        viewer.wire.sendall(f"{head}Sec-WebSocket-Protocol: foxglove.sdk.v1\r\n\r\n".encode())
-        while b"\r\n\r\n" not in viewer.rest:
-            viewer.rest += viewer.wire.recv(65536)
-        answer, viewer.rest = viewer.rest.split(b"\r\n\r\n", 1)
-        assert answer.startswith(b"HTTP/1.1 101")
-        return viewer
-
-    def _take(self, count: int) -> bytes:
-        while len(self.rest) < count:
-            data = self.wire.recv(65536)
-            if not data:
-                raise HungUp
-            self.rest += data
-        taken, self.rest = self.rest[:count], self.rest[count:]
-        return taken
-
-    def next(self) -> dict[str, Any] | bytes:
-        """A JSON message, or the bytes of a binary one."""
-        kind, length = self._take(2)
-        if length == 126:
-            (length,) = struct.unpack(">H", self._take(2))
-        elif length == 127:
-            (length,) = struct.unpack(">Q", self._take(8))
-        payload = self._take(length)
-        if kind & 0x0F == 8:
-            raise HungUp
-        if kind & 0x0F == 2:
-            return payload
-        message = json.loads(payload)
-        if message["op"] == "status" and message["message"].startswith("Unknown channel"):
+    async def next(self) -> dict[str, Any] | bytes | None:
+        """A JSON message, or the bytes of a binary one; None once the server has hung up."""
+        message = await self.socket.receive(PATIENCE_S)
+        if message.type is aiohttp.WSMsgType.BINARY:
+            return message.data
+        if message.type is not aiohttp.WSMsgType.TEXT:
+            return None
+        told = json.loads(message.data)
+        if told["op"] == "status" and told["message"].startswith("Unknown channel"):
             # foxglove-sdk advertises a channel a moment before it can be subscribed to.
-            self.ask_for(int(message["message"].split()[-1]))
-        return message
+            await self.ask_for(int(told["message"].split()[-1]))
+        return told
 
-    def until(self, op: str) -> dict[str, Any]:
-        while True:
-            message = self.next()
-            if isinstance(message, dict) and message["op"] == op:
-                return message
+    async def ask_for(self, channel: int) -> None:
+        await self.socket.send_json({"op": "subscribe", "subscriptions": [{"id": channel, "channelId": channel}]})
 
-    def send(self, message: dict[str, Any]) -> None:
-        text, mask = json.dumps(message).encode(), os.urandom(4)
-        masked = bytes(byte ^ mask[k % 4] for k, byte in enumerate(text))
-        self.wire.sendall(struct.pack(">BBH", 0x81, 0x80 | 126, len(text)) + mask + masked)
-
-    def subscribe(self) -> dict[str, Any]:
+    async def subscribe(self) -> dict[str, Any]:
         """To the next channel that is advertised; returns it."""
-        [channel] = self.until("advertise")["channels"]
-        self.ask_for(channel["id"])
-        return channel
+        while True:
+            message = await self.next()
+            if isinstance(message, dict) and message["op"] == "advertise":
+                [channel] = message["channels"]
+                await self.ask_for(channel["id"])
+                return channel
 
-    def ask_for(self, channel: int) -> None:
-        self.send({"op": "subscribe", "subscriptions": [{"id": channel, "channelId": channel}]})
-
-    def data(self) -> tuple[int, int, bytes]:
+    async def data(self) -> tuple[int, int, bytes]:
         """(channel, log time in ns, message) of the next message."""
         while True:
-            message = self.next()
+            message = await self.next()
             if isinstance(message, bytes) and message[0] == 1:
                 number, log_ns = struct.unpack_from("<IQ", message, 1)
                 return number, log_ns, message[13:]
@@ -141,40 +100,36 @@ def live() -> Iterator[LiveView]:
     live.close()
 
 
-@pytest.fixture
-def viewer(live: LiveView) -> Iterator[Viewer]:
-    viewer = Viewer.connect(live.port)
-    yield viewer
-    with contextlib.suppress(OSError):  # the server may be gone already
-        viewer.wire.sendall(bytes([0x88, 0x80, 0, 0, 0, 0]))  # good-bye
-    viewer.wire.close()
+@contextlib.asynccontextmanager
+async def watching(port: int) -> AsyncIterator[Viewer]:
+    async with (
+        aiohttp.ClientSession() as client,
+        client.ws_connect(f"http://{HOST}:{port}", protocols=["foxglove.sdk.v1"]) as socket,
+    ):
+        yield Viewer(socket)
 
 
-@contextlib.contextmanager
-def again_and_again(offer: Callable[[], None]) -> Iterator[None]:
+@contextlib.asynccontextmanager
+async def again_and_again(offer: Callable[[], None]) -> AsyncIterator[None]:
     """Offer as a robot would: a subscription takes effect at some time between two messages."""
-    over = threading.Event()
 
-    def work() -> None:
-        while not over.wait(0.02):
+    async def work() -> None:
+        while True:
             offer()
+            await asyncio.sleep(0.02)
 
-    thread = threading.Thread(target=work)
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()
+    working = asyncio.create_task(work())
+    yield
+    working.cancel()
 
 
 @pytest.mark.parametrize("outgoing", [pose(7), wrench(7)], ids=["protobuf", "json"])
-def test_a_viewer_sees_what_is_recorded_with_its_topic_schema_and_time(
-    live: LiveView, viewer: Viewer, outgoing: Outgoing
+async def test_a_viewer_sees_what_is_recorded_with_its_topic_schema_and_time(
+    live: LiveView, outgoing: Outgoing
 ) -> None:
-    with again_and_again(lambda: live.offer(outgoing)):
-        channel = viewer.subscribe()
-        number, log_ns, data = viewer.data()
+    async with watching(live.port) as viewer, again_and_again(lambda: live.offer(outgoing)):
+        channel = await viewer.subscribe()
+        number, log_ns, data = await viewer.data()
     assert (channel["topic"], number, log_ns) == (outgoing.topic, channel["id"], 7)
     if outgoing.topic is Topic.TCP:
         assert channel["schemaName"] == "foxglove.PoseInFrame"
@@ -187,10 +142,10 @@ def test_a_viewer_sees_what_is_recorded_with_its_topic_schema_and_time(
         assert Wrench.model_validate_json(data) == outgoing.message
 
 
-def test_frames_are_shown_as_small_jpegs(live: LiveView, viewer: Viewer) -> None:
-    with again_and_again(lambda: live.frame(frame(5))):
-        channel = viewer.subscribe()
-        _, log_ns, data = viewer.data()
+async def test_frames_are_shown_as_small_jpegs(live: LiveView) -> None:
+    async with watching(live.port) as viewer, again_and_again(lambda: live.frame(frame(5))):
+        channel = await viewer.subscribe()
+        _, log_ns, data = await viewer.data()
     assert (channel["topic"], log_ns) == (Topic.PREVIEW, 5)
     shown = CompressedImage.FromString(data)
     image = cv2.imdecode(np.frombuffer(shown.data, np.uint8), cv2.IMREAD_GRAYSCALE)
@@ -199,12 +154,13 @@ def test_frames_are_shown_as_small_jpegs(live: LiveView, viewer: Viewer) -> None
     assert abs(float(image.mean()) - 200.0) < 2.0
 
 
-def test_nobody_waits_for_a_viewer_that_does_not_read(live: LiveView, viewer: Viewer) -> None:
+async def test_nobody_waits_for_a_viewer_that_does_not_read(live: LiveView) -> None:
     live.offer(wrench(0))
-    viewer.subscribe()
-    for t_ns in range(40 * BACKLOG):
-        live.offer(wrench(t_ns))
-    live.close()  # whoever waits for this viewer waits for ever
+    async with watching(live.port) as viewer:
+        await viewer.subscribe()
+        for t_ns in range(40 * BACKLOG):
+            live.offer(wrench(t_ns))
+        live.close()  # whoever waits for this viewer waits for ever
 
 
 def test_it_listens_on_this_machine_only(live: LiveView) -> None:
@@ -234,22 +190,20 @@ def test_a_run_with_a_viewer_shows_what_it_records_and_records_the_same(lab: Lab
     request = CollectRequest(lab.folder / "rig.toml", lab.folder / "protocol.toml", lab.sessions, live=live)
     seen: set[str] = set()
 
-    def look() -> None:
+    async def look() -> None:
         while live.port == 0:
-            time.sleep(0.01)
-        viewer, names = Viewer.connect(live.port), {}
-        with contextlib.suppress(HungUp):
-            while True:
-                message = viewer.next()
+            await asyncio.sleep(0.01)
+        names: dict[int, str] = {}
+        async with watching(live.port) as viewer:
+            while (message := await viewer.next()) is not None:
                 if isinstance(message, dict):
                     for channel in message.get("channels", ()) if message["op"] == "advertise" else ():
                         names[channel["id"]] = channel["topic"]
-                        viewer.ask_for(channel["id"])
+                        await viewer.ask_for(channel["id"])
                 elif message[0] == 1:
                     seen.add(names[struct.unpack_from("<I", message, 1)[0]])
-        viewer.wire.close()
 
-    thread = threading.Thread(target=look)
+    thread = threading.Thread(target=lambda: asyncio.run(look()))
     thread.start()
     assert collect(request).left_out == 0
     thread.join(timeout=PATIENCE_S)
