@@ -261,14 +261,14 @@ class Run(RunContext):
             self.left_ink_ns = None
             why = "stopped by the operator" if isinstance(error, asyncio.CancelledError) else describe(error)
             await uninterrupted(store.void, attempt, why)
-            self.progress.finished()
+            self.progress.count()
             raise
         if isinstance(result, DipResult) and self.requests.take(OperatorRequest.SKIP):
             left_out = self.progress.planned(step.index).press()
             result = result.model_copy(update={"skipped": left_out})
             self.progress.log(f"{left_out.stroke_id}: is left out, as the operator requested")
         await uninterrupted(store.done, attempt, result)
-        self.progress.finished()
+        self.progress.count()
         return result
 
     @contextlib.contextmanager

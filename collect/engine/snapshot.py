@@ -225,7 +225,7 @@ class Progress:
         """Begin with what a new or resumed session holds; returns how many strokes of it count."""
         self._store = store
         self._change(session_id=store.folder.name, folder=str(store.folder), source=store.header.source)
-        self._count()
+        self.count()
         return self._now.strokes_done
 
     def doing(self, what: str) -> None:
@@ -244,11 +244,7 @@ class Progress:
         """Note that a step begins."""
         if isinstance(step, DipStep | PressStep | DrawStep | CaptureStep):
             self._index = step.index
-        self._count()
-
-    def finished(self) -> None:
-        """Note that a step is done, or was cut short."""
-        self._count()
+        self.count()
 
     @property
     def first_free_index(self) -> int:
@@ -283,7 +279,7 @@ class Progress:
         self._over_ns, self._index = self._clock.now_ns(), None
         self._change(error=error)
         if self._store is not None:
-            self._count()
+            self.count()
 
     def snapshot(self, **values: Any) -> Snapshot:
         """One consistent snapshot, with the `values` that only the engine knows."""
@@ -300,7 +296,7 @@ class Progress:
         with self._lock:
             self._now = replace(self._now, **values)
 
-    def _count(self) -> None:
+    def count(self) -> None:
         """Count what the journal holds; of strokes that were pressed again after a review, only the repetition."""
         assert self._store is not None
         state, plan = self._store.state, self._planned

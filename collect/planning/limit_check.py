@@ -182,64 +182,46 @@ def _places(step: Step, patches: list[Patch]) -> Iterator[tuple[Patch, ...]]:
             yield (patch, patch, patch)
 
 
-DEVICE = "robot"
-
-
 async def ask_reach(rig_path: Path, config: RigConfig, poses: Iterable[tuple[Pose, float, str]]) -> int:
     """Ask the controller for the joints of each pose, near those of the previous one; return how many are distinct.
 
     Powers, sets and moves nothing. The tool that is set on the controller stays: every pose is converted to that tool.
     Raises `ConfigError` for the first pose that is out of reach, and `DeviceError`.
     """
-    robot = config.robot
+    robot, names = config.robot, dict[Pose, str]()
+    for pose, _, name in poses:
+        names.setdefault(pose, name)
+    own_tool = from_wire([*(v / 1e3 for v in robot.tcp_offset_mm), *map(math.radians, robot.tcp_rotation_deg)])
     controller = Controller(RpcConnection(robot.host, robot.port, framing=robot.framing))
     try:
         await open_arcs(controller.connection)
         await controller.connection.login()
         [controller.robot, *_] = await controller.robot_names()
-        offset = await _tool(controller)
-        own_tool = [*(v / 1e3 for v in robot.tcp_offset_mm), *map(math.radians, robot.tcp_rotation_deg)]
+        set_tool = from_wire(numbers("getTcpOffset", await controller.ask("RobotConfig.getTcpOffset")))
         near = await controller.joint_positions()
-        asked: set[Pose] = set()
-        for pose, _, where in poses:
-            if pose in asked:
-                continue
-            asked.add(pose)
-            wire = to_wire(_for_tool(pose, own_tool, offset))
-            joints = await _joints(controller, wire, near)
-            if joints is None:
-                raise ConfigError(
-                    rig_path,
-                    "paper",
-                    f"the controller finds no joint solution for {where}: "
-                    f"x = {pose.x_mm:.1f}, y = {pose.y_mm:.1f}, z = {pose.z_mm:.1f} mm, "
-                    "for robot.tcp_offset_mm. Move the paper nearer to the arm, or change its yaw",
-                )
-            near = joints
-        return len(asked)
+        for pose, name in names.items():
+            wire = to_wire(_for_tool(pose, own_tool, set_tool))
+            match await controller.ask("RobotAlgorithm.inverseKinematics", qnear=near, pose=wire):
+                case [list(joints), 0]:  # pyright: ignore[reportUnknownVariableType]
+                    near = numbers("inverseKinematics", joints)  # pyright: ignore[reportUnknownArgumentType]
+                case [_, int()]:
+                    raise ConfigError(
+                        rig_path,
+                        "paper",
+                        f"the controller finds no joint solution for {name}: "
+                        f"x = {pose.x_mm:.1f}, y = {pose.y_mm:.1f}, z = {pose.z_mm:.1f} mm, "
+                        "for robot.tcp_offset_mm. Move the paper nearer to the arm, or change its yaw",
+                    )
+                case other:
+                    raise ProtocolViolation("robot", "inverseKinematics", f"no return code: {other!r}")
+        return len(names)
     finally:
         await controller.connection.close()
 
 
-async def _joints(controller: Controller, wire: list[float], near: list[float]) -> list[float] | None:
-    match await controller.ask("RobotAlgorithm.inverseKinematics", qnear=near, pose=wire):
-        case [list(joints), 0]:  # pyright: ignore[reportUnknownVariableType]
-            return numbers("inverseKinematics", joints)  # pyright: ignore[reportUnknownArgumentType]
-        case [_, int()]:
-            return None
-        case other:
-            raise ProtocolViolation(DEVICE, "inverseKinematics", f"no return code: {other!r}")
-
-
-async def _tool(controller: Controller) -> list[float]:
-    """The tool offset that is set on the controller: x, y, z in m, rx, ry, rz in rad."""
-    return numbers("getTcpOffset", await controller.ask("RobotConfig.getTcpOffset"))
-
-
-def _for_tool(tip: Pose, own_tool: list[float], set_tool: list[float]) -> Pose:
-    """Pose of the controller's tool while our tip is at `tip`: tip * ours^-1 * theirs. Tools as on the wire."""
-    own, other = from_wire(own_tool), from_wire(set_tool)
-    flange = product(tip.quaternion, inverse(own.quaternion))
-    shift_mm = turned(flange, [t - o for t, o in zip(other.position_mm, own.position_mm, strict=True)])
+def _for_tool(tip: Pose, own_tool: Pose, set_tool: Pose) -> Pose:
+    """Pose of the controller's tool while our tip is at `tip`: tip * ours^-1 * theirs."""
+    flange = product(tip.quaternion, inverse(own_tool.quaternion))
+    shift_mm = turned(flange, [t - o for t, o in zip(set_tool.position_mm, own_tool.position_mm, strict=True)])
     px, py, pz = (p + s for p, s in zip(tip.position_mm, shift_mm, strict=True))
-    return Pose(px, py, pz, *product(flange, other.quaternion))
+    return Pose(px, py, pz, *product(flange, set_tool.quaternion))

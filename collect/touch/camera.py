@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -111,6 +112,8 @@ class Mark:
 
 def new_marks(before: Gray, after: Gray, image_to_paper: Floats, least_ink_mm2: float) -> list[Mark]:
     """New marks of at least `least_ink_mm2`, the largest first. The camera must not have moved in between."""
+    import skimage.measure  # slow to import
+
     first, second = before.astype(np.float32), after.astype(np.float32)
     darkened = _darkening(first, second)
     if darkened is None:
@@ -122,26 +125,18 @@ def new_marks(before: Gray, after: Gray, image_to_paper: Floats, least_ink_mm2: 
     reach_px = max(1, round(0.5 * JOIN_MM / local_scale(lambda at: apply(image_to_paper, at), middle)))
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach_px + 1, 2 * reach_px + 1))
     joined = cv2.dilate((darker > DARKER).astype(np.uint8), kernel)
-    count, labels, boxes, _ = cv2.connectedComponentsWithStats(joined, connectivity=8)
-    parts = np.asarray(labels, np.int32)
-    marks = [_mark(darker, parts, label, boxes[label], image_to_paper) for label in range(1, count)]
+    measure: Any = skimage.measure
+    marks: list[Mark] = []
+    for part in measure.regionprops(measure.label(joined, connectivity=2), intensity_image=darker):
+        # Noise averages to 0: without clipping, the margin that joining added has no weight.
+        ink = float(part.image_intensity.sum())
+        if ink > 0.0:
+            row, column = part.centroid_weighted
+            pixel = np.array([column, row], np.float64)
+            [[x_mm, y_mm]] = apply(image_to_paper, pixel[None])
+            mm_per_px = local_scale(lambda at: apply(image_to_paper, at), pixel)
+            marks.append(Mark(float(x_mm), float(y_mm), ink * mm_per_px**2))
     return sorted((m for m in marks if m.ink_mm2 >= least_ink_mm2), key=lambda m: -m.ink_mm2)
-
-
-def _mark(
-    darker: NDArray[np.float32], labels: NDArray[np.int32], label: int, box: cv2.typing.MatLike, image_to_paper: Floats
-) -> Mark:
-    x, y, width, height = (int(v) for v in box[:4])
-    part = (slice(y, y + height), slice(x, x + width))
-    # Noise averages to 0: without clipping, the margin that joining added has no weight.
-    weights = np.where(labels[part] == label, darker[part], 0.0).astype(np.float64)
-    total = float(weights.sum())
-    if total <= 0.0:
-        return Mark(0.0, 0.0, 0.0)
-    rows, columns = np.mgrid[y : y + height, x : x + width]
-    pixel = np.array([float((columns * weights).sum()), float((rows * weights).sum())]) / total
-    [[x_mm, y_mm]] = apply(image_to_paper, pixel[None])
-    return Mark(float(x_mm), float(y_mm), total * local_scale(lambda at: apply(image_to_paper, at), pixel) ** 2)
 
 
 def first_ink(ink_mm2: Floats, least_mm2: float) -> int:

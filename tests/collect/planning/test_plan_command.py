@@ -190,10 +190,10 @@ def test_the_command_line_says_what_is_missing(
 
 def test_a_tip_is_where_either_tool_says_that_it_is():
     """Two descriptions of the flange's place: theirs, and ours with a turn of its own, give the same flange."""
-    ours, theirs = [0.004, -0.007, 0.18, 0.03, -0.02, 0.5], [0.05, -0.1, 0.3, 0.1, 0.2, 1.0]
+    ours = from_wire([0.004, -0.007, 0.18, 0.03, -0.02, 0.5])
+    theirs = from_wire([0.05, -0.1, 0.3, 0.1, 0.2, 1.0])
     tip = brush_pose(400.0, 50.0, 130.0, heading_deg=70.0, tilt_deg=10.0)
     flanges = [
-        matrix_of(at) @ inverted(matrix_of(from_wire(tool)))
-        for at, tool in ((tip, ours), (_for_tool(tip, ours, theirs), theirs))
+        matrix_of(at) @ inverted(matrix_of(tool)) for at, tool in ((tip, ours), (_for_tool(tip, ours, theirs), theirs))
     ]
     assert flanges[1] == pytest.approx(flanges[0], abs=1e-9)
