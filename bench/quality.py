@@ -194,7 +194,7 @@ class Bench:
                 image = self._render(dataclasses.replace(view, glare=peak, glare_mm=place, glare_sigma_mm=sigma_mm))
                 return dataclasses.replace(sample, image=image)
             case Failure.EXPOSURE:
-                sheet = self._scene.paper_to_image @ np.array([*np.array(self.table.sheet_mm) / 2, 1.0])
+                sheet = self._scene.optics.homography @ np.array([*np.array(self.table.sheet_mm) / 2, 1.0])
                 u, v = (round(float(q)) for q in sheet[:2] / sheet[2])
                 paper = float(np.median(self.still[v - 300 : v + 300, u - 400 : u + 400]))
                 wanted = rng.uniform(15.0, 60.0) if rng.random() < 0.5 else rng.uniform(290.0, 450.0)

@@ -28,7 +28,7 @@ from brushloop.drivers.camera import CameraTable, OpenCvCamera
 from brushloop.drivers.devices import Stamp
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.ink.simulator import Well
-from brushloop.drivers.sim import mjpeg_server
+from brushloop.drivers.sim import scene
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.faults import ALWAYS, KINDS, Device, Fault
 from brushloop.drivers.sim.rig import Addresses, LoopbackRig, rig_toml
@@ -155,7 +155,7 @@ def test_an_ink_device_is_a_table_and_a_driver_and_the_engine_inks_a_brush_with_
 
 
 async def test_a_fault_is_a_kind_and_what_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mjpeg_server, "SPOILED", spoiled := dict(mjpeg_server.SPOILED))
+    monkeypatch.setattr(scene, "SPOILED", spoiled := dict(scene.SPOILED))
     monkeypatch.setitem(KINDS, Device.CAMERA, KINDS[Device.CAMERA])
     recipe("fault").add()
     async with LoopbackRig(SimConfig(force_sensor=False, ink_device="none", view=SMALL)) as rig:

@@ -110,7 +110,6 @@ class View:
     """First radial distortion coefficient of OpenCV's lens model."""
     blur_px: float = 0.7
     fps: float = 8.0
-    jpeg_quality: int = 95
     delay_s: float = 0.0
     """Real seconds that a picture waits before it is sent, on top of drawing and coding it."""
     delay_jitter_s: float = 0.0

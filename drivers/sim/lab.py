@@ -54,9 +54,8 @@ from brushloop.drivers.sim.lab_facts import (
     over_sheet,
     trapped,
 )
-from brushloop.drivers.sim.mjpeg_server import MjpegServer
 from brushloop.drivers.sim.rig import LoopbackRig
-from brushloop.drivers.sim.scene import Held, Wall
+from brushloop.drivers.sim.scene import Held, MjpegServer, Wall
 
 TOUCHED = ("pin", "board-corner", "sheet-corner", "well-rim", "wash-rim")
 """Things that the tip touches; it is brought to the others by eye."""
@@ -308,7 +307,7 @@ class UnknownLab:
         self.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
         self.cabinet.payload = [self.facts.payload_kg, [0.0] * 3, [0.0] * 3, [0.0] * 6]
         self.person = Person(self.cabinet, self.facts)
-        self._room = MjpegServer(Wall(self.world), View(fps=ROOM_FPS, jpeg_quality=80))
+        self._room = MjpegServer(Wall(self.world), View(fps=ROOM_FPS))
         self._older = OlderSoftware()
         self._touches = 0
         self._pulled: list[int] = []

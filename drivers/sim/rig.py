@@ -16,8 +16,7 @@ from brushloop.drivers.server import LoopbackServer
 from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.faults import Device, FaultBoard
-from brushloop.drivers.sim.mjpeg_server import MjpegServer
-from brushloop.drivers.sim.scene import Scene
+from brushloop.drivers.sim.scene import MjpegServer, Scene
 from brushloop.drivers.sim.world import World
 
 LOOPBACK_HEAD = "# The loopback rig"

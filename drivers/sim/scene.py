@@ -1,9 +1,17 @@
-"""What the loopback cameras see: sheet, board, ink and tool in perspective, under uneven light with glare and noise."""
+"""The loopback cameras: what they see, in perspective, under uneven light with glare and noise, and the streams of it.
+
+A stream is MJPEG over HTTP, one new image per period to every client that keeps up.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import functools
 import math
+import random
+import time
+from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import cast
 
@@ -11,11 +19,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from brushloop.drivers.camera.source import LOOPBACK_SERVER
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import columns as axes
 from brushloop.drivers.geometry import of_vector
+from brushloop.drivers.server import LoopbackServer
 from brushloop.drivers.sim.brush.paper import PX_PER_MM
 from brushloop.drivers.sim.config import Table, View
+from brushloop.drivers.sim.faults import Device, FaultBoard
 from brushloop.drivers.sim.world import World
 
 Floats = NDArray[np.float64]
@@ -36,15 +47,11 @@ class Optics:
 
     def image_of(self, paper_mm: Floats) -> Floats:
         """(n, 2) pixels (centres on integers) of (n, 2) points of the paper plane, distortion included."""
-        undistorted = self.undistorted_image_of(paper_mm)
+        undistorted = mapped(self.homography, paper_mm)
         rays = np.column_stack([undistorted, np.ones(len(undistorted))]) @ np.linalg.inv(self.camera_matrix).T
         none = np.zeros(3)
         distorted, _ = cv2.projectPoints(rays[:, None], none, none, self.camera_matrix, self.distortion)
         return np.asarray(distorted, np.float64).reshape(-1, 2)
-
-    def undistorted_image_of(self, paper_mm: Floats) -> Floats:
-        """The same as `image_of`, for a lens without distortion."""
-        return mapped(self.homography, paper_mm)
 
     def distort(self, undistorted: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """An image as this lens would have taken it; the same if the lens is perfect."""
@@ -72,29 +79,23 @@ def camera_matrix(view: View) -> Floats:
     return np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
 
 
-def stance(view: View, lens_mm: tuple[float, float, float]) -> tuple[Floats, Floats]:
-    """(rotation (3, 3), translation (3,) in mm) from the paper frame to that of a camera at `lens_mm`.
+def homography(view: View) -> Floats:
+    """(3, 3) from the paper plane in mm to image pixels, pixel centres on integers; rows run against y.
 
-    The camera looks at the middle of the view; without a turn its x axis lies over the paper's.
+    A lens over the sheet looks at the middle of the view; without a turn its x axis lies over the paper's.
     """
-    aim = np.array([*view.centre_mm, 0.0]) - lens_mm
-    ahead = aim / np.linalg.norm(aim)
-    across = np.array([1.0, 0.0, 0.0]) - ahead[0] * ahead
-    across = across / np.linalg.norm(across)
-    turn = math.radians(view.turn_deg)
-    right = math.cos(turn) * across - math.sin(turn) * np.cross(ahead, across)
-    rotation = np.asarray(np.stack([right, np.cross(ahead, right), ahead]), np.float64)
-    return rotation, np.asarray(-rotation @ np.array(lens_mm), np.float64)
-
-
-def homography(view: View) -> NDArray[np.float64]:
-    """(3, 3) from the paper plane in mm to image pixels, pixel centres on integers; rows run against y."""
-    if view.lens_mm is not None:
-        rotation, shift = stance(view, view.lens_mm)
-        return camera_matrix(view) @ np.column_stack([rotation[:, 0], rotation[:, 1], shift])
     turn = math.radians(view.turn_deg)
     cos, sin, s = math.cos(turn), math.sin(turn), view.px_per_mm
     x, y = view.centre_mm
+    if view.lens_mm is not None:
+        aim = np.array([x, y, 0.0]) - view.lens_mm
+        ahead = aim / np.linalg.norm(aim)
+        across = np.array([1.0, 0.0, 0.0]) - ahead[0] * ahead
+        across = across / np.linalg.norm(across)
+        right = cos * across - sin * np.cross(ahead, across)
+        rotation = np.stack([right, np.cross(ahead, right), ahead])
+        shift = -rotation @ np.array(view.lens_mm)
+        return np.asarray(camera_matrix(view) @ np.column_stack([rotation[:, :2], shift]), np.float64)
     to_centre = np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, 1.0]])
     flat = np.array([[s * cos, -s * sin, 0.0], [-s * sin, -s * cos, 0.0], [0.0, 0.0, 1.0]])
     tilt = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, view.keystone / view.height_px, 1.0]])
@@ -137,31 +138,6 @@ class Held:
     centre_mm: tuple[float, float, float]
 
 
-def held_picture(
-    board: cv2.aruco.CharucoBoard, table: Table, view: View, optics: Optics, held: Held
-) -> NDArray[np.float32]:
-    """(h, w) float32 gray levels of the board in hand, under the light of the table."""
-    size_x_mm, size_y_mm = (n * table.board_square_mm for n in table.board_squares)
-    inner = board.generateImage((round(size_x_mm * PRINT_PX_PER_MM), round(size_y_mm * PRINT_PX_PER_MM)))
-    edge = round(EDGE_MM * PRINT_PX_PER_MM)
-    columns, rows = inner.shape[1] + 2 * edge, inner.shape[0] + 2 * edge
-    paper = np.full((rows, columns), WHITE, np.uint8)
-    paper[edge:-edge, edge:-edge] = np.where(np.asarray(inner) > 127, WHITE, BLACK)
-    for column in (0, columns):
-        cv2.circle(paper, (column, rows // 2), round(FINGER_MM * PRINT_PX_PER_MM), (150,), -1)
-    # raster pixel centres -> mm from the middle of the board -> image
-    s = 1.0 / PRINT_PX_PER_MM
-    to_mm = np.array([[s, 0.0, -0.5 * s * (columns - 1)], [0.0, s, -0.5 * s * (rows - 1)], [0.0, 0.0, 1.0]])
-    rx, ry, rz = (math.radians(turn_deg) for turn_deg in held.turn_deg)
-    right, down, _ = axes(of_vector((rx, ry, rz)))
-    plane = np.column_stack([right, down, held.centre_mm])
-    flat = cv2.warpPerspective(
-        paper, optics.camera_matrix @ plane @ to_mm, (view.width_px, view.height_px), borderValue=BEHIND
-    )
-    blurred = cv2.GaussianBlur(optics.distort(np.asarray(flat, np.uint8)), (0, 0), view.blur_px)
-    return blurred.astype(np.float32) * optics.light
-
-
 TABLE_GRAY = 120
 PAPER_GRAY = 228
 INK_REFLECTANCE = 0.06
@@ -183,25 +159,19 @@ def board(table: Table) -> cv2.aruco.CharucoBoard:
 class Scene:
     """Renders the world. The sheet is warped only when it has changed; each frame's noise differs from the last one's.
 
-    While nothing changes in view, one of `NOISE_FIELDS` finished frames is reused.
+    While nothing changes and the tool is out of the picture, one of `NOISE_FIELDS` frames is returned again.
     """
 
     def __init__(self, world: World) -> None:
         self._world = world
         table, view = world.config.table, world.config.view
-        self._origin_mm, self._size_mm = _extent(table)
         self._blank, self._noise = _draw(table, world.config.seed, view.noise, (view.height_px, view.width_px))
         self.optics = Optics(view, world.config.seed)
-        self.paper_to_image = self.optics.homography
-        self._plane_to_image = self._raster_to_image()
-        self._finished: dict[int, tuple[tuple[int, int] | None, NDArray[np.uint8]]] = {}
-        """By noise field: the place of the tool's disc, and the frame. Valid for the sheet as it is lit now."""
-        self._without_tool: dict[int, NDArray[np.uint8]] = {}
-        """By noise field: the frame without the tool. Valid for the sheet as it is lit now."""
-        self._lit: NDArray[np.float32] | None = None
-        self._lit_version: tuple[int, Held | None] = (-1, None)
-        self._disc_of: tuple[Pose | None, tuple[int, int] | None] = None, None
-        """The tool as it was last seen, and the place of its disc."""
+        self._lit: NDArray[np.float32] = np.zeros(0, np.float32)
+        """The picture without noise and tool, of the sheet and the held board in `_shown`."""
+        self._shown: tuple[int, Held | None] = (-1, None)
+        self._frames: dict[int, NDArray[np.uint8]] = {}
+        """`_lit` with each field of noise: a moving tool only hides a part of it."""
         self._count = 0
         self.held: Held | None = None
         """The board that a person holds before the camera; it hides everything else."""
@@ -217,66 +187,64 @@ class Scene:
         returned again while the picture does not change.
         """
         tool = tool or self.tool()
-        config, held = self._world.config, self.held
-        if self._lit is None or self._lit_version != (self._world.version, held):
-            self._lit_version = self._world.version, held
-            if held is None:
-                self._lit = self._light_sheet()
-            else:
-                self._lit = held_picture(board(config.table), config.table, config.view, self.optics, held)
-            self._finished.clear()
-            self._without_tool.clear()
+        held, mirrored = self.held, self._world.config.view.mirrored
+        if self._shown != (self._world.version, held):
+            self._shown = self._world.version, held
+            self._lit = self._light_sheet() if held is None else self._light_board(held)
+            self._frames.clear()
         field = self._count % NOISE_FIELDS
         self._count += 1
-        if self._disc_of[0] != tool:
-            self._disc_of = tool, self._tool_disc(tool)
-        disc_px = None if held else self._disc_of[1]
-        at_px, frame = self._finished.get(field, (None, None))
-        if frame is None or at_px != disc_px:
-            frame = self._sheet_alone(field, self._lit)
-            if disc_px is not None:
-                frame = frame.copy()
-                cv2.circle(frame, disc_px, self._disc_radius_px, (TOOL_GRAY,), -1)
-                frame.flags.writeable = False
-            if config.view.mirrored:
-                frame = np.ascontiguousarray(frame[:, ::-1])
-            self._finished[field] = disc_px, frame
-        return frame
-
-    def _sheet_alone(self, field: int, lit: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """The frame without the tool, made once for each sheet: a moving tool only hides part of it."""
-        frame = self._without_tool.get(field)
+        frame = self._frames.get(field)
         if frame is None:
-            image = lit + self._noise[field]
-            np.clip(image, 0.0, 255.0, out=image)
-            frame = image.astype(np.uint8)
+            frame = np.clip(self._lit + self._noise[field], 0.0, 255.0).astype(np.uint8)
+            frame = np.ascontiguousarray(frame[:, ::-1]) if mirrored else frame
             frame.flags.writeable = False
-            self._without_tool[field] = frame
+            self._frames[field] = frame
+        disc_px = None if held else self._tool_disc(tool)
+        if disc_px is not None:
+            frame = frame.copy()
+            cv2.circle(frame, disc_px, self._disc_radius_px, (TOOL_GRAY,), -1)
         return frame
-
-    def _raster_to_image(self) -> NDArray[np.float64]:
-        # raster pixel centres (cv2 convention) -> mm in the paper frame -> image
-        s = 1.0 / PX_PER_MM
-        top_mm = self._origin_mm[1] + self._size_mm[1]
-        to_mm = np.array([[s, 0, self._origin_mm[0] + 0.5 * s], [0, -s, top_mm - 0.5 * s], [0, 0, 1]])
-        return self.paper_to_image @ to_mm
 
     def _light_sheet(self) -> NDArray[np.float32]:
-        table, view = self._world.config.table, self._world.config.view
+        table = self._world.config.table
         raster = self._blank.copy()
-        rows, columns = _sheet_slices(table)
+        sheet = _sheet_slices(table)
         kept = 1.0 - (1.0 - INK_REFLECTANCE) * self._world.paper.density
-        raster[rows, columns] = (raster[rows, columns] * kept).astype(np.uint8)
-        warped = cv2.warpPerspective(
-            raster,
-            self._plane_to_image,
-            (view.width_px, view.height_px),
-            flags=cv2.INTER_LINEAR,
-            borderValue=TABLE_GRAY,
-        )
-        blurred = cv2.GaussianBlur(self.optics.distort(warped.astype(np.uint8)), (0, 0), view.blur_px)
-        lit = blurred.astype(np.float32) * self.optics.light
+        raster[sheet] = (raster[sheet] * kept).astype(np.uint8)
+        # raster pixel centres (cv2 convention) -> mm in the paper frame -> image
+        (left_mm, bottom_mm), (_, along_mm) = _extent(table)
+        s, top_mm = 1.0 / PX_PER_MM, bottom_mm + along_mm
+        to_mm = np.array([[s, 0, left_mm + 0.5 * s], [0, -s, top_mm - 0.5 * s], [0, 0, 1]])
+        lit = self._photograph(raster, self.optics.homography @ to_mm, TABLE_GRAY)
         return lit if self.optics.glare is None else lit + self.optics.glare
+
+    def _light_board(self, held: Held) -> NDArray[np.float32]:
+        """The print in hand, under the light of the table."""
+        table = self._world.config.table
+        size_x_mm, size_y_mm = (n * table.board_square_mm for n in table.board_squares)
+        inner = board(table).generateImage((round(size_x_mm * PRINT_PX_PER_MM), round(size_y_mm * PRINT_PX_PER_MM)))
+        edge = round(EDGE_MM * PRINT_PX_PER_MM)
+        columns, rows = inner.shape[1] + 2 * edge, inner.shape[0] + 2 * edge
+        paper = np.full((rows, columns), WHITE, np.uint8)
+        paper[edge:-edge, edge:-edge] = np.where(np.asarray(inner) > 127, WHITE, BLACK)
+        for column in (0, columns):
+            cv2.circle(paper, (column, rows // 2), round(FINGER_MM * PRINT_PX_PER_MM), (150,), -1)
+        # raster pixel centres -> mm from the middle of the board -> image
+        s = 1.0 / PRINT_PX_PER_MM
+        to_mm = np.array([[s, 0.0, -0.5 * s * (columns - 1)], [0.0, s, -0.5 * s * (rows - 1)], [0.0, 0.0, 1.0]])
+        rx, ry, rz = (math.radians(turn_deg) for turn_deg in held.turn_deg)
+        right, down, _ = axes(of_vector((rx, ry, rz)))
+        plane = np.column_stack([right, down, held.centre_mm])
+        return self._photograph(paper, self.optics.camera_matrix @ plane @ to_mm, BEHIND)
+
+    def _photograph(self, raster: NDArray[np.uint8], to_image: Floats, around_gray: int) -> NDArray[np.float32]:
+        """(h, w) gray levels of a flat raster through the lens, under the light of the table."""
+        view = self._world.config.view
+        size = view.width_px, view.height_px
+        flat = cv2.warpPerspective(raster, to_image, size, flags=cv2.INTER_LINEAR, borderValue=around_gray)
+        blurred = cv2.GaussianBlur(self.optics.distort(np.asarray(flat, np.uint8)), (0, 0), view.blur_px)
+        return blurred.astype(np.float32) * self.optics.light
 
     @property
     def _disc_radius_px(self) -> int:
@@ -284,15 +252,15 @@ class Scene:
 
     def _tool_disc(self, tool: Pose) -> tuple[int, int] | None:
         """Pixel at the centre of the disc that the arm hides; None if all of it lies outside the image."""
-        view, radius_px = self._world.config.view, self._disc_radius_px
-        x_mm, y_mm = self._world.to_paper(tool.x_mm, tool.y_mm)
-        at_mm = np.array([[x_mm, y_mm]])
-        if np.abs(self.optics.undistorted_image_of(at_mm)).max() > FAR_WIDTHS * view.width_px:
+        view = self._world.config.view
+        at_mm = np.array([self._world.to_paper(tool.x_mm, tool.y_mm)])
+        if np.abs(mapped(self.optics.homography, at_mm)).max() > FAR_WIDTHS * view.width_px:
             return None  # so far outside, the formula of the distortion leads back into the image
         [[u, v]] = self.optics.image_of(at_mm)
         u_px, v_px = round(float(u)), round(float(v))
-        beside = max(-u_px, u_px - view.width_px, -v_px, v_px - view.height_px) > radius_px + 1
-        return None if beside else (u_px, v_px)
+        beside_px = max(-u_px, u_px - view.width_px, -v_px, v_px - view.height_px)
+        column_px = view.width_px - 1 - u_px if view.mirrored else u_px
+        return None if beside_px > self._disc_radius_px + 1 else (column_px, v_px)
 
 
 def _extent(table: Table) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -329,13 +297,12 @@ def _draw(
     raster[top - margin : top + board_px[1] + margin, column - margin : column + board_px[0] + margin] = 245
     picture = board(table).generateImage((board_px[0], board_px[1]))
     raster[top : top + board_px[1], column : column + board_px[0]] = np.where(picture > 127, 245, 20)
-    rows, columns = _sheet_slices(table)
-    raster[rows, columns] = np.clip(PAPER_GRAY + fibre[rows, columns], 0, 255).astype(np.uint8)
+    sheet = _sheet_slices(table)
+    raster[sheet] = np.clip(PAPER_GRAY + fibre[sheet], 0, 255).astype(np.uint8)
     return raster, [rng.normal(0.0, noise, shape).astype(np.float32) for _ in range(NOISE_FIELDS)]
 
 
-WIDTH_PX, HEIGHT_PX = 640, 480
-WALL, WALL_NOISE = 185, 2.0
+WALL_GRAY, WALL_NOISE = 185, 2.0
 
 
 class Wall:
@@ -351,4 +318,133 @@ class Wall:
 
     def render(self, tool: Pose | None = None) -> NDArray[np.uint8]:
         """A (480, 640) gray image."""
-        return self._noise.normal(WALL, WALL_NOISE, (HEIGHT_PX, WIDTH_PX)).astype(np.uint8)
+        return self._noise.normal(WALL_GRAY, WALL_NOISE, (480, 640)).astype(np.uint8)
+
+
+NOISE_LEVELS = 6
+"""Number of gray levels of a covered sensor, which is not quite black."""
+
+
+def black(jpeg: bytes) -> bytes:
+    """A picture of the same size as taken with the lens cap on, other than the one before."""
+    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    return cv2.imencode(".jpg", np.random.default_rng().integers(0, NOISE_LEVELS, image.shape, np.uint8))[1].tobytes()
+
+
+def renumbered(jpeg: bytes, number: int) -> bytes:
+    """The same picture with other bytes: a JPEG comment with a number is inserted after the two start bytes."""
+    text = b"%d" % number
+    comment = b"\xff\xfe" + (len(text) + 2).to_bytes(2, "big") + text
+    return jpeg[:2] + comment + jpeg[2:]
+
+
+def torn(jpeg: bytes) -> bytes:
+    """The first half with a valid end mark: the rest never arrived."""
+    return jpeg[: len(jpeg) // 2] + b"\xff\xd9"
+
+
+SPOILED: dict[str, Callable[[bytes], bytes]] = {"black": black, "torn": torn}
+"""Faults of a single picture: JPEG in, JPEG out."""
+BOUNDARY = "brushloop"
+JPEG_QUALITY = 95
+NEXT_S = 1e-6
+"""Time between two pictures that are due at once, because timers with the same time run in any order."""
+BACKLOG = 64
+"""Images that a stalled stream keeps, as the buffers of a real one do."""
+
+
+class Line:
+    """One client's connection with the view's delay; no picture overtakes another."""
+
+    def __init__(self, view: View, writer: asyncio.StreamWriter) -> None:
+        self._view = view
+        self._writer = writer
+        self._loop = asyncio.get_running_loop()
+        self._last_s = self._loop.time()
+        self._random = random.Random(0)
+
+    async def send(self, data: bytes, exposed_s: float) -> None:
+        """Send now, or as soon as it is due: its delay counts from `exposed_s` and includes the time to draw it."""
+        late_s = self._view.delay_s + self._view.delay_jitter_s * self._random.random()
+        if self._writer.is_closing():  # a late picture is not drained, which would notice
+            raise ConnectionResetError("the client has gone")
+        if late_s <= 0.0:
+            self._writer.write(data)
+        else:
+            self._last_s = max(self._last_s + NEXT_S, exposed_s + late_s)
+            self._loop.call_at(self._last_s, self._write, data)
+        await self._writer.drain()  # of earlier pictures: else a slow client would fall farther and farther behind
+
+    def _write(self, data: bytes) -> None:
+        if not self._writer.is_closing():
+            self._writer.write(data)
+
+
+class MjpegServer(LoopbackServer):
+    """Serves `/stream.mjpg`. A client that reads too slowly is sent the newest image next, never a backlog."""
+
+    def __init__(self, scene: Scene | Wall, view: View, faults: FaultBoard | None = None) -> None:
+        """`view` gives the rate and the delay of the pictures."""
+        super().__init__()
+        self._scene = scene
+        self._view = view
+        self._rendering = asyncio.Lock()
+        self._coded: deque[tuple[NDArray[np.uint8], bytes]] = deque(maxlen=NOISE_FIELDS)
+        """The newest images of the scene and their JPEGs, reused while nothing changes."""
+        self._faults = faults
+
+    def show(self, scene: Scene | Wall, view: View) -> None:
+        """Look at something else, with other settings. Every stream begins again, as when a camera is set up again."""
+        self._scene, self._view = scene, view
+        self._coded.clear()
+        self.drop_clients()
+
+    async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Answer any request with the stream."""
+        async with asyncio.timeout(5.0):
+            request = await reader.readuntil(b"\r\n\r\n")
+        writer.write(
+            b"HTTP/1.0 200 OK\r\nCache-Control: no-store\r\nServer: " + LOOPBACK_SERVER.encode() + b"\r\n"
+            b"Content-Type: multipart/x-mixed-replace; boundary=" + BOUNDARY.encode() + b"\r\n\r\n"
+        )
+        if not request.startswith(b"HEAD"):
+            await self._stream(Line(self._view, writer))
+
+    async def _stream(self, line: Line) -> None:
+        loop = asyncio.get_running_loop()
+        due_s = loop.time()
+        held: deque[bytes] = deque(maxlen=BACKLOG)
+        shown = b""
+        while True:
+            fault = None if self._faults is None else self._faults.meet(Device.CAMERA)
+            kind = "" if fault is None else fault.kind
+            exposed_s, image = await self._exposed()
+            if kind == "frozen":
+                image = renumbered(shown or image, time.time_ns())
+            elif kind in SPOILED:
+                image = SPOILED[kind](image)
+            else:
+                shown = image
+            held.append(image)
+            while held and kind != "stale":
+                jpeg = held.popleft()
+                head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
+                await line.send(head.encode() + jpeg + b"\r\n", exposed_s)
+            due_s = max(due_s + 1.0 / self._view.fps, loop.time())
+            await asyncio.sleep(due_s - loop.time())
+
+    async def _exposed(self) -> tuple[float, bytes]:
+        """A new picture: the loop's time at its exposure, and its JPEG."""
+        async with self._rendering:  # the scene keeps a cache: one thread at a time
+            tool = self._scene.tool()  # here, because the motion queue belongs to the event loop's thread
+            return asyncio.get_running_loop().time(), await asyncio.to_thread(self._jpeg, tool)
+
+    def _jpeg(self, tool: Pose) -> bytes:
+        image: NDArray[np.uint8] = self._scene.render(tool)
+        for coded, data in self._coded:
+            if coded is image:
+                return data
+        _, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        self._coded.append((image, data := encoded.tobytes()))
+        return data

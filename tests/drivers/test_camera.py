@@ -25,9 +25,8 @@ from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.faults import ALWAYS, Fault, FaultBoard
-from brushloop.drivers.sim.mjpeg_server import MjpegServer, renumbered, torn
 from brushloop.drivers.sim.rig import HOST
-from brushloop.drivers.sim.scene import Scene
+from brushloop.drivers.sim.scene import MjpegServer, Scene, renumbered, torn
 from brushloop.drivers.sim.world import World
 from tests.waiting import until
 
@@ -72,7 +71,7 @@ def faults(small_view: View) -> FaultBoard:
 
 @pytest.fixture
 async def stream(small_view: View, faults: FaultBoard) -> AsyncIterator[MjpegServer]:
-    server = MjpegServer(StampedScene(faults._world), replace(small_view, fps=15.0, jpeg_quality=90), faults)
+    server = MjpegServer(StampedScene(faults._world), replace(small_view, fps=15.0), faults)
     await server.start(HOST, 0)
     yield server
     await server.stop()

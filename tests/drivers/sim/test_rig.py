@@ -22,8 +22,8 @@ from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault, FaultBoard
 from brushloop.drivers.sim.lab import OlderSoftware
-from brushloop.drivers.sim.mjpeg_server import MjpegServer
 from brushloop.drivers.sim.rig import HOST, LoopbackRig
+from brushloop.drivers.sim.scene import MjpegServer
 from brushloop.drivers.sim.serve import ControlServer, serve
 from brushloop.drivers.sim.world import World
 from tests.waiting import until

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from brushloop.drivers.sim.config import SimConfig, View
-from brushloop.drivers.sim.mjpeg_server import _Line
-from brushloop.drivers.sim.scene import Scene, board, homography
+from brushloop.drivers.sim.scene import Line, Scene, board, homography
 from brushloop.drivers.sim.world import World
 
 CONFIG = SimConfig(view=View(width_px=1024, height_px=768, px_per_mm=3.125))
@@ -110,13 +109,13 @@ class Open:
 
 
 async def test_the_time_to_draw_a_picture_is_a_part_of_its_delay_and_no_picture_overtakes_another() -> None:
-    loop, line = Loop(), _Line(View(delay_s=0.3, delay_jitter_s=0.0), cast("asyncio.StreamWriter", Open()))
+    loop, line = Loop(), Line(View(delay_s=0.3, delay_jitter_s=0.0), cast("asyncio.StreamWriter", Open()))
     line._loop = cast("asyncio.AbstractEventLoop", loop)
     line._last_s = loop.now_s
     for drawn_s in (0.05, 0.0, 2.0, 0.0):
-        line.exposed()
+        exposed_s = loop.now_s
         loop.now_s += drawn_s
-        await line.send(b"picture")
+        await line.send(b"picture", exposed_s)
     assert loop.due_s == pytest.approx([100.3, 100.35, 100.35, 102.35], abs=1e-3)
     assert loop.due_s == sorted(set(loop.due_s))
 
@@ -124,9 +123,8 @@ async def test_the_time_to_draw_a_picture_is_a_part_of_its_delay_and_no_picture_
 async def test_a_client_that_reads_too_slowly_is_sent_no_further_picture_until_it_has_taken_the_earlier_ones() -> None:
     client = Open()
     client.taken.clear()
-    line = _Line(View(delay_s=0.3), cast("asyncio.StreamWriter", client))
-    line.exposed()
-    sending = asyncio.create_task(line.send(b"picture"))
+    line = Line(View(delay_s=0.3), cast("asyncio.StreamWriter", client))
+    sending = asyncio.create_task(line.send(b"picture", 0.0))
     await asyncio.sleep(0)
     assert not sending.done()
     client.taken.set()
