@@ -279,19 +279,19 @@ class _Person:
         await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(act, self._loop))
 
     def _typed(self, words: str) -> str:
-        seen = self._lab.seen()
-        host, port, bus = seen.can
+        lab, facts = self._lab, self._lab.facts
+        table, brush = facts.config.table, facts.config.brush
         answers = {
-            "address of the cabinet": seen.host,
-            "stream": " ".join(seen.streams),
-            "longer side": str(seen.squares[0]),
-            "shorter side": str(seen.squares[1]),
-            "side of a square": f"{seen.square_mm:g}",
-            "side of a marker": f"{seen.marker_mm:g}",
-            "r: radius": f"{seen.radius_mm:g}",
-            "l: length": f"{seen.length_mm:g}",
-            "can bus": f"{host}:{port}/{bus}",
-            "serial line": "" if seen.ink is None else seen.ink[1],
+            "address of the cabinet": lab.host,
+            "stream": " ".join(lab.streams),
+            "longer side": str(table.board_squares[0]),
+            "shorter side": str(table.board_squares[1]),
+            "side of a square": f"{facts.printed_square_mm:g}",
+            "side of a marker": f"{facts.printed_marker_mm:g}",
+            "r: radius": f"{brush.radius_mm:g}",
+            "l: length": f"{brush.length_mm:g}",
+            "can bus": lab.can_bus,
+            "serial line": "" if lab.rig.ink is None else lab.rig.ink.path,
         }
         return next((answer for part, answer in answers.items() if part in words), "")
 
@@ -300,8 +300,7 @@ class _Person:
         if "moves by itself" in prompt.question:
             return "a"
         if "well filled" in prompt.question:
-            ink = self._lab.seen().ink
-            return "n" if ink is None else "i" if ink[0] == "ink-station" else "p"
+            return {"station": "i", "pump": "p", "none": "n"}[self._lab.facts.config.ink_device]
         return "enter" if prompt.default else "y" if "Agreed?" in prompt.question else "n"
 
 

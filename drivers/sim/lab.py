@@ -22,7 +22,7 @@ import os
 import zlib
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -33,7 +33,6 @@ from brushloop.drivers.devices import Pose
 from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL
 from brushloop.drivers.geometry import of_vector, product, turned, unit, vector
 from brushloop.drivers.server import LoopbackServer
-from brushloop.drivers.sim.cabinet import Cabinet
 from brushloop.drivers.sim.config import View
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 from brushloop.drivers.sim.kinematics import Joints, inverse, inverted, matrix_of
@@ -41,10 +40,7 @@ from brushloop.drivers.sim.lab_facts import (
     LIFT_MM,
     PICTURE_PX,
     PIN_TILT_DEG,
-    PRESS_SHARE,
-    Facts,
     Place,
-    Seen,
     Trap,
     azimuth_deg,
     board_size_mm,
@@ -76,45 +72,177 @@ PUSHES = ((0.0, 0.0, -PUSH_N), (PUSH_N, 0.0, 0.0), (0.0, PUSH_N, 0.0))
 """Forces in the brush's frame, N: along the brush toward the flange, then along its x and y."""
 
 
-@dataclass(frozen=True, slots=True)
-class Grip:
-    """How the board is held: its slant and the side toward which it slants, its turn in the picture, its place."""
-
-    slant_deg: float = 0.0
-    toward_deg: float = 0.0
-    turn_deg: float = 0.0
-    aside: tuple[float, float] = (0.0, 0.0)
-    """Right and down, in shares of the picture's width and height."""
-
-
 GRIPS = (
-    Grip(3.0),
-    *(Grip(28.0, toward) for toward in (270.0, 90.0, 0.0, 180.0)),
-    Grip(22.0, 45.0, 0.0, (-0.17, -0.17)),
-    Grip(22.0, 135.0, 0.0, (0.17, -0.17)),
-    Grip(22.0, 225.0, 0.0, (0.17, 0.17)),
-    Grip(22.0, 315.0, 0.0, (-0.17, 0.17)),
-    Grip(25.0, 60.0, 90.0),
+    (3.0, 0.0, 0.0, (0.0, 0.0)),
+    *((28.0, toward_deg, 0.0, (0.0, 0.0)) for toward_deg in (270.0, 90.0, 0.0, 180.0)),
+    (22.0, 45.0, 0.0, (-0.17, -0.17)),
+    (22.0, 135.0, 0.0, (0.17, -0.17)),
+    (22.0, 225.0, 0.0, (0.17, 0.17)),
+    (22.0, 315.0, 0.0, (-0.17, 0.17)),
+    (25.0, 60.0, 90.0, (0.0, 0.0)),
 )
-"""How a person is asked to hold it: flat, slanted to each side, in the four corners, and turned by a quarter."""
+"""How a person is asked to hold the board: flat, slanted to each side, in the four corners, and turned by a quarter.
+
+Each is its slant, the side toward which it slants and its turn in the picture, in degrees, and its place to the right
+and down, in shares of the picture's width and height.
+"""
+ARCS_PORT, RTDE_PORT, CAN_PORT = 30004, 30010, 29536
+CAMERA_PORTS = (8080, 8081)
+ROOM_FPS = 5.0
+MOST_ROUNDS = 3.0
+"""The sensor's rounds come faster with simulated time, up to this many times: what one process can send and read."""
+THINGS = (
+    *("pin", "upright", "board-corner", "sheet-corner", "well", "well-rim", "wash-pot", "wash-rim"),
+    *("park", "clear-view", "hold-board", "push-sensor"),
+)
+ADDRESSES = 200
+"""Labs of one seed that can be open at once on a machine."""
+_labs = itertools.count()
 
 
-class Person:
-    """A person with hands on the arm of one controller.
+class OlderSoftware(LoopbackServer):
+    """The port of the software before ARCS: it takes connections, and answers nothing that ARCS would."""
+
+    async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Read until the client disconnects."""
+        while await reader.read(4096):
+            pass
+
+
+class UnknownLab:
+    """`async with UnknownLab(seed) as lab:` serves until the block ends; `obey` asks the person for something.
 
     An error of the hand depends on the seed, the thing, and how often it was asked for.
     """
 
-    def __init__(self, cabinet: Cabinet, facts: Facts) -> None:
-        self.facts = facts
-        """The lab as it is now."""
-        self._cabinet = cabinet
-        self._world = cabinet.world
+    def __init__(
+        self, seed: int, trap: Trap | None = None, *, rate: float = 1.0, picture_px: tuple[int, int] = PICTURE_PX
+    ) -> None:
+        clean = draw(seed, rate, picture_px)
+        self.facts, self._mended = (clean, clean) if trap is None else trapped(clean, trap)
+        """The lab as it is now, and once the mistake is corrected."""
+        self.host = f"127.16.{seed % 250 + 1}.{10 + (os.getpid() + next(_labs)) % ADDRESSES}"
+        """The address that the pendant shows."""
+        self.streams = tuple(f"http://{self.host}:{port}/stream.mjpg" for port in CAMERA_PORTS)
+        """The addresses on the stickers of the cameras."""
+        self.can_bus = f"{self.host}:{CAN_PORT}/{LOOPBACK_CHANNEL}"
+        """The gateway and bus of the force sensor."""
+        config = replace(
+            self.facts.config,
+            arcs_port=ARCS_PORT,
+            rtde_port=RTDE_PORT,
+            camera_port=CAMERA_PORTS[self.facts.sheet_camera],
+            force_port=CAN_PORT,
+            force_hz=self.facts.config.force_hz * min(max(rate, 1.0), MOST_ROUNDS),
+        )
+        self.rig = LoopbackRig(config, self.host)
+        self.world = self.rig.world
+        self.cabinet = self.rig.arcs.cabinet
+        self.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
+        self.cabinet.payload = [self.facts.payload_kg, [0.0] * 3, [0.0] * 3, [0.0] * 6]
+        self._room = MjpegServer(Wall(self.world), View(fps=ROOM_FPS))
+        self._older = OlderSoftware()
         self._asked: Counter[str] = Counter()
+        self._touches = 0
+        self._pulled: list[int] = []
+        self._busy = asyncio.Lock()
+        """The person does one thing at a time."""
+
+    async def __aenter__(self) -> UnknownLab:
+        await self.rig.__aenter__()
+        try:
+            await self._room.start(self.host, CAMERA_PORTS[1 - self.facts.sheet_camera])
+            if self.facts.trap is Trap.OLD_SOFTWARE:
+                await self.rig.arcs.stop()
+                await self.rig.rtde.stop()
+                await self._older.start(self.host, AUBOPE_PORT)
+        except BaseException:
+            await self.__aexit__()
+            raise
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self._older.stop()
+        await self._room.stop()
+        await self.rig.__aexit__()
+
+    def labels(self) -> list[str]:
+        """What a person can read in the lab now: on labels, plugs, the print and the pendant."""
+        facts, table, brush = self.facts, self.facts.config.table, self.facts.config.brush
+        columns, rows = table.board_squares
+        ink = "none, a person pours" if self.rig.ink is None else f"{facts.config.ink_device} on {self.rig.ink.path}"
+        return [
+            "an unknown lab; simulated: nothing measured in it is a result on paper",
+            f"robot     the pendant shows the address {self.host}",
+            *(f"camera    {stream}" for stream in self.streams),
+            f"force     SRI M8123 on the gateway {self.can_bus}",
+            f"ink       {ink}",
+            f"print     ChArUco, {columns} x {rows} squares of {facts.printed_square_mm:g} mm, "
+            f"markers of {facts.printed_marker_mm:g} mm, {table.board_dictionary}",
+            f"brush     radius R = {brush.radius_mm:g} mm, length L = {brush.length_mm:g} mm, "
+            f"press at most {facts.max_depth_mm:g} mm",
+        ]
+
+    async def obey(self, request: Mapping[str, object]) -> dict[str, Any]:
+        """Carry out a request as in the table above. Raises ValueError, with a one-line message, for an invalid one."""
+        act, to = request.get("act"), str(request.get("to", ""))
+        index, corner = request.get("index", 0), str(request.get("corner", ""))
+        if type(index) is not int or not 0 <= index < 1000:
+            raise ValueError(f"index = {index!r}: must be a whole number from 0 to 999")
+        async with self._busy:
+            match act:
+                case "bring":
+                    return await self.bring(to, index, corner)
+                case "measure":
+                    return {"says": self._measured(to)}
+                case "mend":
+                    return {"says": await self.mend()}
+                case "plug":
+                    return {"says": self._plug()}
+                case _:
+                    raise ValueError(f"act = {act!r} is not one of bring, measure, mend, plug")
+
+    async def bring(self, to: str, index: int = 0, corner: str = "") -> dict[str, Any]:
+        """Carry out `bring`, as in the table above. Raises ValueError for a thing that the lab does not have."""
+        if to not in THINGS:
+            raise ValueError(f"to = {to!r} is not one of {', '.join(THINGS)}")
+        self.rig.scene.held = self._grip(index) if to == "hold-board" else None
+        if to == "hold-board":
+            return {"reached": True, "says": "I hold the print before the camera."}
+        if to == "push-sensor":
+            await self._push(index)
+            return {"reached": True, "says": "I pushed the tip for a second."}
+        aim = self.aim(to, index, corner)
+        if (trouble := await self._take_hold()) is not None:
+            return {"reached": False, "says": trouble}
+        short_mm = await self.guide(aim, along_brush=to == "pin")
+        if to in TOUCHED:
+            self._touched()
+        if short_mm > 0.0:
+            return {"reached": False, "says": f"The arm is stretched out, {short_mm:.0f} mm before the {to}."}
+        return {"reached": True, "says": f"The tip is at the {to}{f', {corner}' if corner else ''}."}
+
+    async def mend(self) -> str:
+        """Correct the mistake that the trap is; return what was done."""
+        was, self.facts = self.facts, self._mended
+        match was.trap:
+            case None:
+                return "Nothing is wrong that I know of."
+            case Trap.CABLE_PULLED:
+                return self._plug()
+            case Trap.OLD_SOFTWARE:
+                await self._older.stop()
+                await self.rig.arcs.start(self.host, ARCS_PORT)
+                await self.rig.rtde.start(self.host, RTDE_PORT)
+            case _:
+                self.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
+                if self.facts.config != was.config:
+                    self.rig.reconfigure(self.facts.config)
+        return f"I have seen to it: {was.trap.value}."
 
     def aim(self, to: str, index: int, name: str) -> Pose:
         """Pose of the tip for a thing. Raises ValueError for one that the lab does not have."""
-        rng, place = self._drawn(to, index, name), self._place(to, name)
+        rng, place = self._hand(to, index, name), self._place(to, name)
         wrist_deg = azimuth_deg(place) + float(rng.normal(0.0, 5.0))
         tilt_deg, toward_deg = 0.0, 0.0
         if to == "pin":
@@ -131,24 +259,23 @@ class Person:
         about_x, about_y = np.radians(rng.normal(0.0, SQUARE_DEG if to == "upright" else UPRIGHT_DEG, 2)).tolist()
         return Pose(x, y, z, *product(of_vector((about_x, about_y, 0.0)), aimed.quaternion))
 
-    def grip(self, index: int) -> Held:
+    def _grip(self, index: int) -> Held:
         """How the board is held before the camera: each time at another slant and in another part of the picture."""
-        rng = self._drawn("hold-board", index, "")
+        rng = self._hand("hold-board", index, "")
         view, table = self.facts.config.view, self.facts.config.table
-        grip = GRIPS[index % len(GRIPS)]
+        slant_deg, toward_deg, turn_deg, (x, y) = GRIPS[index % len(GRIPS)]
         size_x_mm, size_y_mm = board_size_mm(table)
         high = view.height_px / view.width_px
-        longest = max(size_x_mm, size_y_mm / high) if abs(grip.turn_deg) < 45.0 else max(size_y_mm, size_x_mm / high)
+        longest = max(size_x_mm, size_y_mm / high) if abs(turn_deg) < 45.0 else max(size_y_mm, size_x_mm / high)
         across_mm = longest / float(rng.uniform(0.85, 0.95))
-        toward = math.radians(grip.toward_deg + float(rng.uniform(-15, 15)))
-        slant = math.radians(grip.slant_deg + float(rng.uniform(-3, 3)))
-        turn = math.radians(grip.turn_deg + float(rng.normal(0.0, 4.0)))
+        toward = math.radians(toward_deg + float(rng.uniform(-15, 15)))
+        slant = math.radians(slant_deg + float(rng.uniform(-3, 3)))
+        turn = math.radians(turn_deg + float(rng.normal(0.0, 4.0)))
         slanted = of_vector((slant * math.cos(toward), slant * math.sin(toward), 0.0))
         rx, ry, rz = (math.degrees(v) for v in vector(product(slanted, of_vector((0.0, 0.0, turn)))))
-        x, y = grip.aside
         return Held((rx, ry, rz), (x * across_mm, y * across_mm * high, view.focal * across_mm))
 
-    def measure(self, what: str) -> str:
+    def _measured(self, what: str) -> str:
         """A length as the person writes it down. Raises ValueError for one that nobody can measure."""
         config = self.facts.config
         lengths_mm = {
@@ -191,22 +318,22 @@ class Person:
         words, swapped = " ".join(name.replace("-", " ").replace("_", " ").split()), self.facts.swapped
         return swapped[1 - swapped.index(words)] if swapped is not None and words in swapped else words
 
-    def _drawn(self, to: str, index: int, name: str) -> np.random.Generator:
+    def _hand(self, to: str, index: int, name: str) -> np.random.Generator:
         key = f"{to} {index} {name}"
         self._asked[key] += 1
         return np.random.default_rng([self.facts.seed, 31, zlib.crc32(key.encode()), self._asked[key]])
 
-    async def push(self, index: int) -> None:
+    async def _push(self, index: int) -> None:
         """Push the tip for `PUSH_S`, in the direction of this index of `PUSHES`."""
-        self._world.push_n = turned(unit(self._world.tool().quaternion), PUSHES[index % len(PUSHES)])
+        self.world.push_n = turned(unit(self.world.tool().quaternion), PUSHES[index % len(PUSHES)])
         try:
             await asyncio.sleep(PUSH_S)
         finally:
-            self._world.push_n = (0.0, 0.0, 0.0)
+            self.world.push_n = (0.0, 0.0, 0.0)
 
-    async def take_hold(self) -> str | None:
+    async def _take_hold(self) -> str | None:
         """Power the arm at the pendant; return why it cannot be guided."""
-        world, power = self._world, self._cabinet.power
+        world, power = self.world, self.cabinet.power
         if power.safety not in MOVING_ALLOWED:
             return f"The pendant shows {power.safety.value}: that has to be ended first."
         if world.target() is not None or world.motion.held:
@@ -222,12 +349,12 @@ class Person:
 
         The last stretch leads down, or along the brush; a place that the arm does not reach is passed over.
         """
-        reached = self._world.tool()
-        near = self._world.motion.joints(self._world.clock.now_s())
+        reached = self.world.tool()
+        near = self.world.motion.joints(self.world.clock.now_s())
         above = _withdrawn(aim) if along_brush else replace(aim, z_mm=aim.z_mm + LIFT_MM)
         way: list[Joints] = []
         for pose in (_withdrawn(reached), above, aim):
-            joints = inverse(matrix_of(pose) @ inverted(self._world.motion.tool), near)
+            joints = inverse(matrix_of(pose) @ inverted(self.world.motion.tool), near)
             if joints is not None:
                 way.append(joints)
                 near, reached = joints, pose
@@ -235,7 +362,7 @@ class Person:
         return math.dist(reached.position_mm, aim.position_mm)
 
     async def _move(self, way: list[Joints]) -> None:
-        world, motion = self._world, self._world.motion
+        world, motion = self.world, self.world.motion
         world.hand_guided = True
         try:
             for joints in way:
@@ -244,6 +371,20 @@ class Person:
                 await asyncio.sleep(LOOK_S)
         finally:
             world.hand_guided = False
+
+    def _touched(self) -> None:
+        """Count another touched thing; with one trap, somebody then trips over the cable."""
+        self._touches += 1
+        if self._touches == self.facts.cable_after:
+            lost = ((Device.ROBOT, "deaf"), (Device.TELEMETRY, "mute"))
+            self._pulled = [self.rig.faults.hang(Fault(device=d, kind=kind, count=ALWAYS)) for d, kind in lost]
+
+    def _plug(self) -> str:
+        """Put the cable back."""
+        pulled, self._pulled = self._pulled, []
+        for ident in pulled:
+            self.rig.faults.take(ident)
+        return "The cable was out; it is in again." if pulled else "Every cable is in."
 
 
 def _error_mm(rng: np.random.Generator, spread_mm: float) -> list[float]:
@@ -259,164 +400,3 @@ def _withdrawn(tip: Pose) -> Pose:
     back_mm = turned(unit(tip.quaternion), (0.0, 0.0, -LIFT_MM))
     x, y, z = (a + b for a, b in zip(tip.position_mm, back_mm, strict=True))
     return Pose(x, y, z, *tip.quaternion)
-
-
-ARCS_PORT, RTDE_PORT, CAN_PORT = 30004, 30010, 29536
-CAMERA_PORTS = (8080, 8081)
-ROOM_FPS = 5.0
-MOST_ROUNDS = 3.0
-"""The sensor's rounds come faster with simulated time, up to this many times: what one process can send and read."""
-THINGS = (
-    *("pin", "upright", "board-corner", "sheet-corner", "well", "well-rim", "wash-pot", "wash-rim"),
-    *("park", "clear-view", "hold-board", "push-sensor"),
-)
-ADDRESSES = 200
-"""Labs of one seed that can be open at once on a machine."""
-_labs = itertools.count()
-
-
-class OlderSoftware(LoopbackServer):
-    """The port of the software before ARCS: it takes connections, and answers nothing that ARCS would."""
-
-    async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Read until the client disconnects."""
-        while await reader.read(4096):
-            pass
-
-
-class UnknownLab:
-    """`async with UnknownLab(seed) as lab:` serves until the block ends; `obey` asks the person for something."""
-
-    def __init__(
-        self, seed: int, trap: Trap | None = None, *, rate: float = 1.0, picture_px: tuple[int, int] = PICTURE_PX
-    ) -> None:
-        clean = draw(seed, rate, picture_px)
-        self.facts, self._mended = (clean, clean) if trap is None else trapped(clean, trap)
-        self.host = f"127.16.{seed % 250 + 1}.{10 + (os.getpid() + next(_labs)) % ADDRESSES}"
-        config = replace(
-            self.facts.config,
-            arcs_port=ARCS_PORT,
-            rtde_port=RTDE_PORT,
-            camera_port=CAMERA_PORTS[self.facts.sheet_camera],
-            force_port=CAN_PORT,
-            force_hz=self.facts.config.force_hz * min(max(rate, 1.0), MOST_ROUNDS),
-        )
-        self.rig = LoopbackRig(config, self.host)
-        self.world = self.rig.world
-        self.cabinet = self.rig.arcs.cabinet
-        self.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
-        self.cabinet.payload = [self.facts.payload_kg, [0.0] * 3, [0.0] * 3, [0.0] * 6]
-        self.person = Person(self.cabinet, self.facts)
-        self._room = MjpegServer(Wall(self.world), View(fps=ROOM_FPS))
-        self._older = OlderSoftware()
-        self._touches = 0
-        self._pulled: list[int] = []
-        self._busy = asyncio.Lock()
-        """The person does one thing at a time."""
-
-    async def __aenter__(self) -> UnknownLab:
-        await self.rig.__aenter__()
-        try:
-            await self._room.start(self.host, CAMERA_PORTS[1 - self.facts.sheet_camera])
-            if self.facts.trap is Trap.OLD_SOFTWARE:
-                await self.rig.arcs.stop()
-                await self.rig.rtde.stop()
-                await self._older.start(self.host, AUBOPE_PORT)
-        except BaseException:
-            await self.__aexit__()
-            raise
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        await self._older.stop()
-        await self._room.stop()
-        await self.rig.__aexit__()
-
-    def seen(self) -> Seen:
-        """What a person can read in the lab now."""
-        ink, facts, brush = self.rig.ink, self.facts, self.facts.config.brush
-        kind = "modbus-pump" if facts.config.ink_device == "pump" else "ink-station"
-        return Seen(
-            self.host,
-            tuple(f"http://{self.host}:{port}/stream.mjpg" for port in CAMERA_PORTS),
-            (self.host, CAN_PORT, LOOPBACK_CHANNEL),
-            None if ink is None else (kind, ink.path),
-            squares=facts.config.table.board_squares,
-            square_mm=facts.printed_square_mm,
-            marker_mm=facts.printed_marker_mm,
-            dictionary=facts.config.table.board_dictionary,
-            radius_mm=brush.radius_mm,
-            length_mm=brush.length_mm,
-            max_depth_mm=round(PRESS_SHARE * brush.length_mm),
-        )
-
-    async def obey(self, request: Mapping[str, object]) -> dict[str, Any]:
-        """Carry out a request as in the table above. Raises ValueError, with a one-line message, for an invalid one."""
-        act, to = request.get("act"), str(request.get("to", ""))
-        index, corner = request.get("index", 0), str(request.get("corner", ""))
-        if type(index) is not int or not 0 <= index < 1000:
-            raise ValueError(f"index = {index!r}: must be a whole number from 0 to 999")
-        async with self._busy:
-            match act:
-                case "bring":
-                    return await self.bring(to, index, corner)
-                case "measure":
-                    return {"says": self.person.measure(to)}
-                case "mend":
-                    return {"says": await self.mend()}
-                case "plug":
-                    return {"says": self.plug()}
-                case _:
-                    raise ValueError(f"act = {act!r} is not one of bring, measure, mend, plug")
-
-    async def bring(self, to: str, index: int = 0, corner: str = "") -> dict[str, Any]:
-        """Carry out `bring`, as in the table above. Raises ValueError for a thing that the lab does not have."""
-        if to not in THINGS:
-            raise ValueError(f"to = {to!r} is not one of {', '.join(THINGS)}")
-        self.rig.scene.held = self.person.grip(index) if to == "hold-board" else None
-        if to == "hold-board":
-            return {"reached": True, "says": "I hold the print before the camera."}
-        if to == "push-sensor":
-            await self.person.push(index)
-            return {"reached": True, "says": "I pushed the tip for a second."}
-        aim = self.person.aim(to, index, corner)
-        if (trouble := await self.person.take_hold()) is not None:
-            return {"reached": False, "says": trouble}
-        short_mm = await self.person.guide(aim, along_brush=to == "pin")
-        if to in TOUCHED:
-            self._touched()
-        if short_mm > 0.0:
-            return {"reached": False, "says": f"The arm is stretched out, {short_mm:.0f} mm before the {to}."}
-        return {"reached": True, "says": f"The tip is at the {to}{f', {corner}' if corner else ''}."}
-
-    def _touched(self) -> None:
-        """Count another touched thing; with one trap, somebody then trips over the cable."""
-        self._touches += 1
-        if self._touches == self.facts.cable_after:
-            lost = ((Device.ROBOT, "deaf"), (Device.TELEMETRY, "mute"))
-            self._pulled = [self.rig.faults.hang(Fault(device=d, kind=kind, count=ALWAYS)) for d, kind in lost]
-
-    def plug(self) -> str:
-        """Put the cable back."""
-        pulled, self._pulled = self._pulled, []
-        for ident in pulled:
-            self.rig.faults.take(ident)
-        return "The cable was out; it is in again." if pulled else "Every cable is in."
-
-    async def mend(self) -> str:
-        """Correct the mistake that the trap is; return what was done."""
-        was = self.facts
-        if was.trap is None:
-            return "Nothing is wrong that I know of."
-        self.facts = self.person.facts = self._mended
-        if was.trap is Trap.CABLE_PULLED:
-            return self.plug()
-        if self.facts.config != was.config:
-            self.rig.reconfigure(self.facts.config)
-        if self.facts.cabinet_tcp != was.cabinet_tcp:
-            self.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
-        if was.trap is Trap.OLD_SOFTWARE:
-            await self._older.stop()
-            await self.rig.arcs.start(self.host, ARCS_PORT)
-            await self.rig.rtde.start(self.host, RTDE_PORT)
-        return f"I have seen to it: {was.trap.value}."

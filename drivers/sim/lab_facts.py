@@ -73,6 +73,8 @@ CLEAR_OF_PICTURE_MM = 75.0
 """More than the arm hides around the tip."""
 CLEAR_APART_MM = 160.0
 """Between two places out of the picture."""
+PRESS_SHARE = 0.45
+"""Deepest press, as a share of the free length, that the maker of the brush allows."""
 BASE_CLEAR_MM = 230.0
 """Least distance from the axis of the base that a straight way may have."""
 
@@ -133,46 +135,10 @@ class Facts:
     trap: Trap | None = None
     """What is wrong in the lab until it is mended."""
 
-
-PRESS_SHARE = 0.45
-"""Deepest press, as a share of the free length, that the maker of the brush allows."""
-
-
-@dataclass(frozen=True, slots=True)
-class Seen:
-    """Labels, plugs and print of one lab."""
-
-    host: str
-    """Address on the pendant's network page."""
-    streams: tuple[str, ...]
-    """Addresses on the stickers of the cameras."""
-    can: tuple[str, int, str]
-    """Host, port and bus of the CAN gateway with the force sensor."""
-    ink: tuple[str, str] | None
-    """Kind and serial line of the device at the well; None where a person pours."""
-    squares: tuple[int, int]
-    square_mm: float
-    marker_mm: float
-    dictionary: str
-    radius_mm: float
-    length_mm: float
-    max_depth_mm: float
-
-    def lines(self) -> list[str]:
-        """For a person to read."""
-        host, port, bus = self.can
-        ink = "none, a person pours" if self.ink is None else f"{self.ink[0]} on {self.ink[1]}"
-        return [
-            "an unknown lab; simulated: nothing measured in it is a result on paper",
-            f"robot     the pendant shows the address {self.host}",
-            *(f"camera    {stream}" for stream in self.streams),
-            f"force     SRI M8123 on the gateway {host}:{port}/{bus}",
-            f"ink       {ink}",
-            f"print     ChArUco, {self.squares[0]} x {self.squares[1]} squares of {self.square_mm:g} mm, "
-            f"markers of {self.marker_mm:g} mm, {self.dictionary}",
-            f"brush     radius R = {self.radius_mm:g} mm, length L = {self.length_mm:g} mm, "
-            f"press at most {self.max_depth_mm:g} mm",
-        ]
+    @property
+    def max_depth_mm(self) -> int:
+        """Deepest press that the maker of the brush allows."""
+        return round(PRESS_SHARE * self.config.brush.length_mm)
 
 
 def draw(seed: int, rate: float = 1.0, picture_px: tuple[int, int] = PICTURE_PX) -> Facts:

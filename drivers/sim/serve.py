@@ -208,7 +208,7 @@ def serve_unknown(
         over = _signalled()
         async with lab, live_control(lab.rig, control, lab.obey):
             how = [] if control is None else [f"hand      brushloop hand {control} bring pin"]
-            tell(*lab.seen().lines(), *how, "Ctrl-C ends")
+            tell(*lab.labels(), *how, "Ctrl-C ends")
             await _until_over(lab.rig, over, idle_exit_s)
 
     asyncio.run(served())

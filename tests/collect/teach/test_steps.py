@@ -73,10 +73,10 @@ def leaning(x_mm: float, y_mm: float, z_mm: float, toward_deg: float, tilt_deg: 
 async def slipped(person: InLab, target: Target, deg: float) -> bool:
     """The hand holds the brush as ever, but leaning."""
     lab = person.lab
-    aim = lab.person.aim(target.kind, target.index, target.corner)
+    aim = lab.aim(target.kind, target.index, target.corner)
     lean = Rotation.from_rotvec([math.radians(deg), 0.0, 0.0]) * Rotation.from_quat(aim.quaternion)
     qx, qy, qz, qw = (float(v) for v in lean.as_quat())
-    await person._in_lab(lab.person.guide(Pose(*aim.position_mm, qx, qy, qz, qw)))
+    await person._in_lab(lab.guide(Pose(*aim.position_mm, qx, qy, qz, qw)))
     return True
 
 

@@ -21,12 +21,12 @@ from brushloop.collect.rig.paper import to_base
 from brushloop.collect.teach.day import Day, LeftOff, Picture, Shown, Target
 from brushloop.collect.teach.wizard import Wizard
 from brushloop.drivers.host import HostClock
-from brushloop.drivers.sim.lab import Seen, UnknownLab
+from brushloop.drivers.sim.lab import UnknownLab
 from brushloop.drivers.sim.lab_facts import Trap
 from brushloop.drivers.sim.world import tool_of
 from tests.waiting import PATIENCE_S
 
-KIND = {"ink-station": "i", "modbus-pump": "p"}
+KEYS = {"station": "i", "pump": "p", "none": "n"}
 
 
 @dataclass
@@ -68,27 +68,28 @@ class InLab:
             self.mends = False
             return "a"
         if question.startswith("What keeps the ink well filled"):
-            return "n" if self.seen.ink is None else KIND[self.seen.ink[0]]
+            return KEYS[self.lab.facts.config.ink_device]
         if "The arm moves by itself" in question:
             return "a"
         return default or ("y" if "Agreed?" in question else "n")
 
     def _typed(self, question: str) -> str:
-        seen = self.seen
+        lab, facts = self.lab, self.lab.facts
+        table, brush = facts.config.table, facts.config.brush
         read = {
-            "Address of the cabinet": seen.host,
-            "Address of the camera": " ".join(seen.streams),
-            "Squares along its longer": str(seen.squares[0]),
-            "Squares along its shorter": str(seen.squares[1]),
-            "Side of a square": str(seen.square_mm),
-            "Side of a marker": str(seen.marker_mm),
-            "Markers of the print": seen.dictionary,
-            "R:": str(seen.radius_mm),
-            "L:": str(seen.length_mm),
-            "Deepest press": str(seen.max_depth_mm),
+            "Address of the cabinet": lab.host,
+            "Address of the camera": " ".join(lab.streams),
+            "Squares along its longer": str(table.board_squares[0]),
+            "Squares along its shorter": str(table.board_squares[1]),
+            "Side of a square": str(facts.printed_square_mm),
+            "Side of a marker": str(facts.printed_marker_mm),
+            "Markers of the print": table.board_dictionary,
+            "R:": str(brush.radius_mm),
+            "L:": str(brush.length_mm),
+            "Deepest press": str(facts.max_depth_mm),
             "Delivery per revolution": "0.1",
-            "Its serial line": "" if seen.ink is None else seen.ink[1],
-            "CAN bus": f"{seen.can[0]}:{seen.can[1]}/{seen.can[2]}",
+            "Its serial line": "" if lab.rig.ink is None else lab.rig.ink.path,
+            "CAN bus": lab.can_bus,
         }
         return next((v for start, v in read.items() if question.startswith(start)), "")
 
@@ -99,10 +100,6 @@ class InLab:
         answer = await self._in_lab(self.lab.bring(target.kind, target.index, target.corner))
         self.lines.append(f"person: {answer['says']}")
         return bool(answer["reached"])
-
-    @property
-    def seen(self) -> Seen:
-        return self.lab.seen()
 
     @property
     def trouble(self) -> str:

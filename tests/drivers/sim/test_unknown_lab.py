@@ -92,7 +92,7 @@ async def test_what_a_client_reads_agrees_with_the_truth(lab: UnknownLab, contro
 
 
 def test_what_is_seen_names_no_truth(lab: UnknownLab):
-    words = " ".join(lab.seen().lines())
+    words = " ".join(lab.labels())
     assert lab.host in words
     for hidden in (lab.facts.config.tool_mm, lab.facts.config.table.yaw_deg, lab.facts.pin_mm[0]):
         assert f"{hidden:.1f}" not in words
