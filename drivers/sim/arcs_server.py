@@ -111,25 +111,30 @@ class ArcsServer(LoopbackServer):
                     writer.write(_error(None, PARSE_ERROR, f"parse error: {error.what}"))
                 raise
             for payload in payloads:
-                request = _parsed(payload)
-                op = _op(request)
+                op, carried_out = self._request(payload)
                 if self.faults.meet(Device.ROBOT, op, LOST) is not None:
                     continue
-                answer = self._answer(request)
+                answer = carried_out()
                 fault = self.faults.meet(Device.ROBOT, op, KINDS[Device.ROBOT] - LOST)
                 if fault is not None and fault.kind in STOPS:
                     self.cabinet.safety_stop(STOPS[fault.kind])
                 await send(writer, frame, answer, fault)
             data = await reader.read(65536)
 
-    def _answer(self, request: Any) -> bytes:
+    def _request(self, payload: bytes) -> tuple[str, Callable[[], bytes]]:
+        """The method's name, as faults refer to it, and a function that carries the request out and replies."""
+        if payload.startswith(b"__login__"):
+            return "login", lambda: b"SUCCEED"
+        try:
+            request = json.loads(payload)
+        except (ValueError, RecursionError) as error:
+            parse_error = _error(None, PARSE_ERROR, f"parse error: {error}")
+            return "", lambda: parse_error
         match request:
-            case bytes() as reply:
-                return reply
             case {"method": str(name)}:
-                return self._call(request.get("id"), name, request.get("params"))  # pyright: ignore[reportUnknownMemberType, reportUnknownArgumentType]
+                return name, lambda: self._call(request.get("id"), name, request.get("params"))
             case _:
-                return _error(None, INVALID_PARAMS, "a request is an object with a method")
+                return "", lambda: _error(None, INVALID_PARAMS, "a request is an object with a method")
 
     def _call(self, ident: object, name: str, params: Any) -> bytes:
         method = self._methods.get(name)
@@ -144,27 +149,6 @@ class ArcsServer(LoopbackServer):
         return _reply(ident, result=result)
 
 
-def _parsed(payload: bytes) -> Any:
-    """The request; for a login or invalid JSON, the reply as bytes."""
-    if payload.startswith(b"__login__"):
-        return b"SUCCEED"
-    try:
-        return json.loads(payload)
-    except (ValueError, RecursionError) as error:
-        return _error(None, PARSE_ERROR, f"parse error: {error}")
-
-
-def _op(request: Any) -> str:
-    """The method's name, as faults refer to it."""
-    match request:
-        case b"SUCCEED":
-            return "login"
-        case {"method": str(name)}:
-            return name
-        case _:
-            return ""
-
-
 def _reply(ident: object, **body: object) -> bytes:
     return json.dumps({"id": ident, "jsonrpc": "2.0", **body}, separators=(",", ":")).encode()
 
@@ -173,6 +157,14 @@ def _error(ident: object, code: int, message: str) -> bytes:
     return _reply(ident, error={"code": code, "message": message})
 
 
+OUTPUTS = {
+    "timestamp": 100,
+    "R1_actual_q": 1006,
+    "R1_robot_mode": 1014,
+    "R1_safety_mode": 1015,
+    "R1_actual_TCP_pose": 1021,
+}
+"""Identifier of each output that a client may subscribe to."""
 MAX_HZ = 500.0
 BACKLOG_BYTES = 32 * 1024
 """A client that does not read is sent nothing more until it has caught up."""
@@ -188,18 +180,10 @@ class RtdeServer(LoopbackServer):
         self._cabinet = cabinet
         self.pings = 0
         """Keep-alives seen, for tests."""
-        self._outputs: dict[str, tuple[int, Callable[[], Any]]] = {
-            "timestamp": (100, cabinet.now_s),
-            "R1_actual_q": (1006, lambda: list(cabinet.joints())),
-            "R1_robot_mode": (1014, lambda: cabinet.power.mode.value),
-            "R1_safety_mode": (1015, lambda: cabinet.power.safety.value),
-            "R1_actual_TCP_pose": (1021, lambda: to_wire(cabinet.tcp())),
-        }
 
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Greet the client, then serve its topics until it disconnects."""
-        outputs = {name: ident for name, (ident, _) in self._outputs.items()}
-        hello = {"protocol": "rtde", "version": 1, "input": {"set_recipe": SET_RECIPE}, "output": outputs}
+        hello = {"protocol": "rtde", "version": 1, "input": {"set_recipe": SET_RECIPE}, "output": OUTPUTS}
         writer.write(json.dumps(hello, separators=(",", ":")).encode() + b"\n\n")
         decoder = FrameDecoder(skip=PING, max_bytes=MAX_MESSAGE_BYTES)
         pushes: dict[int, asyncio.Task[None]] = {}
@@ -210,7 +194,7 @@ class RtdeServer(LoopbackServer):
                     chanel, hz, names = topic_of(payload)
                     if (old := pushes.pop(chanel, None)) is not None:
                         old.cancel()
-                    if hz > 0.0 and names and all(name in self._outputs for name in names):
+                    if hz > 0.0 and names and OUTPUTS.keys() >= set(names):
                         push = self._push(chanel, 1.0 / min(hz, MAX_HZ), names, writer)
                         pushes[chanel] = asyncio.create_task(push, name="rtde push")
         finally:
@@ -237,17 +221,19 @@ class RtdeServer(LoopbackServer):
         return [rest for rest in world.motion.rests if after_s < rest.at_s <= until_s] if world.clock.rate > 1.0 else []
 
     def _value(self, name: str, rest: Rest | None) -> Any:
-        if rest is not None:
-            match name:
-                case "timestamp":
-                    return rest.at_s
-                case "R1_actual_TCP_pose":
-                    return to_wire(self._cabinet.configured(rest.pose))
-                case "R1_actual_q":
-                    return list(self._cabinet.motion.near_joints(rest.pose))
-                case _:
-                    pass
-        return self._outputs[name][1]()
+        """An output as it is now, or as it was when the arm came to rest."""
+        cabinet = self._cabinet
+        match name:
+            case "timestamp":
+                return cabinet.now_s() if rest is None else rest.at_s
+            case "R1_actual_q":
+                return list(cabinet.joints() if rest is None else cabinet.motion.near_joints(rest.pose))
+            case "R1_robot_mode":
+                return cabinet.power.mode.value
+            case "R1_safety_mode":
+                return cabinet.power.safety.value
+            case _:
+                return to_wire(cabinet.tcp() if rest is None else cabinet.configured(rest.pose))
 
     def _push_once(self, chanel: int, values: list[Any], writer: asyncio.StreamWriter) -> None:
         fault = self.faults.meet(Device.TELEMETRY)

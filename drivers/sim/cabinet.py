@@ -101,14 +101,9 @@ ROBOT = "rob1"
 IK_NO_CONVERGE = -23
 HARD_STOP_M_S2 = 10.0
 SOFT_STOP_M_S2 = 2.0
-JOINT_SPEEDS_RAD_S = (2.5964, 2.5964, 2.5964, 3.1105, 3.1105, 3.1105)
-JOINT_ACCS_RAD_S2 = (31.1, 31.1, 31.1, 20.7, 20.7, 20.7)
+JOINT_SPEED_RAD_S, JOINT_ACC_RAD_S2 = 2.5964, 20.7
+"""Of the slowest joint."""
 TCP_SPEED_M_S, TCP_ACC_M_S2 = 2.0, 10.0
-REDUCED_M_S = 0.25
-"""Limit in reduced mode and manual operation: ISO 10218-1's reduced speed, 250 mm/s. Configurable on a real cabinet."""
-REACH_M = 0.8865
-REDUCED_RAD_S = REDUCED_M_S / REACH_M
-"""Joint speed at which the tip of the stretched arm stays below `REDUCED_M_S`."""
 POSE_OUT_OF_REACH = 30047
 BLEND_M = (0.001, 1.0)
 OPERATIONAL_MODES = ("Disabled", "Automatic", "Manual")
@@ -245,7 +240,7 @@ class Cabinet:
         if joints is None:
             return self._out_of_reach()
         self._near = joints
-        speed_m_s, acc_m_s2 = self._pace(p, TCP_SPEED_M_S, TCP_ACC_M_S2, REDUCED_M_S)
+        speed_m_s, acc_m_s2 = _pace(p, TCP_SPEED_M_S, TCP_ACC_M_S2)
         added = self.motion.add(
             target,
             speed_m_s * 1e3,
@@ -266,7 +261,7 @@ class Cabinet:
             return code
         if any(abs(v) > math.radians(limit) for v, limit in zip(q, LIMITS_DEG, strict=True)):
             return self._out_of_reach()
-        speed_rad_s, acc_rad_s2 = self._pace(p, min(JOINT_SPEEDS_RAD_S), min(JOINT_ACCS_RAD_S2), REDUCED_RAD_S)
+        speed_rad_s, acc_rad_s2 = _pace(p, JOINT_SPEED_RAD_S, JOINT_ACC_RAD_S2)
         joints: Joints = (q[0], q[1], q[2], q[3], q[4], q[5])
         least_s = float(p.get("duration", 0.0))
         added = self.motion.add_joints(joints, speed_rad_s, acc_rad_s2, self.now_s(), least_s)
@@ -284,13 +279,6 @@ class Cabinet:
         if not (timed or (acc > 0.0 and speed > 0.0)) or not (blend_m == 0.0 or BLEND_M[0] <= blend_m <= BLEND_M[1]):
             return -ReturnCode.INVALID_ARGUMENT
         return ReturnCode.QUEUE_FULL if self.motion.full else ReturnCode.OK
-
-    def _pace(self, p: Params, fastest: float, hardest: float, reduced: float) -> tuple[float, float]:
-        """Speed and acceleration, clipped to what the arm allows; the maxima if only a duration was given."""
-        speed, acc = float(p["v"]), float(p["a"])
-        slow = self.power.safety == SafetyMode.REDUCED or self.operational_mode == "Manual"
-        limit = reduced if slow else fastest
-        return min(speed, limit) if speed > 0.0 else limit, min(acc, hardest) if acc > 0.0 else hardest
 
     def _out_of_reach(self) -> int:
         """Accept a move that then proves to be out of reach: the arm stops and a message says why."""
@@ -362,6 +350,12 @@ class Cabinet:
     def peek(self, count: int, after: int) -> list[dict[str, Any]]:
         """The newest `count` messages after a time stamp."""
         return [m for m in self.messages if m["timestamp"] > after][-count:] if count > 0 else []
+
+
+def _pace(p: Params, fastest: float, hardest: float) -> tuple[float, float]:
+    """Speed and acceleration, clipped to what the arm allows; the maxima if only a duration was given."""
+    speed, acc = float(p["v"]), float(p["a"])
+    return min(speed, fastest) if speed > 0.0 else fastest, min(acc, hardest) if acc > 0.0 else hardest
 
 
 def _floats(values: Any, count: int) -> list[float]:

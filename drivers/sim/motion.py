@@ -39,6 +39,7 @@ SAME_POSE_DEG = 1e-4
 SAME_JOINT_RAD = 1e-6
 RESTS_KEPT = 64
 SHORTEST_CUT = 1e-6
+MOST_MOVES = 64
 CORNER_SHARE = 0.5
 """Share of the acceleration that the bend of a corner may need; the rest is left for the speed along it."""
 SLACK = 1e-9
@@ -46,33 +47,11 @@ SLACK = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
-class Move:
-    """One accepted move. It ends at rest unless `blend_mm` is the distance from its end at which it may be left."""
-
-    ident: int
-    path: Line | JointLine
-    speed: float
-    acc: float
-    duration_s: float = 0.0
-    blend_mm: float = 0.0
-
-    def paced(self, fraction: float, rests: int) -> float:
-        """The speed at which it takes `duration_s`, but at most that share of its speed.
-
-        `rests` is the number of its ends at rest. T(v) = length / v + rests v / (2 acc), solved for v.
-        """
-        speed, duration_s = self.speed * fraction, self.duration_s
-        if not duration_s:
-            return speed
-        shorter_s2 = 2.0 * rests * self.path.length / self.acc
-        return min(speed, 2.0 * self.path.length / (duration_s + math.sqrt(max(duration_s**2 - shorter_s2, 0.0))))
-
-
-@dataclass(frozen=True, slots=True)
 class Piece:
     """A stretch of the whole path; a corner belongs to the move that it leads into."""
 
-    move: Move
+    ident: int
+    """Of its move."""
     path: Line | JointLine | Corner
     start: float
     """Where it begins, along the whole path."""
@@ -81,9 +60,10 @@ class Piece:
     end: float
     """Where it ends, along its own path."""
     cap: float
+    """Highest speed."""
     acc: float
-    rests: int = 2
-    """Number of its ends at rest."""
+    blend_mm: float = 0.0
+    """Distance from its end at which it may be left; 0 where it ends at rest."""
 
     @property
     def stop(self) -> float:
@@ -165,9 +145,7 @@ class MotionQueue:
     `tool` is the true flange to tip. The path does not depend on when it is looked at.
     """
 
-    def __init__(
-        self, home: Pose, on_path: Callable[[Pose, Pose], None], tool: Matrix | None = None, capacity: int = 64
-    ) -> None:
+    def __init__(self, home: Pose, on_path: Callable[[Pose, Pose], None], tool: Matrix | None = None) -> None:
         self.tool: Matrix = np.eye(4) if tool is None else tool
         self.fraction = 1.0
         """Speed factor for every move that is added from now on."""
@@ -186,18 +164,17 @@ class MotionQueue:
         self._left_s = -1.0
         """When the arm left the last rest, or came to it."""
         self._on_path = on_path
-        self._capacity = capacity
         self._next_id = 0
 
     @property
     def full(self) -> bool:
         """True when another move would be refused."""
-        return self.size >= self._capacity
+        return self.size >= MOST_MOVES
 
     @property
     def size(self) -> int:
         """Number of moves queued, running or held."""
-        return len({piece.move.ident for piece in self._pieces})
+        return len({piece.ident for piece in self._pieces})
 
     def add(
         self,
@@ -220,8 +197,8 @@ class MotionQueue:
         if travel_mm <= SAME_POSE_MM and turn_deg <= SAME_POSE_DEG:
             return False
         line = Line(start, target, fix)
-        unit, blend = (1e-3, 0.0) if line.angular else (1.0, blend_mm)
-        self._append(Move(self._next_id, line, speed_mm_s * unit, acc_mm_s2 * unit, duration_s, blend), now_s)
+        unit, blend_mm = (1e-3, 0.0) if line.angular else (1.0, blend_mm)
+        self._append(line, speed_mm_s * unit, acc_mm_s2 * unit, duration_s, now_s, blend_mm)
         return True
 
     def add_joints(self, joints: Joints, speed_rad_s: float, acc_rad_s2: float, now_s: float, least_s: float) -> bool:
@@ -235,7 +212,7 @@ class MotionQueue:
             return False
         last = self._pieces[-1] if self._pieces else None
         start = (last.joints(last.stop) if last else None) or self.near_joints(self._last())
-        self._append(Move(self._next_id, JointLine(start, joints, self.tool), speed_rad_s, acc_rad_s2, least_s), now_s)
+        self._append(JointLine(start, joints, self.tool), speed_rad_s, acc_rad_s2, least_s, now_s)
         return True
 
     def advance(self, now_s: float) -> None:
@@ -254,9 +231,7 @@ class MotionQueue:
         self._brake(acc_mm_s2, acc_rad_s2, now_s)
         self.held, rest = False, self._knots[-1].along
         self._pieces = [
-            replace(piece, move=replace(piece.move, blend_mm=0.0), end=piece.place(rest))
-            for piece in self._pieces
-            if piece.start < rest
+            replace(piece, end=piece.place(rest), blend_mm=0.0) for piece in self._pieces if piece.start < rest
         ]
         self.advance(now_s)
 
@@ -288,7 +263,7 @@ class MotionQueue:
         """Id of the running move, or of the one that is held; -1 when there is none. A corner belongs to the move that
         it leads into."""
         self.advance(now_s)
-        return self._pieces[0].move.ident if self._pieces else -1
+        return self._pieces[0].ident if self._pieces else -1
 
     def joints(self, now_s: float) -> Joints:
         """Joint positions for the present pose of the tip."""
@@ -337,19 +312,28 @@ class MotionQueue:
             for start, end in itertools.pairwise(places if length > 0.0 else ()):
                 self._on_path(start, end)
 
-    def _append(self, move: Move, now_s: float) -> None:
-        self._next_id += 1
+    def _append(
+        self,
+        path: Line | JointLine,
+        speed: float,
+        acc: float,
+        least_s: float,
+        now_s: float,
+        blend_mm: float = 0.0,
+    ) -> None:
+        """Append a move at that share of its speed that `fraction` says, or slower so that it takes `least_s`."""
         here = self._knots[-1] if self.held else self._at(now_s)
-        rounded = self._rounded(move, here.along)
+        start = self._pieces[-1].stop if self._pieces else here.along
+        cap = min(speed * self.fraction, path.length / least_s) if least_s else speed * self.fraction
+        piece = Piece(self._next_id, path, start, 0.0, path.length, cap, acc, blend_mm)
+        self._next_id += 1
+        rounded = self._rounded(piece, here.along)
         if rounded is not None:
             knots = self._knots if self.held else timetable(rounded, here)
             if knots is not None:
                 self._pieces, self._knots = rounded, knots
                 return
-        # it begins at rest: the moves before it stay as they are
-        start, rests = (self._pieces[-1].stop if self._pieces else here.along), 2 - (move.blend_mm > 0.0)
-        piece = Piece(move, move.path, start, 0.0, move.path.length, move.paced(self.fraction, rests), move.acc, rests)
-        self._pieces.append(piece)
+        self._pieces.append(piece)  # it begins at rest: the moves before it stay as they are
         if not self.held:
             self._go_on([piece], now_s)
 
@@ -361,29 +345,26 @@ class MotionQueue:
             self._left_s = start.at_s
         self._knots[-1:] = timetable(pieces, start) or [rest]
 
-    def _rounded(self, move: Move, along: float) -> list[Piece] | None:
+    def _rounded(self, piece: Piece, along: float) -> list[Piece] | None:
         """The path with a move appended, and with a corner into it; None where the last move ends at rest.
 
         The corner has to begin beyond `along`.
         """
-        match self._pieces and self._pieces[-1].path, move.path:
+        match self._pieces and self._pieces[-1].path, piece.path:
             case Line() as a, Line() as b if not a.angular and not b.angular and a.fix is b.fix:
                 last = self._pieces[-1]
-                cut = min(last.move.blend_mm, 0.5 * a.length, 0.5 * b.length)
+                cut = min(last.blend_mm, 0.5 * a.length, 0.5 * b.length)
             case _:
                 return None
         if cut <= SHORTEST_CUT or last.stop - cut < along:
             return None
-        corner, acc = Corner(a, b, cut), min(last.acc, move.acc)
+        corner, acc = Corner(a, b, cut), min(last.acc, piece.acc)
         # the speed bends by `bend` v within 2 cut / v: an acceleration of v^2 bend / (2 cut)
         limit = math.sqrt(2.0 * cut * CORNER_SHARE * acc / max(corner.bend, 1e-12))
         before = replace(last, end=a.length - cut)
-        rests = 1 - (move.blend_mm > 0.0)
-        speed = move.paced(self.fraction, rests)
-        cap = min(limit, last.cap, speed)
-        bent = Piece(move, corner, before.stop, 0.0, corner.length, cap, (1.0 - CORNER_SHARE) * acc)
-        after = Piece(move, b, bent.stop, cut, b.length, speed, move.acc, rests)
-        return [*self._pieces[:-1], before, bent, after]
+        cap = min(limit, last.cap, piece.cap)
+        bent = Piece(piece.ident, corner, before.stop, 0.0, corner.length, cap, (1.0 - CORNER_SHARE) * acc)
+        return [*self._pieces[:-1], before, bent, replace(piece, start=bent.stop, begin=cut)]
 
     def _brake(self, acc_mm_s2: float, acc_rad_s2: float, now_s: float) -> None:
         """Come to rest on the path, never farther than the arm would have gone."""

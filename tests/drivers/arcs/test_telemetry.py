@@ -228,8 +228,11 @@ async def test_where_both_ways_are_silent_the_pose_goes_stale(rtde: RtdeServer, 
     cabinet.faults.clear()
 
 
-async def test_a_pose_that_is_none_ends_the_stream_not_the_arm(rtde: RtdeServer, make_arm: MakeArm, notices: list[str]):
-    rtde._outputs["R1_actual_TCP_pose"] = (1021, lambda: [None] * 6)
+async def test_a_pose_that_is_none_ends_the_stream_not_the_arm(
+    rtde: RtdeServer, make_arm: MakeArm, notices: list[str], monkeypatch: pytest.MonkeyPatch
+):
+    value, pose = rtde._value, "R1_actual_TCP_pose"
+    monkeypatch.setattr(rtde, "_value", lambda name, rest: [None] * 6 if name == pose else value(name, rest))
     arm = make_arm(rtde_port=rtde.port)
     assert (await arm.connect()).firmware.endswith("polling")
     assert len(notices) == 1

