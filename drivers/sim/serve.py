@@ -24,6 +24,7 @@ import os
 import signal
 import socket
 from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
+from contextlib import AbstractAsyncContextManager
 from pathlib import Path
 from typing import Any, ClassVar, cast
 
@@ -35,8 +36,6 @@ from brushloop.drivers.sim.rig import LOOPBACK_HEAD, LoopbackRig
 
 Person = Callable[[Mapping[str, object]], Awaitable[dict[str, Any]]]
 """Carries out a `hand` request. Raises ValueError, with a one-line message, for an invalid request."""
-MAX_LINE_BYTES = 8192
-MAX_CLIENTS = 16
 USAGE = (
     'not a request: {"do": "add", "fault": {...}}, or "list", "clear" (with a number "id" or without), '
     '"state", "release", "fresh-sheet", "hand"'
@@ -50,7 +49,6 @@ class ControlServer(LoopbackServer):
         super().__init__()
         self._rig = rig
         self._person = person
-        self._path: Path | None = None
 
     async def open(self, path: Path) -> None:
         """Listen at `path` for its owner alone; a socket of a rig that has ended is replaced. Raises `SimFileError`."""
@@ -61,44 +59,23 @@ class ControlServer(LoopbackServer):
         # Set before the path exists: another user could connect before a later `chmod`.
         mask = os.umask(0o177)
         try:
-            self._server = await asyncio.start_unix_server(self._serve, path, limit=MAX_LINE_BYTES)
+            self._server = await asyncio.start_unix_server(self._serve, path)
         except OSError as error:
             raise SimFileError(path, "", f"cannot listen here: {error.strerror or error}") from None
         finally:
             os.umask(mask)
-        self._path = path
-
-    async def stop(self) -> None:
-        """Close the listener and every client, and remove the socket."""
-        await super().stop()
-        path, self._path = self._path, None
-        if path is not None:
-            path.unlink(missing_ok=True)
 
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Answer line by line; an overlong line is answered, then the connection is closed."""
-        if self.clients > MAX_CLIENTS:
-            writer.write(_line(_error(f"more than {MAX_CLIENTS} clients")))
-            return
+        """Answer line by line."""
         while True:
+            line = await reader.readuntil(b"\n")
             try:
-                line = await reader.readuntil(b"\n")
-            except asyncio.LimitOverrunError:
-                writer.write(_line(_error(f"a line has at most {MAX_LINE_BYTES} bytes")))
-                return
-            writer.write(_line(await self.answer(line)))
+                answer = {"ok": True, **await self._obey(json.loads(line))}
+            except (ValueError, RecursionError) as error:
+                text = "not JSON" if isinstance(error, json.JSONDecodeError | RecursionError) else str(error)
+                answer = {"ok": False, "error": text.replace("\n", " ")[:500]}
+            writer.write(json.dumps(answer, separators=(",", ":")).encode() + b"\n")
             await writer.drain()
-
-    async def answer(self, line: bytes) -> dict[str, Any]:
-        """The answer to a request; never raises, whatever a client sends."""
-        try:
-            request: Any = json.loads(line)
-        except (ValueError, RecursionError):
-            return _error("not JSON")
-        try:
-            return {"ok": True, **await self._obey(request)}
-        except ValueError as error:
-            return _error(str(error))
 
     async def _obey(self, said: object) -> dict[str, Any]:
         request = cast("dict[str, Any]", said) if isinstance(said, dict) else {}
@@ -130,26 +107,21 @@ class ControlServer(LoopbackServer):
 @contextlib.asynccontextmanager
 async def live_control(rig: LoopbackRig, path: Path | None, person: Person | None = None) -> AsyncGenerator[None]:
     """A control socket at `path` until the block ends; none if `path` is None. Raises `SimFileError`."""
+    if path is None:
+        yield
+        return
     server = ControlServer(rig, person)
-    if path is not None:
-        await server.open(path)
+    await server.open(path)
     try:
         yield
     finally:
         await server.stop()
+        path.unlink(missing_ok=True)
 
 
 def _as_json(hung: Hung) -> dict[str, Any]:
     fault = hung.fault.model_dump(mode="json", exclude_defaults=True)
     return {"id": hung.ident, "fault": fault, "struck": hung.struck}
-
-
-def _error(text: str) -> dict[str, Any]:
-    return {"ok": False, "error": text.replace("\n", " ")[:500]}
-
-
-def _line(body: dict[str, Any]) -> bytes:
-    return json.dumps(body, separators=(",", ":")).encode() + b"\n"
 
 
 def _listens(path: Path) -> bool:
@@ -176,24 +148,28 @@ def serve(
     Raises `SimFileError` for a control socket that cannot be created, and rather than overwrite a file that no loopback
     rig wrote.
     """
+    if write_rig is not None:
+        _refuse_to_overwrite(write_rig)
+    rig = LoopbackRig(config)
 
-    async def served() -> None:
-        over = _signalled()
+    def announce() -> None:
         if write_rig is not None:
-            _refuse_to_overwrite(write_rig)
-        async with LoopbackRig(config) as rig, live_control(rig, control):
-            if write_rig is not None:
-                _write_whole(write_rig, rig.toml())
-            tell(f"{rig.where()}; Ctrl-C ends")
-            await _until_over(rig, over, idle_exit_s)
+            _write_whole(write_rig, rig.toml())
+        tell(f"{rig.where()}; Ctrl-C ends")
 
-    asyncio.run(served())
+    asyncio.run(_until_over(rig, rig, live_control(rig, control), idle_exit_s, announce))
+
+
+class LabRefused(Exception):
+    """No such lab can be served."""
+
+    exit_code: ClassVar[int] = 2
 
 
 def serve_unknown(
     seed: int, trap: str | None, rate: float, idle_exit_s: float, tell: Callable[..., None], control: Path | None
 ) -> None:
-    """Serve the unknown lab of this seed and print what a person sees there.
+    """Serve the unknown lab of this seed and print what a person reads there.
 
     Raises `LabRefused` for an unknown trap, and `SimFileError` for the control socket.
     """
@@ -204,37 +180,31 @@ def serve_unknown(
         raise LabRefused(f"--trap is {trap!r}, allowed: {', '.join(Trap)}")
     lab = UnknownLab(seed, None if trap is None else Trap(trap), rate=rate)
 
-    async def served() -> None:
-        over = _signalled()
-        async with lab, live_control(lab.rig, control, lab.obey):
-            how = [] if control is None else [f"hand      brushloop hand {control} bring pin"]
-            tell(*lab.labels(), *how, "Ctrl-C ends")
-            await _until_over(lab.rig, over, idle_exit_s)
+    def announce() -> None:
+        hand = [] if control is None else [f"hand      brushloop hand {control} bring pin"]
+        tell(*lab.labels(), *hand, "Ctrl-C ends")
 
-    asyncio.run(served())
+    asyncio.run(_until_over(lab, lab.rig, live_control(lab.rig, control, lab.obey), idle_exit_s, announce))
 
 
-def _signalled() -> asyncio.Event:
-    """An event that SIGINT (Ctrl-C) and SIGTERM set."""
+async def _until_over(
+    serving: AbstractAsyncContextManager[object],
+    rig: LoopbackRig,
+    controlled: AbstractAsyncContextManager[None],
+    idle_exit_s: float,
+    announce: Callable[[], None],
+) -> None:
+    """Serve until Ctrl-C, SIGTERM, or no client for `idle_exit_s`; SIGUSR1 changes the sheet."""
     over, loop = asyncio.Event(), asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, over.set)
-    return over
-
-
-async def _until_over(rig: LoopbackRig, over: asyncio.Event, idle_exit_s: float) -> None:
-    """Serve until the event is set or no client was connected for `idle_exit_s`; SIGUSR1 changes the sheet."""
-    asyncio.get_running_loop().add_signal_handler(signal.SIGUSR1, rig.world.fresh_sheet)
-    if idle_exit_s > 0:
-        idle = asyncio.create_task(rig.idle(idle_exit_s))
-        idle.add_done_callback(lambda _: over.set())
-    await over.wait()
-
-
-class LabRefused(Exception):
-    """No such lab can be served."""
-
-    exit_code: ClassVar[int] = 2
+    async with serving, controlled:
+        announce()
+        loop.add_signal_handler(signal.SIGUSR1, rig.world.fresh_sheet)
+        if idle_exit_s > 0:
+            idle = asyncio.create_task(rig.idle(idle_exit_s))
+            idle.add_done_callback(lambda _: over.set())
+        await over.wait()
 
 
 def _refuse_to_overwrite(path: Path) -> None:

@@ -23,7 +23,7 @@ from brushloop.drivers.sim.brush.spec import SimFileError
 from brushloop.drivers.sim.config import SimConfig, Table
 from brushloop.drivers.sim.faults import Device, Fault, FaultBoard, Phase, fault_of, phase_of
 from brushloop.drivers.sim.rig import LoopbackRig
-from brushloop.drivers.sim.serve import MAX_LINE_BYTES, ControlServer, live_control
+from brushloop.drivers.sim.serve import ControlServer, live_control
 from brushloop.drivers.sim.world import World
 from tests.drivers.sim.conftest import StoppedClock
 from tests.waiting import PATIENCE_S, wait_until
@@ -215,17 +215,15 @@ def path(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-async def control(rig: LoopbackRig, path: Path) -> AsyncIterator[ControlServer]:
-    server = ControlServer(rig)
-    await server.open(path)
-    yield server
-    await server.stop()
+async def control(rig: LoopbackRig, path: Path) -> AsyncIterator[Path]:
+    async with live_control(rig, path):
+        yield path
     assert not path.exists()
 
 
 @pytest.fixture
-async def ask(control: ControlServer, path: Path) -> AsyncIterator[Ask]:
-    reader, writer = await asyncio.open_unix_connection(str(path))
+async def ask(control: Path) -> AsyncIterator[Ask]:
+    reader, writer = await asyncio.open_unix_connection(str(control))
 
     async def exchange(request: object) -> dict[str, Any]:
         writer.write((request if isinstance(request, bytes) else json.dumps(request).encode()) + b"\n")
@@ -285,18 +283,8 @@ async def test_what_is_no_request_gets_one_line_and_the_next_is_answered(ask: As
     assert (await ask({"do": "state"}))["ok"]
 
 
-async def test_a_line_without_end_is_refused_and_hung_up_on(control: ControlServer, path: Path, ask: Ask):
-    reader, writer = await asyncio.open_unix_connection(str(path))
-    writer.write(b"x" * (4 * MAX_LINE_BYTES))
-    assert b"at most" in await reader.readline()
-    assert await reader.read() == b""
-    writer.close()
-    await writer.wait_closed()
-    assert (await ask({"do": "state"}))["ok"]
-
-
-async def test_only_its_owner_can_open_it(control: ControlServer, path: Path):
-    mode = path.stat().st_mode
+async def test_only_its_owner_can_open_it(control: Path):
+    mode = control.stat().st_mode
     assert stat.S_ISSOCK(mode)
     assert stat.S_IMODE(mode) == 0o600
 
