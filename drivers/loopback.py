@@ -1,4 +1,4 @@
-"""The loopback rig in a process of its own: for a notebook, a lab's tests and the demo; and requests to it.
+"""The loopback rig: started in a process of its own and asked from outside, and the base of its servers.
 
 A simulator needs an interpreter of its own: it keeps real time while the process that uses it computes. It also holds
 the simulated sheet, and the rig of a demo outlives the demo, so it is started as the command that serves it.
@@ -6,6 +6,10 @@ the simulated sheet, and the rig of a demo outlives the demo, so it is started a
 
 from __future__ import annotations
 
+import abc
+import asyncio
+import contextlib
+import ipaddress
 import json
 import signal
 import socket
@@ -14,10 +18,11 @@ import sys
 import tempfile
 import time
 from collections.abc import Generator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
+
+from brushloop.drivers.errors import ProtocolViolation
 
 START_S = 120.0
 """Longest start; a busy machine may need most of it."""
@@ -71,7 +76,7 @@ def start(config: Path, log: Path, *options: str, detached: bool = False) -> Loo
     return rig
 
 
-@contextmanager
+@contextlib.contextmanager
 def simulate(
     folder: Path | None = None, *, rate: float = RATE, seed: int = 1, brush: str = "loopback"
 ) -> Generator[LoopbackRig]:
@@ -134,3 +139,88 @@ def ask(path: Path, request: Mapping[str, object]) -> dict[str, Any]:
             raise FaultRefused(error)
         case _:
             raise FaultRefused(f"{path}: not the control socket of a rig")
+
+
+TURNS_TO_BEGIN = 3
+"""Turns of the event loop from accepting a connection to the first step of its task."""
+
+
+class NotLoopback(ValueError):
+    """A simulated device was asked to listen where other machines could reach it."""
+
+    exit_code: ClassVar[int] = 2
+
+    def __init__(self, host: str) -> None:
+        self.host = host
+        super().__init__(f"host = {host!r}: a loopback rig is served on a loopback address only, such as 127.0.0.1")
+
+
+class LoopbackServer(abc.ABC):
+    """A TCP server whose clients are tasks; `converse` speaks to one of them."""
+
+    def __init__(self) -> None:
+        self._server: asyncio.Server | None = None
+        self._clients: set[asyncio.Task[None]] = set()
+        self.port = 0
+
+    @abc.abstractmethod
+    async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Serve one client until it disconnects; may raise connection errors."""
+
+    async def start(self, host: str, port: int) -> None:
+        """Listen; with `port` 0 the system chooses `self.port`.
+
+        Raises `NotLoopback` unless `host` is a loopback address; a host name could resolve to any address.
+        """
+        if not _is_loopback(host):
+            raise NotLoopback(host)
+        self._server = await asyncio.start_server(self._serve, host, port)
+        self.port = self._server.sockets[0].getsockname()[1]
+
+    async def stop(self) -> None:
+        """Close the listener and every client."""
+        server, self._server = self._server, None
+        if server is not None:
+            # asyncio leaves a connection open that is accepted in the turn of the loop in which the server closes.
+            await asyncio.sleep(0)
+            server.close()
+            for _ in range(TURNS_TO_BEGIN):
+                await asyncio.sleep(0)
+            self.drop_clients()
+            await asyncio.gather(*self._clients, return_exceptions=True)
+            await server.wait_closed()
+
+    def drop_clients(self) -> None:
+        """Close every connection from the server's side."""
+        for task in list(self._clients):
+            task.cancel()
+
+    @property
+    def clients(self) -> int:
+        """Number of connected clients."""
+        return len(self._clients)
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        self._clients.add(task)
+        try:
+            await self.converse(reader, writer)
+        except (ConnectionError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
+            pass  # the client disconnected
+        except ProtocolViolation:
+            pass  # the client does not speak the protocol
+        except asyncio.CancelledError:
+            pass  # `stop`: the streams module would report a cancelled handler as an error
+        finally:
+            self._clients.discard(task)
+            writer.close()
+            with contextlib.suppress(ConnectionError, asyncio.CancelledError):
+                await writer.wait_closed()
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

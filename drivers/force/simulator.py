@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.force.sri_m8123 import BUS_OFF, COMMAND_ID, LOOPBACK_CHANNEL, START, STOP, Wrench, encode_round
-from brushloop.drivers.server import LoopbackServer
+from brushloop.drivers.loopback import LoopbackServer
 
 BUS_ERROR = 0x04
 """Class of an error frame: the controller has a problem but is on the bus."""

@@ -15,7 +15,7 @@ from brushloop.drivers.arcs.telemetry import MAX_MESSAGE_BYTES, PING, SET_RECIPE
 from brushloop.drivers.arcs.wire import BareDecoder, FrameDecoder, encode, named
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.geometry import to_wire
-from brushloop.drivers.server import LoopbackServer
+from brushloop.drivers.loopback import LoopbackServer
 from brushloop.drivers.sim.cabinet import Cabinet, methods
 from brushloop.drivers.sim.faults import KINDS, LOST, STOPS, Device, Fault, FaultBoard
 from brushloop.drivers.sim.motion import Rest

@@ -32,7 +32,7 @@ from brushloop.drivers.arcs.wire import AUBOPE_PORT
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL
 from brushloop.drivers.geometry import of_vector, product, turned, unit, vector
-from brushloop.drivers.server import LoopbackServer
+from brushloop.drivers.loopback import LoopbackServer
 from brushloop.drivers.sim.config import View
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 from brushloop.drivers.sim.kinematics import Joints, inverse, inverted, matrix_of

@@ -12,7 +12,7 @@ from brushloop.drivers.force.simulator import ForceBoard, SocketcandServer
 from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL, Wrench
 from brushloop.drivers.geometry import inverse, of_angles, product, turned
 from brushloop.drivers.ink.simulator import PtyLine, PumpFirmware, StationFirmware
-from brushloop.drivers.server import LoopbackServer
+from brushloop.drivers.loopback import LoopbackServer
 from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.faults import Device, FaultBoard

@@ -28,7 +28,7 @@ from contextlib import AbstractAsyncContextManager
 from pathlib import Path
 from typing import Any, ClassVar, cast
 
-from brushloop.drivers.server import LoopbackServer
+from brushloop.drivers.loopback import LoopbackServer
 from brushloop.drivers.sim.brush.spec import SimFileError
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.faults import Hung, fault_of

@@ -16,7 +16,7 @@ from brushloop.drivers.force import sri_m8123
 from brushloop.drivers.force.simulator import FRAME_S, ForceBoard, SocketcandServer
 from brushloop.drivers.force.sri_m8123 import COMMAND_ID, LOOPBACK_CHANNEL, START, ForceTable, SriM8123
 from brushloop.drivers.host import HostClock
-from brushloop.drivers.server import LoopbackServer, NotLoopback
+from brushloop.drivers.loopback import LoopbackServer, NotLoopback
 from brushloop.drivers.sim import rig as rig_module
 from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.config import SimConfig, View
