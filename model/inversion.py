@@ -6,7 +6,8 @@ mark lies from the zero-touch point.
 A fit starts at the press of a table whose area, position and spread are nearest to the image's: from the middle of the
 range it can end in a wrong local minimum. It then minimises -log likelihood = (N - P) / 2 log(r'r) + prior / 2, with r
 the image less the exact coverage that the model predicts, N pixels and P parameters. So the noise of a pixel is that of
-the fit itself, and a prior has the right weight at any noise.
+the fit itself. The prior counts as often as a square of `BLOCK_PX` has pixels, because they have one residual in common
+where the model is wrong: pixel by pixel, its misfit would outweigh what is known of the place, and move it and alpha.
 
 Intervals allow for residuals that are arbitrarily correlated within squares of `BLOCK_PX`, and independent between
 them: the sandwich (J'J)^-1 M (J'J)^-1 with M the sum over squares of (J'r)(J'r)' (K.-Y. Liang and S. Zeger, 1986). That
@@ -238,7 +239,8 @@ class _Fit:
         # The place may lie beyond the image on every side.
         limits = (inverter.within.depth_mm, inverter.within.tilt_deg, (-side, 2 * side), (-side, 2 * side))
         self._low, self._high = np.array(limits[:free]).T
-        self._precision = np.array([0.0, 0.0, *[1 / max(sigma, 1e-9) ** 2] * 2])[:free]
+        # Residuals are alike within a square, so that all of its pixels together count as one against the prior.
+        self._precision = BLOCK_PX**2 * np.array([0.0, 0.0, *[1 / max(sigma, 1e-9) ** 2] * 2])[:free]
         self._step, self._nudge = _STEP[:free], _NUDGE[:free]
         self._degrees = max(image.size - free, 1)
 
@@ -310,7 +312,8 @@ class _Fit:
         sums = blocks.reshape(len(jacobian), -1).astype(np.float64)
         # Only blocks on the boundary carry information: about as many as lie along two sides of the image.
         few = 2 * len(starts) / max(2 * len(starts) - 1, 1)
-        sandwich = bread @ (few * sums @ sums.T + noise**2 * np.diag(self._precision)) @ bread
+        prior = (noise * BLOCK_PX) ** 2 * np.diag(self._precision)
+        sandwich = bread @ (few * sums @ sums.T + prior) @ bread
         return np.maximum(np.diag(sandwich), noise * np.diag(bread))
 
     def _clipped(self, vector: Floats) -> Floats:

@@ -94,6 +94,14 @@ def test_an_uncertain_anchor_widens_the_interval_of_alpha() -> None:
     assert np.abs(nearly_sure.tilt_deg - sure.tilt_deg).max() < 0.01
 
 
+@pytest.mark.parametrize("other", [Brush(6.6, 48.0), Brush(6.0, 45.0)], ids=["wider", "shorter"])
+def test_the_misfit_of_a_model_does_not_move_a_place_that_is_known_and_so_not_alpha(other: Brush) -> None:
+    depth, tilt = np.array([13.0, 17.0, 20.0]), np.array([5.0, 10.0, 0.0])
+    recovered = UNSURE(drawn(depth, tilt, np.tile(ANCHOR, (3, 1)), model=stroke_models(other)["ccd-bsm"]), ANCHOR)
+    assert recovered.tilt_deg == pytest.approx(tilt, abs=1.0)
+    assert recovered.values[:, 2:] == pytest.approx(np.tile(ANCHOR, (3, 1)), abs=0.2)
+
+
 def test_flags_say_what_is_wrong() -> None:
     depth, tilt, place, images = anchored(1, 9)
     blank = INVERT(np.zeros_like(images), place)
