@@ -92,6 +92,8 @@ def test_killed_in_mid_collection_the_same_command_ends_with_every_stroke_exactl
     assert '<span class="source">loopback rig, brush made to agree with the paper&#39;s Table 2: no evidence' in page
     assert "not a result on paper" in page
     assert Path(printed[2]).is_file()
+    assert "pix2len" in (out / "demo.log").read_text()  # what the steps print does not drown the answer
+    assert "pix2len" not in ran.stdout
     report = load_report(Path(printed[1]).with_name("report.json"))
     rows = {row.label: row.scores for row in table_1(report)}
     assert rows.pop("another press") is rows.pop("ceiling") is None  # no cell was pressed twice

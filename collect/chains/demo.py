@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import socket
 import time
-from collections.abc import Callable
+import webbrowser
+from collections.abc import Callable, Generator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from brushloop.calibrate.commands import ValidateRequest, show_work
 from brushloop.calibrate.writing import PROTOCOL as WRITE
@@ -28,7 +31,12 @@ from brushloop.drivers.loopback import FaultRefused, LoopbackRig, ask, start
 from brushloop.model.generator import SHIPPED_GENERATOR
 from brushloop.sessions.terminal import say
 
+if TYPE_CHECKING:
+    from brushloop.calibrate.validate.command import ValidationOutput
+
 CHARACTER = "字"
+LOG, BAR = "demo.log", 40
+"""The file that gets what the steps print; length of a full bar, in characters."""
 IDLE_EXIT_S = 180.0
 """Longer than the evaluation between two collections takes on a busy computer."""
 FPS = 12
@@ -104,15 +112,16 @@ class Demo:
 
     def __init__(self, request: DemoRequest, size: Size) -> None:
         self._out, self._repeats, self._seed = request.out, request.repeats, request.seed
-        self._size = size
+        self._size, self._verbose = size, request.verbose
         self._protocol, self._sessions = self._out / "protocol.toml", self._out / "sessions"
         self._rig = DemoRig(request)
         self._session: Path
         """What the first step collects, for every later step."""
+        self._validated: ValidationOutput
         self._left_out = 0
 
     def run(self) -> None:
-        """Run every step, and print the paths of the report and of the recording.
+        """Run every step, and print how well the models predict the strokes, and where report and recording lie.
 
         A session without a report is continued; a new one is started only when the last one has its report. Raises
         `ConfigError`, `SessionError`, `CollectAborted`, and at the end `StrokesLeftOut` if some were left out.
@@ -123,16 +132,38 @@ class Demo:
         say(f"Demo on the loopback rig, all simulated: {len(steps)} steps.")
         began_s = time.monotonic()
         for number, (title, run) in enumerate(steps, 1):
-            say("", f"[{number}/{len(steps)}] {title}")
+            say(f"[{number}/{len(steps)}] {title} ...")
             step_began_s = time.monotonic()
-            run()
-            say(f"[{number}/{len(steps)}] done in {time.monotonic() - step_began_s:.0f} s")
+            with self._logged():
+                run()
+            say(f"  ✓   {time.monotonic() - step_began_s:.0f} s")
         self._rig.end()
-        session = self._session
+        from brushloop.calibrate.validate.findings import headline, verdict  # slow to import
+
+        session, report = self._session, self._validated.report
+        assert report is not None, "the demo presses"
+        say("", f"How much of the ink is predicted (average CSIM; {report.label}):")
+        for label, percent in headline(report):
+            say(f"  {label:30} {'█' * round(percent / 100 * BAR):{BAR}} {percent:.1f} %")
+        say(*verdict(report))
         say("", f"Done in {time.monotonic() - began_s:.0f} s, simulated: nothing here is a result on paper.")
         say(f"Report: {_report(session)}", f"MCAP:   {session / f'{session.name}.mcap'}")
         if self._left_out:
             raise StrokesLeftOut(self._left_out)
+
+    @contextmanager
+    def _logged(self) -> Generator[None]:
+        """Write what a step prints to demo.log, unless it is to be shown; an error says where to read on."""
+        if self._verbose:
+            yield
+            return
+        path = self._out / LOG
+        with path.open("a", encoding="utf-8") as log, redirect_stdout(log), redirect_stderr(log):
+            try:
+                yield
+            except Exception as error:
+                error.add_note(f"What was printed before is in {path}.")
+                raise
 
     def _steps(self) -> list[tuple[str, Callable[[], None]]]:
         """Title of each step, and what does the part of it that is not done yet."""
@@ -146,6 +177,11 @@ class Demo:
             *write,
             ("compare every model with every stroke", self._validate),
         ]
+
+    @property
+    def report(self) -> Path:
+        """The report's page."""
+        return _report(self._session)
 
     def _write_protocol(self) -> None:
         size = self._size
@@ -195,7 +231,8 @@ class Demo:
         command = f"brushloop validate {self._session} --generator {SHIPPED_GENERATOR}"
         say(f"$ {command}")
         places = (str(self._session),)
-        show_work(validate, ValidateRequest(places, command=command, generators=(SHIPPED_GENERATOR,)))
+        wanted = ValidateRequest(places, command=command, generators=(SHIPPED_GENERATOR,))
+        self._validated = show_work(validate, wanted)
 
     def _blank_sheet(self, protocol: Path) -> None:
         """Make the rig ready for the session of this protocol, with a blank sheet unless the session has begun."""
@@ -211,5 +248,8 @@ def _report(session: Path) -> Path:
 
 
 def demo(request: DemoRequest) -> None:
-    """Run the demo, as `Demo.run` does."""
-    Demo(request, FULL if request.full else QUICK).run()
+    """Run the demo, as `Demo.run` does, and open its report if that is asked."""
+    run = Demo(request, FULL if request.full else QUICK)
+    run.run()
+    if request.show:
+        webbrowser.open(run.report.resolve().as_uri())
