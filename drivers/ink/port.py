@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Annotated, Protocol, TypeVar, cast
+from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, Field
 
@@ -143,16 +143,6 @@ REPLUG = "Check cable, power and the path of the port, then connect again."
 T = TypeVar("T")
 
 
-class _Port(Protocol):
-    """The part of pyserial's API that is used; pyserial ships no types."""
-
-    @property
-    def in_waiting(self) -> int: ...
-    def read(self, size: int) -> bytes: ...
-    def write(self, data: bytes) -> int | None: ...
-    def close(self) -> None: ...
-
-
 class SerialPort:
     """Requests and replies over pyserial, without blocking the event loop."""
 
@@ -164,7 +154,8 @@ class SerialPort:
         self._baud = baud
         self._gap_s = gap_s
         self._worker: ThreadPoolExecutor | None = None
-        self._port: _Port | None = None
+        self._port: Any = None
+        """A `serial.Serial`; pyserial ships no types."""
         self._closing = threading.Event()
 
     async def open(self) -> None:
@@ -216,11 +207,10 @@ class SerialPort:
         import serial
 
         try:
-            port = serial.Serial(self._path, self._baud, timeout=POLL_S, write_timeout=1.0, exclusive=True)
+            self._port = serial.Serial(self._path, self._baud, timeout=POLL_S, write_timeout=1.0, exclusive=True)
         except (OSError, ValueError) as error:
             why = f"cannot open {self._path}: {error}"
             raise ConnectionLost(self._device, "connect", why, remedy=REPLUG) from None
-        self._port = cast("_Port", port)
 
     def _close(self) -> None:
         port, self._port = self._port, None

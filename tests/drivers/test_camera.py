@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import queue
 import re
 import threading
-import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -20,43 +19,69 @@ from numpy.typing import NDArray
 from brushloop.drivers import camera as camera_module
 from brushloop.drivers.camera import Backlog, CameraTable, FrameFault, Locked, OpenCvCamera, looked_at
 from brushloop.drivers.camera.source import JpegStream, is_repeated, open_source
-from brushloop.drivers.devices import Pose, Stamp
+from brushloop.drivers.devices import Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout
 from brushloop.drivers.host import HostClock
-from brushloop.drivers.sim.config import SimConfig, View
-from brushloop.drivers.sim.faults import ALWAYS, Fault, FaultBoard
 from brushloop.drivers.sim.rig import HOST
-from brushloop.drivers.sim.scene import MjpegServer, Scene, renumbered, torn
-from brushloop.drivers.sim.world import World
+from brushloop.drivers.sim.scene import black, renumbered, torn
 from tests.waiting import until
 
-CLOCK = HostClock()
+RNG = np.random.default_rng(0)
 
 
-BITS, BLOCK_PX = 64, 8
+def page(level: float = 220.0, noise: float = 2.0) -> np.ndarray:
+    return np.clip(RNG.normal(level, noise, (480, 640)), 0, 255).astype(np.uint8)
 
 
-class StampedScene(Scene):
-    """Its pictures have the time from which they are in their top rows: 64 black or white blocks."""
-
-    at_ns = 0
-
-    def tool(self) -> Pose:
-        self.at_ns = time.time_ns()
-        return super().tool()
-
-    def render(self, tool: Pose | None = None) -> NDArray[np.uint8]:
-        frame = super().render(tool).copy()
-        bits = [self.at_ns >> place & 1 for place in range(BITS)]
-        frame[: 2 * BLOCK_PX, : BITS * BLOCK_PX] = np.repeat(255 * np.array(bits, np.uint8), BLOCK_PX)
-        return frame
+def jpeg_of(image: np.ndarray) -> bytes:
+    return cv2.imencode(".jpg", image)[1].tobytes()
 
 
-def stamp_of(frame: NDArray[np.uint8]) -> int:
-    """The time in a picture, also after JPEG compression."""
-    row = frame[BLOCK_PX // 2 : BLOCK_PX * 3 // 2, : BITS * BLOCK_PX].mean(axis=0)
-    blocks = row.reshape(BITS, BLOCK_PX)[:, 2:-2].mean(axis=1) > 127
-    return sum(1 << place for place, bit in enumerate(blocks) if bit)
+class Feed:
+    """A source whose pictures a test hands over, and its clock: a picture comes a tenth of a second after the other."""
+
+    live, simulated = True, False
+    settings: ClassVar[dict[str, float]] = {}
+
+    def __init__(self) -> None:
+        self.t_ns = 10**12
+        self._pictures: queue.Queue[bytes | NDArray[np.uint8] | None] = queue.Queue()
+        self.released = threading.Event()
+
+    def now_ns(self) -> int:
+        return self.t_ns
+
+    def show(self, *pictures: bytes | NDArray[np.uint8] | None) -> None:
+        """These come next; None ends the stream."""
+        for picture in pictures:
+            self._pictures.put(picture)
+
+    def read(self) -> bytes | NDArray[np.uint8] | None:
+        picture = self._pictures.get()
+        self.t_ns += 100_000_000
+        return picture
+
+    def release(self) -> None:
+        self.released.set()
+
+
+@pytest.fixture
+def feed() -> Feed:
+    return Feed()
+
+
+@pytest.fixture
+def sources(feed: Feed, monkeypatch: pytest.MonkeyPatch) -> list[Feed]:
+    """What each opening finds; nothing where the list is empty."""
+    coming = [feed]
+
+    def opened(_: CameraTable) -> Feed:
+        if not coming:
+            raise ConnectionLost("camera", "open", "nothing there")
+        return coming.pop(0)
+
+    monkeypatch.setattr(camera_module, "open_source", opened)
+    return coming
 
 
 @pytest.fixture
@@ -65,134 +90,137 @@ def notices() -> list[str]:
 
 
 @pytest.fixture
-def faults(small_view: View) -> FaultBoard:
-    return FaultBoard(World(SimConfig(view=small_view)))
+async def camera(feed: Feed, sources: list[Feed], notices: list[str]) -> AsyncIterator[OpenCvCamera]:
+    """Connected, over a feed that has shown one picture; it gives up after a second."""
+    table = CameraTable(kind="opencv", source="rtsp://camera", latency_ms=0.0)
+    camera = OpenCvCamera(table, feed, notices.append)
+    feed.show(page())
+    await camera.connect()
+    assert camera._grabber is not None
+    camera._grabber._table = table.model_copy(update={"timeout_s": 1.0})
+    yield camera
+    feed.show(None)
+    await camera.close()
 
 
-@pytest.fixture
-async def stream(small_view: View, faults: FaultBoard) -> AsyncIterator[MjpegServer]:
-    server = MjpegServer(StampedScene(faults._world), replace(small_view, fps=15.0), faults)
-    await server.start(HOST, 0)
-    yield server
-    await server.stop()
+async def asked(camera: OpenCvCamera, feed: Feed) -> asyncio.Task[Any]:
+    """A question for a frame that is exposed after now."""
+    task = asyncio.create_task(camera.fresh(Stamp(feed.now_ns() + 1)))
+    await until(lambda: camera._grabber._condition._waiters, "the question")  # type: ignore[union-attr]
+    return task
 
 
 def camera_at(source: str, on_notice: Callable[[str], None] = lambda _text: None, **more: Any) -> OpenCvCamera:
     table = {"kind": "opencv", "source": source, "timeout_s": 60.0, **more}
-    return OpenCvCamera(CameraTable.model_validate(table), CLOCK, on_notice)
+    return OpenCvCamera(CameraTable.model_validate(table), HostClock(), on_notice)
 
 
-def url(server: MjpegServer) -> str:
-    return f"http://{HOST}:{server.port}/stream.mjpg"
-
-
-@pytest.fixture
-async def camera(stream: MjpegServer, notices: list[str]) -> AsyncIterator[OpenCvCamera]:
-    # A busy machine takes its time to draw a picture.
-    camera = camera_at(url(stream), notices.append, latency_ms=2000.0)
-    await camera.connect()
-    yield camera
-    await camera.close()
-
-
-async def seen_after(camera: OpenCvCamera, after_ns: int) -> int:
-    """When the frame that the driver hands over was really rendered."""
-    return stamp_of((await camera.fresh(Stamp(after_ns))).image)
-
-
-def impatient(camera: OpenCvCamera) -> None:
-    """From now on give up soon."""
-    assert camera._grabber is not None
-    camera._grabber._table = camera._grabber._table.model_copy(update={"timeout_s": 1.0})
-
-
-async def test_connecting_reports_the_size_and_the_first_frame_counts_from_when_the_camera_was_opened(
-    stream: MjpegServer,
-):
-    camera = camera_at(url(stream))
-    opened_ns = CLOCK.now_ns()
+async def test_the_first_frame_counts_from_when_the_camera_was_opened(feed: Feed, sources: list[Feed]):
+    opened_ns = feed.now_ns()
+    camera = OpenCvCamera(CameraTable(kind="opencv", source="rtsp://camera"), feed)
+    feed.show(page())
     identity = await camera.connect()
-    connected_ns = CLOCK.now_ns()
-    assert "640x480" in identity.model
-    assert identity.simulated  # the loopback camera says so itself
-    first = await camera.fresh(Stamp(0))
-    if first.stamp.seq == 0:
-        assert opened_ns <= first.exposed_after_ns + 250_000_000 <= connected_ns
-        assert first.exposed_after_ns <= stamp_of(first.image)
+    assert (identity.model, identity.simulated) == ("rtsp://camera 640x480", False)
+    assert (await camera.fresh(Stamp(0))).exposed_after_ns == opened_ns - 250_000_000
+    feed.show(None)
     await camera.close()
 
 
-async def test_no_frame_is_ever_older_than_asked_right_after_connecting_and_after_a_pause(camera: OpenCvCamera):
-    for pause_s in (0.0, 0.0, 2.0):
-        await asyncio.sleep(pause_s)
-        asked_ns = CLOCK.now_ns()
-        frame = await camera.fresh(Stamp(asked_ns))
-        assert stamp_of(frame.image) >= asked_ns
-        assert frame.exposed_after_ns >= asked_ns
+async def test_a_frame_is_never_older_than_asked_by_the_camera_s_latency(feed: Feed, sources: list[Feed]):
+    camera = OpenCvCamera(CameraTable(kind="opencv", source="rtsp://camera", latency_ms=250.0), feed)
+    feed.show(page())
+    await camera.connect()
+    pictures = [page() for _ in range(4)]
+    asked_ns = feed.now_ns()
+    waiting = asyncio.create_task(camera.fresh(Stamp(asked_ns)))
+    feed.show(*pictures)
+    frame = await waiting
+    assert frame.exposed_after_ns >= asked_ns
+    assert any(np.array_equal(frame.image, picture) for picture in pictures[2:])
+    feed.show(None)
+    await camera.close()
+
+
+async def test_a_frame_is_decoded_only_when_somebody_looks(
+    camera: OpenCvCamera, feed: Feed, monkeypatch: pytest.MonkeyPatch
+):
+    looks: list[object] = []
+    monkeypatch.setattr(camera_module, "looked_at", lambda picture: (looks.append(picture), looked_at(picture))[1])
+    jpegs = [jpeg_of(page()) for _ in range(5)]
+    feed.show(*jpegs)
+    await until(lambda: camera._grabber._newest.picture is jpegs[-1], "the pictures")  # type: ignore[union-attr]
+    assert not looks
+    await camera.fresh(Stamp(0))
+    assert looks == jpegs[-1:]
 
 
 async def test_a_stream_that_ends_is_opened_again_and_both_are_reported(
-    stream: MjpegServer, camera: OpenCvCamera, notices: list[str], small_view: View
+    camera: OpenCvCamera, feed: Feed, sources: list[Feed], notices: list[str]
 ):
-    await stream.stop()
+    feed.show(None)
     await until(lambda: notices, "the end of the stream")
-    impatient(camera)
     with pytest.raises(DeviceTimeout, match="the stream ended and is opened again"):
-        await camera.fresh(Stamp(CLOCK.now_ns()))
-    second = MjpegServer(stream._scene, replace(small_view, fps=15.0))
-    await second.start(HOST, stream.port)
+        await camera.fresh(Stamp(feed.now_ns() + 1))
+    second = Feed()
+    sources.append(second)
     await until(lambda: len(notices) == 2, "the stream to be opened")
-    asked_ns = CLOCK.now_ns()
-    camera._grabber._table = camera._table  # type: ignore[union-attr]
-    assert await seen_after(camera, asked_ns) >= asked_ns
+    second.show(picture := page())
+    await until(lambda: camera._grabber._newest.picture is picture, "a picture")  # type: ignore[union-attr]
+    assert np.array_equal((await camera.fresh(Stamp(0))).image, picture)
     assert notices[0] == "camera: the stream ended and is opened again"
     assert notices[1].startswith("camera is back after")
-    await camera.close()
-    await second.stop()
+    second.show(None)
+
+
+SOUND = jpeg_of(page())
 
 
 @pytest.mark.parametrize(
-    ("kind", "words"),
+    ("pictures", "words"),
     [
-        ("black", r"\(The picture is black: lens covered or light off\? frames skipped: .*\d+ black"),
-        ("frozen", r"\(frames skipped: .*\d+ frozen"),
-        ("torn", r"\(frames skipped: .*\d+ torn"),
+        ([black(SOUND)], "(The picture is black: lens covered or light off? frames skipped: 1 black)"),
+        ([torn(SOUND), torn(SOUND)[:-9]], "(frames skipped: "),
+        ([SOUND, renumbered(SOUND, 1), renumbered(SOUND, 2)], "(frames skipped: 2 frozen)"),
     ],
+    ids=["black", "torn", "frozen"],
 )
 async def test_frames_that_are_no_picture_are_a_timeout_that_names_them_and_then_it_goes_on(
-    stream: MjpegServer, faults: FaultBoard, kind: str, words: str
+    camera: OpenCvCamera, feed: Feed, pictures: list[bytes], words: str
 ):
-    camera = camera_at(url(stream), latency_ms=0.0)
-    await camera.connect()
-    ident = faults.hang(Fault.model_validate({"device": "camera", "kind": kind, "count": ALWAYS}))
-    impatient(camera)
-    said = ""
-    while kind not in said:
-        try:
-            await camera.fresh(Stamp(CLOCK.now_ns()))
-        except DeviceTimeout as error:
-            said = str(error)
-    assert re.search(words, said)
-    faults.take(ident)
-    camera._grabber._table = camera._table  # type: ignore[union-attr]
-    asked_ns = CLOCK.now_ns()
-    assert (await camera.fresh(Stamp(asked_ns))).exposed_after_ns >= asked_ns
-    await camera.close()
+    waiting = await asked(camera, feed)
+    if len(pictures) == 3:
+        feed.show(pictures.pop(0))
+        await waiting
+        waiting = await asked(camera, feed)
+    feed.show(*pictures)
+    with pytest.raises(DeviceTimeout, match=re.escape(words)):
+        await waiting
+    waiting = await asked(camera, feed)
+    feed.show(picture := page())
+    assert np.array_equal((await waiting).image, picture)
 
 
-async def test_a_picture_that_comes_again_is_not_taken_for_new_even_once(faults: FaultBoard, camera: OpenCvCamera):
-    for _ in range(2):
-        faults.hang(Fault.model_validate({"device": "camera", "kind": "frozen", "count": 4}))
-        asked_ns = CLOCK.now_ns()
-        assert await seen_after(camera, asked_ns) >= asked_ns
-
-
-async def test_closing_never_hands_an_old_frame_to_whoever_still_waits(camera: OpenCvCamera):
-    waiting = asyncio.create_task(camera.fresh(Stamp(CLOCK.now_ns() + 3600 * 10**9)))
-    await asyncio.sleep(0.1)
+async def test_closing_never_hands_an_old_frame_to_whoever_still_waits(camera: OpenCvCamera, feed: Feed):
+    waiting = await asked(camera, feed)
+    feed.show(None)
     await camera.close()
     with pytest.raises(ConnectionLost, match="closed while waiting"):
         await waiting
+
+
+async def test_a_read_that_hangs_beyond_the_end_of_its_connection_gives_the_next_one_no_frame(
+    camera: OpenCvCamera, feed: Feed, sources: list[Feed], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(camera_module, "JOIN_S", 0.01)
+    await camera.close()
+    second = Feed()
+    second.show(picture := page())
+    sources.append(second)
+    await camera.connect()
+    feed.show(page(), None)
+    await asyncio.to_thread(feed.released.wait)
+    assert np.array_equal((await camera.fresh(Stamp(0))).image, picture)
+    second.show(None)
 
 
 async def test_a_server_that_says_nothing_is_given_up():
@@ -209,53 +237,7 @@ async def test_a_server_that_says_nothing_is_given_up():
         over.set()
 
 
-class OneFrame:
-    """A source that gives one frame of this brightness, and a second one, 40 levels lighter, once it is let go."""
-
-    live, simulated = True, True
-    settings: ClassVar[dict[str, float]] = {}
-
-    def __init__(self, level: int) -> None:
-        self._level = level
-        self._reads = 0
-        self.let_go, self.released = threading.Event(), threading.Event()
-
-    def read(self) -> np.ndarray | None:
-        self._reads += 1
-        if self._reads > 1:
-            self.let_go.wait()
-        noise = np.random.default_rng(self._reads).integers(0, 20, (48, 64), np.uint8)
-        return noise + np.uint8(self._level + 40 * (self._reads - 1)) if self._reads < 3 else None
-
-    def release(self) -> None:
-        self.released.set()
-
-
-async def test_a_read_that_hangs_beyond_the_end_of_its_connection_gives_the_next_one_no_frame(
-    monkeypatch: pytest.MonkeyPatch,
-):
-    before, after = OneFrame(50), OneFrame(150)
-    sources = iter([before, after])
-    monkeypatch.setattr(camera_module, "open_source", lambda _table: next(sources))
-    monkeypatch.setattr(camera_module, "JOIN_S", 0.01)
-    camera = camera_at("rtsp://camera")
-    await camera.connect()
-    await camera.close()
-    await camera.connect()
-    before.let_go.set()
-    await asyncio.to_thread(before.released.wait)
-    assert (await camera.fresh(Stamp(0))).image.mean() > 140
-    after.let_go.set()
-    await camera.close()
-
-
 # ---------------------------------------------------------------- one frame after the other
-
-RNG = np.random.default_rng(0)
-
-
-def page(level: float = 220.0, noise: float = 2.0) -> np.ndarray:
-    return np.clip(RNG.normal(level, noise, (480, 640)), 0, 255).astype(np.uint8)
 
 
 def inked() -> np.ndarray:
@@ -289,7 +271,7 @@ def test_one_frame_is_judged_by_what_it_shows(image: np.ndarray, fault: FrameFau
 
 def test_a_jpeg_is_the_same_picture_in_gray_and_one_that_is_cut_off_is_torn(capfd: pytest.CaptureFixture[str]) -> None:
     colours = np.dstack([page(200.0), page(100.0), page(150.0)])
-    jpeg = cv2.imencode(".jpg", colours)[1].tobytes()
+    jpeg = jpeg_of(colours)
     seen = looked_at(jpeg)
     assert isinstance(seen, np.ndarray)
     assert np.abs(seen.astype(float) - cv2.cvtColor(colours, cv2.COLOR_BGR2GRAY)).mean() < 3.0
@@ -300,7 +282,7 @@ def test_a_jpeg_is_the_same_picture_in_gray_and_one_that_is_cut_off_is_torn(capf
 
 
 def test_a_picture_is_the_one_before_where_only_what_a_jpeg_says_about_itself_has_changed() -> None:
-    jpeg, other = (cv2.imencode(".jpg", page())[1].tobytes() for _ in range(2))
+    jpeg, other = jpeg_of(page()), jpeg_of(page())
     assert is_repeated(renumbered(jpeg, 7), jpeg)
     assert not is_repeated(other, jpeg)
     assert not is_repeated(jpeg, None)
@@ -340,7 +322,7 @@ async def serving(answer: bytes) -> AsyncIterator[str]:
 
 
 MULTIPART = b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=b\r\n\r\n"
-JPEG = cv2.imencode(".jpg", page())[1].tobytes()
+JPEG = jpeg_of(page())
 PART = b"--b\r\nContent-Type: image/jpeg\r\ncontent-length: %d\r\n\r\n" % len(JPEG) + JPEG + b"\r\n"
 
 
@@ -387,7 +369,7 @@ async def test_a_file_that_is_missing_or_over_is_a_lost_connection(tmp_path: Pat
     camera = camera_at(str(path))
     await camera.connect()
     with pytest.raises(ConnectionLost, match="ended"):
-        await camera.fresh(Stamp(CLOCK.now_ns() + 3600 * 10**9))
+        await camera.fresh(Stamp(HostClock().now_ns() + 3600 * 10**9))
     await camera.close()
 
 
