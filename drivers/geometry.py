@@ -4,8 +4,7 @@ In plain floats, for single poses at the pace of a control loop: scipy's `Rotati
 (tests/drivers/test_geometry.py), but spends 30 to 300 us on a call, most of it on finding out what it was given. Use it
 for arrays of rotations.
 
-Formulas as in scipy: J. Diebel, Representing Attitude (2006); Euler angles after E. Bernardes and S. Viollet,
-PLoS ONE 17 (2022) e0276302.
+Formulas: J. Diebel, Representing Attitude (2006).
 """
 
 from __future__ import annotations
@@ -19,8 +18,6 @@ from brushloop.drivers.devices import Pose
 
 Quaternion = tuple[float, float, float, float]
 Vector = tuple[float, float, float]
-SMALL_RAD = 1e-3
-"""Below this angle, sin(angle / 2) / angle is its Taylor series."""
 
 
 def unit(q: Quaternion) -> Quaternion:
@@ -86,17 +83,15 @@ def of_vector(turn_rad: Vector) -> Quaternion:
     """The rotation about `turn_rad` by its length."""
     x, y, z = turn_rad
     angle = math.sqrt(x * x + y * y + z * z)
-    small = angle <= SMALL_RAD
-    share = 0.5 - angle**2 / 48.0 + angle**4 / 3840.0 if small else math.sin(angle / 2.0) / angle
+    share = math.sin(angle / 2.0) / angle if angle > 0.0 else 0.5
     return share * x, share * y, share * z, math.cos(angle / 2.0)
 
 
 def vector(q: Quaternion) -> Vector:
-    """The inverse of `of_vector`; its length is at most pi."""
+    """The inverse of `of_vector`, of a unit quaternion; its length is at most pi."""
     x, y, z, w = q if q[3] >= 0.0 else (-q[0], -q[1], -q[2], -q[3])
-    angle = 2.0 * math.atan2(math.sqrt(x * x + y * y + z * z), w)
-    small = angle <= SMALL_RAD
-    share = 2.0 + angle**2 / 12.0 + 7.0 * angle**4 / 2880.0 if small else angle / math.sin(angle / 2.0)
+    sine = math.sqrt(x * x + y * y + z * z)
+    share = 2.0 * math.atan2(sine, w) / sine if sine > 0.0 else 2.0
     return share * x, share * y, share * z
 
 
@@ -108,31 +103,18 @@ def angle_rad(q: Quaternion) -> float:
 
 def of_angles(rx: float, ry: float, rz: float) -> Quaternion:
     """Rz(rz) Ry(ry) Rx(rx), angles in rad."""
-    about_x = (math.sin(rx / 2.0), 0.0, 0.0, math.cos(rx / 2.0))
-    about_y = (0.0, math.sin(ry / 2.0), 0.0, math.cos(ry / 2.0))
-    about_z = (0.0, 0.0, math.sin(rz / 2.0), math.cos(rz / 2.0))
+    about_x, about_y, about_z = of_vector((rx, 0.0, 0.0)), of_vector((0.0, ry, 0.0)), of_vector((0.0, 0.0, rz))
     return product(product(about_z, about_y), about_x)
 
 
 def angles(q: Quaternion) -> Vector:
     """(rx, ry, rz) in rad, the inverse of `of_angles`; rx is 0 where ry is a right angle and leaves it undetermined."""
-    x, y, z, w = q
-    a, b, c, d = w - y, x + z, y + w, z - x
-    ry = 2.0 * math.atan2(math.hypot(c, d), math.hypot(a, b))
-    half_sum, half_difference = math.atan2(b, a), math.atan2(d, c)
-    if ry <= 1e-7:
-        rx, rz = 0.0, 2.0 * half_sum
-    elif math.pi - ry <= 1e-7:
-        rx, rz = 0.0, 2.0 * half_difference
-    else:
-        rx, rz = half_sum - half_difference, half_sum + half_difference
-    return _wrapped(rx), _wrapped(ry - math.pi / 2.0), _wrapped(rz)
-
-
-def _wrapped(angle: float) -> float:
-    if angle < -math.pi:
-        return angle + math.tau
-    return angle - math.tau if angle > math.pi else angle
+    (xx, xy, xz), (yx, yy, yz), (_, _, zz) = columns(q)
+    level = math.hypot(xx, xy)
+    ry = math.atan2(-xz, level)
+    if level < 1e-7:
+        return 0.0, ry, math.atan2(-yx, yy)
+    return math.atan2(yz, zz), ry, math.atan2(xy, xx)
 
 
 DOWN = of_vector((math.pi, 0.0, 0.0))

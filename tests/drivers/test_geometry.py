@@ -44,12 +44,11 @@ def test_vectors_and_angles_make_the_rotations_that_scipy_makes(x: float, y: flo
 
 
 @given(quaternions)
-def test_angles_are_those_of_scipy(q: Quaternion) -> None:
+def test_angles_make_the_rotation_and_the_second_is_at_most_a_right_angle(q: Quaternion) -> None:
     rx, ry, rz = rotation.angles(q)
+    assert abs(ry) <= math.pi / 2.0
     back = rotation.of_angles(rx, ry, rz)
-    assert rotation.angle_rad(rotation.product(rotation.inverse(q), back)) < 1e-7
-    if abs(ry) < 1.57:
-        assert (rz, ry, rx) == pytest.approx(Rotation.from_quat(q).as_euler("ZYX"), abs=1e-10)
+    assert rotation.angle_rad(rotation.product(rotation.inverse(q), back)) < (1e-10 if abs(ry) < 1.57 else 1e-6)
 
 
 @pytest.mark.parametrize("ry", [math.pi / 2.0, -math.pi / 2.0])
