@@ -20,8 +20,8 @@ import asyncio
 import contextlib
 import json
 import math
-from collections import deque
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections import defaultdict, deque
+from collections.abc import Callable, Generator, Sequence
 from typing import Any, NoReturn
 
 import cbor2
@@ -42,20 +42,6 @@ GREETING_END = b"}\n\n"
 MAX_GREETING_BYTES = 256 * 1024
 MAX_MESSAGE_BYTES = 64 * 1024
 MAX_DEPTH = 16
-
-
-class _NoTags(Mapping[int, Any]):
-    """Refuses every tag. Poses and modes need none, and a tagged regular expression of 64 KiB takes
-    cbor2 half a minute to compile, a tagged big decimal half a second."""
-
-    def __getitem__(self, tag: int) -> Any:
-        return _refuse
-
-    def __iter__(self) -> Iterator[int]:
-        return iter(())
-
-    def __len__(self) -> int:
-        return 1
 
 
 def _refuse(*_: object) -> NoReturn:
@@ -98,8 +84,10 @@ def decode_message(payload: bytes, device: str) -> tuple[int, list[Any]]:
         if payload.startswith(b"["):
             message: Any = json.loads(payload)
         else:
+            # Poses and modes need no tags, and a tagged regular expression of 64 KiB takes half a minute to compile.
+            no_tags = defaultdict(lambda: _refuse, {0: _refuse})
             message = cbor2.loads(
-                payload, semantic_decoders=_NoTags(), tag_hook=_refuse, max_depth=MAX_DEPTH, strict_hashable_types=True
+                payload, semantic_decoders=no_tags, tag_hook=_refuse, max_depth=MAX_DEPTH, strict_hashable_types=True
             )
     except Exception as error:  # the decoders may raise anything
         raise ProtocolViolation(device, "decode", f"neither CBOR nor JSON: {error}") from None
