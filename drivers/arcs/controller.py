@@ -4,8 +4,6 @@
 
 MotionError
  +-- WrongOperationalMode   the pendant's mode switch is not on Automatic
- +-- MotionRefused
- |    +-- QueueFull         another client fills the controller's queue
  +-- MotionFailed
       +-- OutOfReach        accepted, then failed in planning: messages 30047 and 30048
 """
@@ -130,10 +128,6 @@ class WrongOperationalMode(MotionError):
     def __init__(self, device: str, op: str, mode: str) -> None:
         self.mode = mode
         super().__init__(device, op, f"operational mode is {mode}")
-
-
-class QueueFull(MotionRefused):
-    """The controller's queue has no room, although this driver queues few lines and waits."""
 
 
 class OutOfReach(MotionFailed):
@@ -301,9 +295,8 @@ def accepted(op: str, code: object) -> None:
         raise NotPowered(DEVICE, op)
     if code not in (ReturnCode.OK, ReturnCode.REQUEST_IGNORED):
         known = next((member for member in ReturnCode if member == abs(code)), None)
-        error = QueueFull if code == ReturnCode.QUEUE_FULL else MotionRefused
         name, remedy = ("UNKNOWN", "") if known is None else (known.name, REFUSAL_REMEDY.get(known, ""))
-        raise error(DEVICE, op, code, name, remedy)
+        raise MotionRefused(DEVICE, op, code, name, remedy)
 
 
 # ---------------------------------------------------------------- a transcript of questions that change nothing

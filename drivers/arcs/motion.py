@@ -19,7 +19,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from brushloop.drivers.arcs.controller import Controller, OutOfReach, QueueFull
+from brushloop.drivers.arcs.controller import Controller, OutOfReach, ReturnCode
 from brushloop.drivers.arcs.wire import DEVICE
 from brushloop.drivers.devices import Pose, QueuedLine
 from brushloop.drivers.errors import (
@@ -28,6 +28,7 @@ from brushloop.drivers.errors import (
     DeviceTimeout,
     MotionError,
     MotionFailed,
+    MotionRefused,
     PathDisturbed,
     ProtocolViolation,
 )
@@ -149,7 +150,7 @@ class Messages:
 
 
 MOST_QUEUED = 16
-"""Lines that the controller holds at a time. The queue of a real cabinet is not documented; see `QueueFull` below."""
+"""Lines that the controller holds at a time. The queue of a real cabinet is not documented; see `QUEUE_FULL` below."""
 EMPTY = (-1, 0)
 LEAST_BLEND_MM = 1.0
 """ARCS takes 0 or 1 mm to 1 m."""
@@ -213,11 +214,11 @@ async def feed(
             leg = legs[sent]
             try:
                 await controller.move_line(leg.target, leg.speed_mm_s, acc_mm_s2, leg.blend_mm)
-            except QueueFull:
-                # Refused, so it may be sent again: the controller holds fewer lines than assumed. A controller that
-                # still refuses with nothing queued ends below, as an arm that does not advance.
-                if sent == 0:
-                    raise  # none of them is ours
+            except MotionRefused as refusal:
+                if refusal.code != ReturnCode.QUEUE_FULL or sent == 0:  # then none of those in the queue is ours
+                    raise
+                # It may be sent again: the controller holds fewer lines than assumed. A controller that still refuses
+                # with nothing queued ends below, as an arm that does not advance.
                 break
             sent, room = sent + 1, room - 1
         if sent == len(legs):

@@ -24,11 +24,6 @@ def test_the_host_clock_goes_on_when_wall_time_is_set_back(monkeypatch: pytest.M
     assert readings[-1] - before < 10**9
 
 
-def test_the_simulated_clock_runs_at_its_rate():
-    readings = iter([10.0, 10.5])
-    assert SimClock(100.0, lambda: next(readings)).now_s() == 50.0
-
-
 @pytest.mark.parametrize("rate", [0.0, -1.0, 1000.1, float("nan")])
 def test_a_rate_that_makes_no_sense_is_refused(rate: float):
     with pytest.raises(ValueError, match="rate"):

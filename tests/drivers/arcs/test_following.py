@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 
 from brushloop.drivers.arcs import motion as queueing
-from brushloop.drivers.arcs.controller import QueueFull
 from brushloop.drivers.arcs.motion import legs_of
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.devices import Pose, QueuedLine
@@ -186,7 +185,7 @@ async def test_a_controller_that_holds_few_lines_is_fed_as_it_takes_them(arm: Au
 @pytest.mark.parametrize(
     ("accepted", "code", "error", "words"),
     [
-        (0, 2, QueueFull, "Another client"),
+        (0, 2, MotionRefused, "Another client"),
         (3, 2, MotionFailed, "does not advance"),
         (5, -5, MotionRefused, "refused with -5"),
     ],

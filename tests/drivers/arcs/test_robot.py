@@ -25,7 +25,7 @@ from brushloop.drivers.errors import (
 )
 from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.sim.arcs_server import ArcsServer
-from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
+from brushloop.drivers.sim.faults import ALWAYS, Fault
 from tests.drivers.failing import mute_to
 from tests.waiting import until
 
@@ -134,13 +134,6 @@ async def test_one_bad_reply_ends_the_move_with_its_name_and_the_arm_rests_on_it
     assert to_go_mm(cabinet) == left_mm
 
 
-async def test_a_line_that_never_arrives_is_a_timeout_and_nothing_has_moved(arm: AuboArcs, cabinet: ArcsServer):
-    cabinet.faults.hang(Fault(device=Device.ROBOT, kind="deaf", on="moveLine"))
-    with pytest.raises(DeviceTimeout, match="moveLine"):
-        await arm.move(FAR, **SLOW)
-    assert to_go_mm(cabinet) == pytest.approx(200.0)
-
-
 @pytest.mark.parametrize("kind", ["mute", "deaf"])
 async def test_a_controller_that_falls_silent_is_reported_as_an_arm_that_may_still_move(
     arm: AuboArcs, cabinet: ArcsServer, kind: str
@@ -216,20 +209,6 @@ async def comes_to_rest(cabinet: ArcsServer) -> bool:
     """Within 0.1 s the arm rests, far from its target and not back at its start."""
     await asyncio.sleep(0.1)
     return at_rest(cabinet) and 100.0 < to_go_mm(cabinet) < 199.0
-
-
-async def test_a_stop_in_mid_move_stops_the_arm_well_short_and_the_move_fails(
-    arm: AuboArcs, cabinet: ArcsServer, move: asyncio.Task[None]
-):
-    await arm.stop()
-    await arm.stop()
-    assert await comes_to_rest(cabinet)
-    with pytest.raises(MotionError, match="from the target"):
-        await move
-    x, y, z = cabinet.cabinet.world.tool().position_mm
-    step = brush_pose(x, y + 1.5, z)
-    await arm.move(step, speed_mm_s=100.0, acc_mm_s2=800.0)
-    assert distance(cabinet.cabinet.world.tool(), step)[0] < 0.05
 
 
 async def test_a_stop_is_fine_in_a_protective_stop(arm: AuboArcs, cabinet: ArcsServer):
