@@ -12,24 +12,21 @@ from typing import Any
 from pydantic import TypeAdapter
 from rich.console import Group
 from rich.table import Table
-from rich.text import Text
 
 from brushloop.collect.motion import Path as MotionPath
 from brushloop.collect.motion import park_moves
-from brushloop.collect.planning.walk import StepMoves, Walked, marks_of, poses_of, sheet_of, walk
+from brushloop.collect.planning.walk import StepMoves, Walked, poses_of, sheet_of, walk
 from brushloop.collect.protocols.config import ProtocolConfig
-from brushloop.collect.protocols.steps import Drawn, DrawStep, Planned, PressStep, TouchStep
+from brushloop.collect.protocols.steps import Drawn, DrawStep, PressStep, TouchStep
 from brushloop.collect.rig.check import BLUE, GREY, ORANGE, Axes, finish, from_above, shown_name
-from brushloop.collect.rig.config import BrushConfig, RigConfig
+from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import limits_of
-from brushloop.collect.rig.paper import Patch, Sheet, to_base
+from brushloop.collect.rig.paper import Sheet, to_base
 from brushloop.collect.touch.selfcheck import partners
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import distance
 from brushloop.drivers.limits import Limits
-from brushloop.model.ccdbsm import basic_lengths
 from brushloop.sessions.events import Press
-from brushloop.sessions.records import Condition
 
 SETTLE_S = 0.12
 """Time from the end of a ramp to the next command: the controller's lag in reporting rest, half a poll, the calls.
@@ -85,16 +82,6 @@ def step_s(config: RigConfig, here: Pose, moves: StepMoves) -> tuple[float, Pose
     return total_s, here
 
 
-def reach_of(brush: BrushConfig, condition: Condition) -> tuple[float, float, float]:
-    """How far a mark reaches from its zero-touch point in mm: along the heading, against it, and to either side.
-
-    Estimated by the stroke model as published (Eq. 1-5, lambda = pi): good for a warning, not a measurement.
-    """
-    depth_mm, alpha = max(condition.depth_mm, 0.0), math.radians(condition.tilt_deg)
-    o3a, o3c, o4o3 = basic_lengths(depth_mm, alpha, brush.radius_mm, brush.length_mm, math)
-    return o3a, o4o3, math.pi * o3c
-
-
 @dataclass(frozen=True, slots=True)
 class Plan:
     """Steps, strokes, sheets, ink and time of a protocol."""
@@ -116,7 +103,6 @@ class Plan:
     seconds_by_kind: dict[str, float]
     touches_mm: tuple[tuple[float, float], ...]
     """Touch points in the paper frame, those of zero touch first."""
-    warnings: tuple[str, ...]
 
     def as_json(self) -> dict[str, Any]:
         """Return every field, to be written as JSON."""
@@ -165,7 +151,6 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
         seconds=sum(seconds.values()),
         seconds_by_kind=seconds,
         touches_mm=tuple(dict.fromkeys(touches)),
-        warnings=tuple(_warnings(config, protocol, sheet)),
     )
 
 
@@ -177,37 +162,12 @@ def _wait_s(config: RigConfig, protocol: ProtocolConfig, here: Pose, walked: Wal
     return max(0.0, protocol.wait_after_dip_s - over_s)
 
 
-def _warnings(config: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> list[str]:
-    first_round = [stroke for stroke in protocol.planned() if stroke.repeat == 1]
-    overhangs = [(_overhang_mm(config.brush, stroke, sheet.patch(0)), stroke.stroke_id) for stroke in first_round]
-    over_mm, stroke_id = max(overhangs, default=(0.0, ""))
-    if over_mm <= 0.0:
-        return []
-    return [
-        f"{stroke_id} may reach {over_mm:.1f} mm beyond its patch of {sheet.cell_mm[0]:g} x {sheet.cell_mm[1]:g} mm, "
-        "by the closed-form stroke model: marks may run into each other"
-    ]
-
-
-def _overhang_mm(brush: BrushConfig, stroke: Planned, patch: Patch) -> float:
-    """How far the mark of a press, or half the width of a drawn line to either side of it, reaches beyond the patch."""
-    beyond_mm: list[float] = []
-    for x_mm, y_mm, asked in marks_of(stroke, patch):
-        ahead_mm, behind_mm, side_mm = reach_of(brush, asked)
-        if stroke.drawn is not None:
-            ahead_mm = behind_mm = side_mm
-        right_mm, up_mm = x_mm - patch.x_mm, y_mm - patch.y_mm
-        beyond_mm += [behind_mm - right_mm, right_mm + ahead_mm - patch.size_x_mm]
-        beyond_mm += [side_mm - up_mm, up_mm + side_mm - patch.size_y_mm]
-    return max(beyond_mm)
-
-
 MOST_ROWS = 40
 """Most rows of (H, alpha); nobody would read more."""
 
 
 def plan_table(plan: Plan) -> Group:
-    """Return the plan's totals, what is pressed where, and its warnings, as tables and text."""
+    """Return the plan's totals and what is pressed where, as tables."""
     totals = Table(title=f"plan of {plan.kind}", show_header=False)
     changes = f", a fresh one before {', '.join(plan.sheet_changes)}" if plan.sheet_changes else ""
     totals.add_row("strokes", str(len(plan.placed)))
@@ -221,11 +181,7 @@ def plan_table(plan: Plan) -> Group:
     totals.add_row("time", f"{duration(plan.seconds)}, not counting {OMITTED}")
     for kind, seconds in plan.seconds_by_kind.items():
         totals.add_row(f"  {kind}", duration(seconds))
-    parts: list[Table | Text] = [totals]
-    if plan.placed:
-        parts.append(_conditions(plan))
-    parts += [Text(f"warning: {warning}", style="yellow") for warning in plan.warnings]
-    return Group(*parts)
+    return Group(totals, _conditions(plan)) if plan.placed else Group(totals)
 
 
 def duration(seconds: float) -> str:

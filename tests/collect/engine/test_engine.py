@@ -14,7 +14,7 @@ from brushloop.collect.engine.snapshot import Snapshot
 from brushloop.collect.errors import CollectAborted, ConfigError, NeedsOperator, Parked, SheetFull
 from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.devices import Identity
-from brushloop.drivers.errors import DeviceError, RobotNotSafe
+from brushloop.drivers.errors import DeviceError
 from brushloop.drivers.sim.config import View
 from brushloop.sessions.events import CaptureResult
 from brushloop.sessions.journal import JOURNAL_NAME, replay
@@ -275,16 +275,6 @@ def test_a_safety_stop_holds_the_session_until_a_person_has_released_it(lab: Lab
     wait_for_end(engine)
     now = engine.snapshot()
     assert (now.state, now.strokes_done, now.voids) == (State.DONE, 1, 1)
-
-
-def test_a_safety_stop_where_nobody_watches_ends_the_run_and_says_what_to_do(lab: Lab) -> None:
-    engine = lab.engine()
-    engine.start()
-    until(engine, lambda now: now.step.startswith("press"))
-    lab.rig.arcs.cabinet.safety_stop()
-    with pytest.raises(RobotNotSafe, match="pendant"):
-        wait_for_end(engine)
-    assert "ProtectiveStop" in engine.snapshot().error
 
 
 def test_a_dry_run_moves_all_the_way_and_leaves_neither_ink_nor_session(lab: Lab) -> None:

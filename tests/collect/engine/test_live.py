@@ -30,7 +30,6 @@ from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.messages import pose_message
 from brushloop.sessions.records import Topic, Wrench
 from brushloop.sessions.verify import verify_session
-from tests.command import brushloop
 from tests.waiting import PATIENCE_S
 
 if TYPE_CHECKING:
@@ -213,12 +212,3 @@ def test_a_run_with_a_viewer_shows_what_it_records_and_records_the_same(lab: Lab
     assert Topic.PREVIEW not in recorded
     assert {Topic.PREVIEW, Topic.TCP, Topic.WRENCH, Topic.STEP, Topic.STROKE} <= seen
     assert seen <= {*recorded, Topic.PREVIEW} - {Topic.STILL}
-
-
-def test_the_command_refuses_a_port_that_is_taken_before_anything_is_connected(lab: Lab, live: LiveView) -> None:
-    command = ["collect", "--no-tui", "--live", "--live-port", str(live.port), "--out", lab.sessions]
-    done = brushloop(*command, "--config", lab.folder / "rig.toml", "--protocol", lab.folder / "protocol.toml")
-    assert done.returncode == 2, done.stderr
-    assert done.stderr.startswith(f"brushloop: --live: cannot listen on 127.0.0.1:{live.port}")
-    assert lab.rig.arcs.cabinet.power.mode == "PowerOff"
-    assert not lab.sessions.exists()

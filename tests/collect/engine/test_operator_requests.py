@@ -228,22 +228,6 @@ def test_who_gives_the_jog_of_the_set_up_up_keeps_the_taught_height_and_the_run_
     assert (result["method"], result["touch_z_mm"], result["moved_mm"]) == ("kept", pytest.approx(120.03), 0.0)  # type: ignore[index]
 
 
-def test_park_ends_the_run_after_the_step_with_the_arm_at_its_place(lab: Lab) -> None:
-    lab.write_protocol("[11.0]", "[0.0, 10.0]")
-    engine = lab.engine(on_screen=True)
-    engine.start()
-    until(engine, lambda now: now.strokes_done == 1)
-    engine.park()
-    with pytest.raises(Parked):
-        wait_for_end(engine)
-    now = engine.snapshot()
-    assert (now.state, now.voids) == (State.STOPPED, 0)
-    assert now.parked
-    again = lab.run()
-    assert again.snapshot().strokes_done == 2
-    assert len({c.stroke.stroke_id for c in Recording(next(lab.sessions.iterdir())).captures()}) == 2
-
-
 @pytest.mark.parametrize("state", [State.PAUSED, State.ASKING])
 def test_park_while_the_run_waits_parks_and_asks_nobody_any_more(lab: Lab, state: State) -> None:
     engine = lab.engine(on_screen=True, guided=state is State.ASKING)
@@ -269,17 +253,6 @@ def test_who_accepted_the_set_up_is_not_asked_at_later_views_of_the_board(lab: L
     wait_for_end(engine)
     assert engine.snapshot().strokes_done == 2
     assert sum(line["result"]["kind"] == "board" for line in lines(lab, "done")) == 2
-
-
-def test_a_guided_calibration_has_no_self_check(lab: Lab) -> None:
-    (lab.folder / "protocol.toml").write_text('kind = "calibration"\nboard_views = 2\n')
-    lab.edit_rig("", "\n[self_check]\nenabled = true\n")
-    engine = lab.engine(on_screen=True, guided=True)
-    engine.start()
-    answer(engine, "Camera, board, scale", "g")
-    answer(engine, "Zero touch and plane", "g")
-    wait_for_end(engine)
-    assert engine.snapshot().state is State.DONE
 
 
 def test_a_guided_set_up_measures_again_when_it_is_asked_to_and_shows_the_camera(lab: Lab) -> None:

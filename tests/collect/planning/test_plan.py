@@ -19,7 +19,6 @@ from brushloop.collect.planning.summary import (
     make_plan,
     move_s,
     path_s,
-    reach_of,
 )
 from brushloop.collect.planning.walk import sheet_of, walk
 from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
@@ -63,7 +62,6 @@ def test_the_grid_of_the_paper_needs_four_sheets_and_a_dip_for_each_press(grid_p
     assert len({(p.sheet, p.patch) for p in grid_plan.placed}) == 150
     assert list(grid_plan.sheet_changes) == [grid_plan.placed[i].stroke_id for i in (42, 84, 126)]
     assert sum(grid_plan.seconds_by_kind.values()) == pytest.approx(grid_plan.seconds)
-    assert grid_plan.warnings == ()
 
 
 def test_every_example_passes_and_is_walked(tmp_path: Path) -> None:
@@ -227,21 +225,6 @@ def test_the_ink_of_a_plan_is_what_a_pump_doses(tmp_path: Path) -> None:
     wanted = protocol(tmp_path, 'kind = "grid"\ndepths_mm = [11.0]\ntilts_deg = [0.0]\nrepeats = 12\n')
     assert make_plan(rig(tmp_path, text=PUMP), wanted).ink_ml == pytest.approx(2 * 0.3)
     assert make_plan(rig(tmp_path), wanted).ink_ml is None
-
-
-def test_the_reach_of_a_mark_is_that_of_the_model_at_the_paper_s_own_numbers(tmp_path: Path) -> None:
-    ahead_mm, behind_mm, side_mm = reach_of(rig(tmp_path).brush, Condition(20.0, 10.0))
-    assert (ahead_mm, behind_mm, 2.0 * side_mm) == pytest.approx((2.522, 22.547, 15.950), abs=1e-3)
-
-
-def test_marks_that_leave_their_cells_are_reported(tmp_path: Path) -> None:
-    narrow = rig(tmp_path, "cell_mm = [40.0, 24.0]", "cell_mm = [24.0, 24.0]")
-    [warning] = make_plan(narrow, example("protocol.toml")).warnings
-    assert warning.startswith("H20-a0-r")
-    assert "beyond its patch of 24 x 24 mm" in warning
-    assert make_plan(rig(tmp_path), example("protocol-replay.toml")).warnings == ()
-    edge = protocol(tmp_path, figure([9.0, 1.0, 9.0, 0.0, 0.0], [20.0, 1.0, 9.0, 0.0, 0.0]))
-    assert "a-r01 may reach 2.5 mm beyond" in make_plan(rig(tmp_path), edge).warnings[0]
 
 
 def test_a_self_check_takes_a_cell_before_the_first_stroke(tmp_path: Path) -> None:

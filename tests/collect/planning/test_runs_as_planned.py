@@ -35,8 +35,6 @@ strokes = 1
 FIGURE = "[[figures]]\nname = 'a'\n" + "".join(
     f"[[figures.strokes]]\npoints = [[12.0, {y}, 6.0, 4.0, 30.0], [24.0, {y}, 8.0, 0.0, 60.0]]\n" for y in (12.0, 24.0)
 )
-JOG = '\n[touch]\nmethod = "jog"\ntouches = 1\nresidual_mm = 3.0\npoints_mm = [[2.0, 2.0], [150.0, 3.0]]\n'
-TWO_PRESSES = "presses = [{depth_mm = 9.0, tilt_deg = 5.0}, {depth_mm = 11.0}]\n"
 KINDS = {
     "grid": 'kind = "grid"\ndepths_mm = [9.0]\ntilts_deg = [5.0]\nrepeats = 2\nboard_every = 1\n',
     "replay": 'kind = "replay"\nof = "s"\npresses = [{stroke_id = "b", depth_mm = 9.0, tilt_deg = 1.0}]\n',
@@ -117,10 +115,3 @@ def test_what_a_run_sends_the_plan_has_checked(lab: Lab, made: list[Made], kind:
     run(lab, KINDS[kind])
     hold_against_the_plan(lab, made)
     assert {one.step.kind for one in made} >= {StepKind.ZERO_TOUCH, StepKind.BOARD}
-
-
-def test_a_plane_found_by_jog_is_checked_where_it_is_touched(lab: Lab, made: list[Made]) -> None:
-    run(lab, f'kind = "list"\n{TWO_PRESSES}', EXTRAS + JOG)
-    hold_against_the_plan(lab, made)
-    [touch] = [one for one in made if one.step.kind is StepKind.ZERO_TOUCH]
-    assert len({(round(pose.x_mm), round(pose.y_mm)) for pose in touch.sent}) == 2
