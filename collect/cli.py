@@ -115,11 +115,11 @@ def plan(
     import asyncio
     import json
 
-    from brushloop.collect.planning.limit_check import all_poses, check_protocol
-    from brushloop.collect.planning.summary import make_plan, plan_table
+    from brushloop.collect.plan import make_plan, plan_table
     from brushloop.collect.protocols.config import load_protocol
     from brushloop.collect.rig.config import load_rig
     from brushloop.collect.rig.paper import PaperPlane
+    from brushloop.collect.walk import all_poses, check_protocol
 
     if picture is not None:
         from brushloop.collect.rig.check import check_picture
@@ -132,12 +132,12 @@ def plan(
     made = make_plan(rig, wanted)
     asked = None
     if ask:
-        from brushloop.collect.planning.limit_check import ask_reach
+        from brushloop.collect.walk import ask_reach
 
         poses = all_poses(rig, wanted, PaperPlane(rig.paper.touch_z_mm), every_patch=True)
         asked = asyncio.run(ask_reach(config, rig, poses))
     if picture is not None:
-        from brushloop.collect.planning.summary import draw_plan
+        from brushloop.collect.plan import draw_plan
 
         draw_plan(rig, wanted, made, picture)
     if as_json:

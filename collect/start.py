@@ -19,9 +19,9 @@ from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.open_or_resume import CollectRequest, Opening, find_resumable
 from brushloop.collect.engine.snapshot import REFRESH_S, eta_text, no_pose_text
 from brushloop.collect.operator import stop_signals
-from brushloop.collect.planning.limit_check import check_protocol
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import load_rig
+from brushloop.collect.walk import check_protocol
 from brushloop.drivers.host import HostClock
 from brushloop.sessions.disk import check_writable
 from brushloop.sessions.errors import SessionError

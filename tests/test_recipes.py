@@ -21,9 +21,9 @@ import pytest
 from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.open_or_resume import CollectRequest, Opening
 from brushloop.collect.photograph.measure import Mark
-from brushloop.collect.planning.walk import walk
 from brushloop.collect.protocols.steps import PressStep
 from brushloop.collect.rig.config import InkConfig, QualityConfig, RigConfig
+from brushloop.collect.walk import walk
 from brushloop.drivers.camera import CameraTable, OpenCvCamera
 from brushloop.drivers.devices import Stamp
 from brushloop.drivers.host import HostClock

@@ -10,8 +10,6 @@ from brushloop.collect.engine.recorder import RunContext, StepContext, within_li
 from brushloop.collect.errors import StepError
 from brushloop.collect.motion import TOUCH_TOLERANCE_MM
 from brushloop.collect.operator import Choice, Prompt
-from brushloop.collect.planning.limit_check import check_poses, check_step
-from brushloop.collect.planning.walk import touch_of
 from brushloop.collect.protocols.steps import DrawStep, PressStep, TouchStep, ZeroTouchStep
 from brushloop.collect.rig.config import TouchConfig
 from brushloop.collect.rig.paper import PaperPlane, Patch
@@ -19,6 +17,7 @@ from brushloop.collect.touch.force import ForceTap
 from brushloop.collect.touch.heights import Touch, plane_of, untouched
 from brushloop.collect.touch.measure import asked, measure_plane
 from brushloop.collect.touch.selfcheck import self_check, triangle_on
+from brushloop.collect.walk import check_poses, check_step, touch_of
 from brushloop.drivers.devices import PoseSample, Well
 from brushloop.sessions.events import (
     DipResult,

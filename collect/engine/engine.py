@@ -32,8 +32,8 @@ from brushloop.collect.errors import (
     rest_is_unknown,
 )
 from brushloop.collect.operator import Asker, Choice, OperatorRequest, OperatorRequests, Prompt
-from brushloop.collect.planning.walk import sheet_of
 from brushloop.collect.rig.devices import Rig, connected
+from brushloop.collect.walk import sheet_of
 from brushloop.drivers.errors import DeviceError, NotConnected, Stale
 from brushloop.drivers.host import Clock
 from brushloop.sessions.errors import SessionError

@@ -22,11 +22,11 @@ from brushloop.collect.engine.snapshot import Progress
 from brushloop.collect.errors import BadPicture, ConfigError, ForceTooHigh, StepError, describe
 from brushloop.collect.motion import Procedures
 from brushloop.collect.operator import Asker, OperatorRequests
-from brushloop.collect.planning.walk import sheet_of
 from brushloop.collect.protocols.config import ProtocolConfig
 from brushloop.collect.rig.devices import Rig
 from brushloop.collect.rig.paper import Patch, Sheet
 from brushloop.collect.touch.heights import used_patches as touched_patches
+from brushloop.collect.walk import sheet_of
 from brushloop.drivers.devices import ForceSample, Frame, PoseSample, Stamp
 from brushloop.drivers.errors import DeviceError, MotionFailed
 from brushloop.drivers.host import Clock, finished
@@ -330,7 +330,7 @@ async def uninterrupted(function: Callable[..., _R], *args: object) -> _R:
 
 
 async def within_limits(check: Callable[..., None], where: str, *arguments: object) -> None:
-    """Run a check of `planning.limit_check` in a thread: it takes seconds for a long protocol, and a stop takes effect
+    """Run a check of `collect.walk` in a thread: it takes seconds for a long protocol, and a stop takes effect
     meanwhile. Raises `StepError`, which begins with `where`."""
     try:
         await asyncio.to_thread(check, Path("rig.toml"), *arguments)

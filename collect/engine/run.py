@@ -35,9 +35,9 @@ from brushloop.collect.errors import (
     describe,
 )
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
-from brushloop.collect.planning.walk import patches_of, steps_on
 from brushloop.collect.protocols import steps
 from brushloop.collect.protocols.steps import MARKING, Protocol, Step, press_of, takes
+from brushloop.collect.walk import patches_of, steps_on
 from brushloop.drivers.errors import ArmMoved, DeviceError, LimitExceeded, MotionError
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.events import DipResult, ReviewResult, StepKind, StepResult

@@ -11,7 +11,6 @@ import numpy as np
 from brushloop.calibrate.files import read_gray
 from brushloop.collect.errors import CannotTeach, ConfigError
 from brushloop.collect.photograph.frames import ARM_SHARE, Thumbnail, changed_share, thumbnail
-from brushloop.collect.planning.limit_check import ask_reach
 from brushloop.collect.rig.check import draw_rig
 from brushloop.collect.rig.config import TRAVEL_CLEARANCE_MM, PaperConfig, RigConfig
 from brushloop.collect.rig.paper import to_base, to_paper
@@ -20,6 +19,7 @@ from brushloop.collect.teach.camera import shown_live, side_by_side, still, taug
 from brushloop.collect.teach.day import Asked, Day, Step, Target, TargetKind
 from brushloop.collect.teach.sheet_fit import Point, corners_of
 from brushloop.collect.teach.store import Notebook, Taught, Value, rig_of, taught
+from brushloop.collect.walk import ask_reach
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose
 

@@ -12,12 +12,12 @@ from pathlib import Path
 from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.open_or_resume import CollectRequest, Opening
 from brushloop.collect.errors import CannotTeach
-from brushloop.collect.planning.limit_check import check_protocol
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.doctor import examine
 from brushloop.collect.rig.paper import PaperPlane
 from brushloop.collect.teach.day import Day, Step
 from brushloop.collect.teach.store import rig_of
+from brushloop.collect.walk import check_protocol
 from brushloop.drivers.host import finished
 from brushloop.sessions.events import CaptureResult, SelfCheckResult, ZeroTouchResult
 from brushloop.sessions.journal import JOURNAL_NAME, replay

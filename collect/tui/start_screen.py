@@ -65,7 +65,7 @@ class SessionBrowser:
 
     def planned(self) -> str:
         """What the protocol would do, in one line. Raises `ConfigError`."""
-        from brushloop.collect.planning.summary import make_plan
+        from brushloop.collect.plan import make_plan
         from brushloop.collect.protocols.config import load_protocol
         from brushloop.collect.rig.config import load_rig
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.collect.motion import Move, Path, Region, over_sheet_move, photograph_moves
-from brushloop.collect.planning.walk import StepMoves
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.paper import to_paper
+from brushloop.collect.walk import StepMoves
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import distance
 from brushloop.drivers.sim.motion import MotionQueue

@@ -17,7 +17,7 @@ from brushloop.collect.engine.recorder import meanwhile
 from brushloop.collect.engine.snapshot import Progress
 from brushloop.collect.errors import BadPicture, CollectAborted, ConfigError
 from brushloop.collect.motion import Procedures, dip_moves, wash_moves
-from brushloop.collect.planning.summary import make_plan
+from brushloop.collect.plan import make_plan
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.tui.review_screen import Review

@@ -20,9 +20,9 @@ from brushloop.collect.engine.open_or_resume import (
     put_in_sheet,
 )
 from brushloop.collect.errors import ConfigError
-from brushloop.collect.planning.limit_check import distinct_steps
 from brushloop.collect.protocols.steps import StepKind
 from brushloop.collect.tui.start_screen import SessionBrowser
+from brushloop.collect.walk import distinct_steps
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import Addresses, rig_toml

@@ -16,7 +16,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from brushloop.collect.errors import ConfigError
-from brushloop.collect.planning.walk import as_planned
 from brushloop.collect.protocols import config as protocol_config
 from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
 from brushloop.collect.protocols.kinds import (
@@ -44,6 +43,7 @@ from brushloop.collect.protocols.steps import (
 )
 from brushloop.collect.rig.config import PaperConfig
 from brushloop.collect.rig.paper import Layout, Sheet
+from brushloop.collect.walk import as_planned
 from brushloop.sessions.events import Condition, Press
 
 EXAMPLES = Path(__file__).parents[3] / "examples"

@@ -16,8 +16,6 @@ from pydantic import ValidationError
 
 from brushloop.collect.errors import ConfigError, NeedsOperator, StepError
 from brushloop.collect.operator import Asker
-from brushloop.collect.planning.limit_check import check_step
-from brushloop.collect.planning.walk import moves_of
 from brushloop.collect.protocols.steps import SelfCheckStep, ZeroTouchStep
 from brushloop.collect.rig.config import PaperConfig, RigConfig, TouchConfig
 from brushloop.collect.rig.paper import PaperPlane, Sheet
@@ -25,6 +23,7 @@ from brushloop.collect.touch import camera
 from brushloop.collect.touch.heights import Touch, at_one_point, plane_of, used_patches
 from brushloop.collect.touch.measure import Jogged, asked, measure_plane
 from brushloop.collect.touch.selfcheck import partners, self_check, triangle_on
+from brushloop.collect.walk import check_step, moves_of
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import MotionFailed
 from brushloop.sessions.events import ZeroTouchResult

@@ -15,7 +15,6 @@ from rich.table import Table
 
 from brushloop.collect.motion import Path as MotionPath
 from brushloop.collect.motion import park_moves
-from brushloop.collect.planning.walk import StepMoves, Walked, poses_of, sheet_of, walk
 from brushloop.collect.protocols.config import ProtocolConfig
 from brushloop.collect.protocols.steps import Drawn, DrawStep, PressStep, TouchStep
 from brushloop.collect.rig.check import BLUE, GREY, ORANGE, Axes, finish, from_above, shown_name
@@ -23,6 +22,7 @@ from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import limits_of
 from brushloop.collect.rig.paper import Sheet, to_base
 from brushloop.collect.touch.selfcheck import partners
+from brushloop.collect.walk import StepMoves, Walked, poses_of, sheet_of, walk
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import distance
 from brushloop.drivers.limits import Limits

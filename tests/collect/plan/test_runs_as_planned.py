@@ -9,12 +9,11 @@ import pytest
 from brushloop.collect.engine.recorder import StepContext
 from brushloop.collect.engine.run import Run
 from brushloop.collect.motion import inking_moves
-from brushloop.collect.planning.limit_check import all_poses, check_protocol
-from brushloop.collect.planning.walk import moves_of
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.steps import MARKING, Step, StepKind
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.paper import PaperPlane
+from brushloop.collect.walk import all_poses, check_protocol, moves_of
 from brushloop.drivers.devices import Pose
 from brushloop.sessions.events import StepResult
 from tests.collect.sent import not_checked, not_sent, noting

@@ -13,19 +13,18 @@ import pytest
 from brushloop.collect.errors import ConfigError, StepVoid
 from brushloop.collect.motion import Path as MotionPath
 from brushloop.collect.motion import Procedures, stroke_moves
-from brushloop.collect.planning.limit_check import all_poses, check_poses, check_protocol
-from brushloop.collect.planning.summary import (
+from brushloop.collect.plan import (
     Plan,
     make_plan,
     move_s,
     path_s,
 )
-from brushloop.collect.planning.walk import sheet_of, walk
 from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
 from brushloop.collect.protocols.steps import MARKING, Drawn, DrawStep, PressStep, StepKind
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.rig.devices import Rig, limits_of
 from brushloop.collect.rig.paper import PaperPlane, Sheet
+from brushloop.collect.walk import all_poses, check_poses, check_protocol, sheet_of, walk
 from brushloop.drivers.devices import Identity, Pose, QueuedLine
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.config import SimConfig

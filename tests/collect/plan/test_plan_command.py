@@ -13,11 +13,11 @@ from typer.testing import CliRunner
 
 from brushloop.collect.cli import app
 from brushloop.collect.errors import ConfigError
-from brushloop.collect.planning.limit_check import _for_tool, all_poses, ask_reach
-from brushloop.collect.planning.summary import draw_plan, make_plan
+from brushloop.collect.plan import draw_plan, make_plan
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.rig.paper import PaperPlane
+from brushloop.collect.walk import _for_tool, all_poses, ask_reach
 from brushloop.drivers.arcs.controller import RobotMode
 from brushloop.drivers.errors import ConnectionLost, ProtocolViolation
 from brushloop.drivers.geometry import brush_pose, from_wire
