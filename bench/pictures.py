@@ -27,18 +27,18 @@ from textual.app import App
 from textual.pilot import Pilot
 
 from bench.harness import ROOT
+from brushloop.collect.commission.step import Guide, Visit
+from brushloop.collect.commission.wizard import Wizard
 from brushloop.collect.engine.control import State
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.operator import Prompt
 from brushloop.collect.start import engine_for
-from brushloop.collect.teach.day import Day, Target
-from brushloop.collect.teach.wizard import Wizard
 from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.capture_screen import CaptureScreen
-from brushloop.collect.tui.question_screens import AskScreen
+from brushloop.collect.tui.commission_app import CommissionApp
 from brushloop.collect.tui.review_screen import ReviewScreen
 from brushloop.collect.tui.start_screen import SessionBrowser, StartScreen
-from brushloop.collect.tui.teach_app import ScreenGuide, TeachApp
+from brushloop.collect.tui.widgets import AskScreen
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.brush.footprint import Flaw
 from brushloop.drivers.sim.config import SimConfig, View
@@ -241,7 +241,9 @@ async def _tour(app: OperatorApp, rig: LoopbackRig) -> None:
 class _Person:
     """Reads each question, does by hand what it asks for, and presses keys."""
 
-    def __init__(self, app: TeachApp, pilot: Pilot[None], lab: UnknownLab, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(
+        self, app: CommissionApp, pilot: Pilot[None], lab: UnknownLab, loop: asyncio.AbstractEventLoop
+    ) -> None:
         self._app, self._pilot, self._lab, self._loop = app, pilot, lab, loop
         self._number = 0
         self._held = 0
@@ -251,7 +253,7 @@ class _Person:
         deadline = time.monotonic() + DAY_WAIT_S
         while time.monotonic() < deadline:
             await self._pilot.pause(0.2)
-            if self._app.teaching.finished:
+            if self._app.steps.finished:
                 return None
             prompt = self._app.first_day.prompt
             if prompt is not None and prompt.number > self._number:
@@ -262,8 +264,8 @@ class _Person:
 
     async def answer(self, prompt: Prompt) -> None:
         """Answer it as somebody would who reads it for the first time."""
-        if (target := self._app.teaching.guide.target) is not None:
-            await self._bring(target)
+        if prompt.thing:
+            await self._bring(prompt.thing)
             await self._pilot.press("enter")
         elif prompt.read is not None:
             for letter in self._typed(prompt.question.lower()):
@@ -272,10 +274,11 @@ class _Person:
         else:
             await self._pilot.press(self._chosen(prompt))
 
-    async def _bring(self, target: Target) -> None:
-        index = self._held if target.kind == "hold-board" else target.index
-        self._held += target.kind == "hold-board"
-        act = self._lab.bring(target.kind, index, target.corner)
+    async def _bring(self, thing: str) -> None:
+        kind, index, *corner = thing.split(" ", 2)
+        number = self._held if kind == "hold-board" else int(index)
+        self._held += kind == "hold-board"
+        act = self._lab.bring(kind, number, *corner)
         await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(act, self._loop))
 
     def _typed(self, words: str) -> str:
@@ -307,22 +310,22 @@ class _Person:
 async def _day(lab: UnknownLab, loop: asyncio.AbstractEventLoop) -> None:
     rig = Path("rig.toml")
 
-    async def work(guide: ScreenGuide) -> Path | None:
-        return await Wizard(Day(guide, rig, HostClock(), armed=True)).run()
+    async def work(guide: Guide) -> Path | None:
+        return await Wizard(Visit(guide, rig, HostClock(), armed=True)).run()
 
-    app, taken = TeachApp(work, str(rig)), set[str]()
+    app, taken = CommissionApp(work, str(rig)), set[str]()
     async with app.run_test(size=DAY_SIZE) as pilot:
         person = _Person(app, pilot, lab, loop)
         while (prompt := await person.question()) is not None:
             if prompt.question.startswith("How do you want to go on"):
-                raise RuntimeError("\n".join(app.teaching.guide.findings[-1].lines))
+                raise RuntimeError("\n".join(app.steps.guide.findings[-1].lines))
             words = prompt.question.lower()
             for name in (name for part, name in PICTURES.items() if part in words and name not in taken):
                 taken.add(name)
                 _save(app, f"first-day-{name}", f"brushloop rig new, loopback rig: {name}")
             sys.stdout.write(f"{prompt.question}\n")
             await person.answer(prompt)
-    app.teaching.join()
+    app.steps.join()
 
 
 def session_picture() -> str:

@@ -15,9 +15,9 @@ from brushloop.collect.chains import Arm, Rig, Tui, on_screen
 from brushloop.sessions.terminal import say
 
 if TYPE_CHECKING:
+    from brushloop.collect.commission.step import Guide
     from brushloop.collect.engine.engine import Engine
     from brushloop.collect.engine.open_or_resume import Opening
-    from brushloop.collect.tui.teach_app import ScreenGuide
 
 app = typer.Typer(
     cls=PathOrCommand,
@@ -85,7 +85,7 @@ def collect(
 def browse() -> None:
     """Open the start screen: `brushloop` without arguments. The screen appears before the engine is imported."""
     from brushloop.collect.tui.app import OperatorApp, run_app
-    from brushloop.collect.tui.pictures import Pictures
+    from brushloop.collect.tui.pictures import look_for_pixels
     from brushloop.collect.tui.start_screen import SessionBrowser
 
     def engine_for(opening: Opening) -> Engine:
@@ -93,7 +93,8 @@ def browse() -> None:
 
         return start.engine_for(opening)
 
-    run_app(OperatorApp(browser=SessionBrowser(engine_for), pictures=Pictures(pixels=True)))
+    look_for_pixels()
+    run_app(OperatorApp(browser=SessionBrowser(engine_for)))
 
 
 @app.command()
@@ -184,8 +185,8 @@ def _first_report(config: Path, report: Path) -> bool:
     """Write the archive from what was taught so far, where there is no rig.toml yet; False if nothing was."""
     import asyncio
 
-    from brushloop.collect.teach.arm import write_first_report
-    from brushloop.collect.teach.store import TaughtFile
+    from brushloop.collect.commission.arm import write_first_report
+    from brushloop.collect.commission.notebook import TaughtFile
 
     taught = TaughtFile(config)
     if not taught.path.exists():
@@ -220,20 +221,20 @@ def _teach(rig: Path, step: str | None, *, arm: bool) -> None:
     import sys
 
     from brushloop.collect.errors import ConfigError
-    from brushloop.collect.tui.teach_app import run_teaching
+    from brushloop.collect.tui.commission_app import run_commission
     from brushloop.drivers.host import HostClock
 
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise ConfigError("rig", "", "a rig is taught on a screen: run this command in a terminal")
 
-    async def work(guide: ScreenGuide) -> Path | None:
-        from brushloop.collect.teach.day import Day
-        from brushloop.collect.teach.wizard import Wizard
+    async def work(guide: Guide) -> Path | None:
+        from brushloop.collect.commission.step import Visit
+        from brushloop.collect.commission.wizard import Wizard
 
-        wizard = Wizard(Day(guide, rig, HostClock(), armed=arm))
+        wizard = Wizard(Visit(guide, rig, HostClock(), armed=arm))
         return await (wizard.run() if step is None else wizard.again(step))
 
-    if (written := run_teaching(work, str(rig))) is not None:
+    if (written := run_commission(work, str(rig))) is not None:
         say(f"{written} is written, with how each value was obtained. Next: brushloop rig check {written}")
 
 
@@ -265,9 +266,9 @@ def check(
     import json
     from dataclasses import asdict
 
+    from brushloop.collect.commission.notebook import TaughtFile, gaps
     from brushloop.collect.rig.check import check_page, check_rig, contradictions
     from brushloop.collect.rig.config import load_rig
-    from brushloop.collect.teach.store import TaughtFile, gaps
 
     checks = [*check_rig(load_rig(rig)), *gaps(TaughtFile(rig).load())]
     if as_json:

@@ -107,7 +107,7 @@ class SheetFull(StepError):
         )
 
 
-class CannotTeach(Exception):
+class NotAccepted(Exception):
     """What was taught contradicts itself or cannot be used; `way_out` says what to do. Nothing was written or moved."""
 
     exit_code: ClassVar[int] = 4

@@ -49,6 +49,8 @@ class Prompt:
     """Reads a typed line; raises ValueError, worded for the person. None where the answer is a key."""
     allowed: str = ""
     """What a typed line may be, or what more keys do."""
+    thing: str = ""
+    """What the person brings somewhere, such as `pin 3`; empty where nothing is moved by hand."""
 
     def answer_to(self, *keys: str) -> object | None:
         """What the first of these keys answers that answers anything."""

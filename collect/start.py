@@ -99,9 +99,10 @@ def _run(engine: Engine, again: Callable[[str], Engine] | None, *, on_screen: bo
         run_headless(engine)
         return engine
     from brushloop.collect.tui.app import OperatorApp, run_app
-    from brushloop.collect.tui.pictures import Pictures
+    from brushloop.collect.tui.pictures import look_for_pixels
 
-    app = OperatorApp(engine, again=again, pictures=Pictures(pixels=True))
+    look_for_pixels()
+    app = OperatorApp(engine, again=again)
     run_app(app)
     return app.engine or engine
 

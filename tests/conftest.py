@@ -44,7 +44,7 @@ FIRST = (
     "tests/collect/photograph/test_recognised.py",
     "tests/calibrate/fit",
     "tests/model/test_train.py",
-    "tests/collect/teach/test_first_day.py",
+    "tests/collect/commission/test_first_day.py",
 )
 """The longest tests and groups, longest first, so that no worker is left alone with one of them at the end."""
 
@@ -59,7 +59,7 @@ RUNS = (
     "tests/collect/durability",
     "tests/collect/engine",
     "tests/collect/faults",
-    "tests/collect/teach",
+    "tests/collect/commission",
     "tests/collect/test_headless.py",
 )
 """Tests of whole runs, which wait for half of their time. Both kinds are mixed with tests that only compute."""

@@ -19,12 +19,10 @@ from brushloop.collect.engine.control import FINAL, State
 from brushloop.collect.engine.snapshot import REFRESH_S, Snapshot
 from brushloop.collect.errors import NOT_AT_REST, CollectAborted, ConfigError
 from brushloop.collect.operator import Choice, Prompt, stop_signals
-from brushloop.collect.tui.pictures import Pictures
-from brushloop.collect.tui.question_screens import YES, AskScreen, yes_or_no
 from brushloop.collect.tui.run_screen import CAN_RESUME, RunScreen, live_content
 from brushloop.collect.tui.start_screen import SessionBrowser, StartScreen
 from brushloop.collect.tui.terminal import PlainApp
-from brushloop.collect.tui.widgets import HELP_KEY, plain
+from brushloop.collect.tui.widgets import HELP_KEY, YES, AskScreen, plain, yes_or_no
 from brushloop.sessions.errors import SessionError
 
 if TYPE_CHECKING:
@@ -63,7 +61,6 @@ class OperatorApp(PlainApp):
         *,
         browser: SessionBrowser | None = None,
         again: Callable[[str], Engine] | None = None,
-        pictures: Pictures | None = None,
     ) -> None:
         """With an engine, show that run; with a browser, the start screen first.
 
@@ -73,7 +70,6 @@ class OperatorApp(PlainApp):
         self.engine = engine
         self.leaving = False
         """Whether the app is to end soon, whatever the state; may be set by any thread."""
-        self._pictures = pictures or Pictures()
         self._browser = browser
         self._again = again if browser is None else browser.engine
         self._now: Snapshot | None = None if engine is None else engine.snapshot()
@@ -136,7 +132,7 @@ class OperatorApp(PlainApp):
 
         try:
             review = Review(folder)
-            self.push_screen(ReviewScreen(review, self._pictures, self._finish, at_work=lambda: self.at_work))
+            self.push_screen(ReviewScreen(review, self._finish, at_work=lambda: self.at_work))
         except SessionError as error:
             self._complain(error)
 
@@ -221,7 +217,7 @@ class OperatorApp(PlainApp):
 
     def _show_run(self, engine: Engine) -> None:
         if self._main is None:
-            self._main = RunScreen(engine, self._pictures, resumable=self._again is not None)
+            self._main = RunScreen(engine, resumable=self._again is not None)
             self.push_screen(self._main)
         self._main.engine = engine
 
@@ -281,7 +277,7 @@ class OperatorApp(PlainApp):
             if self._main is not None:
                 self._main.answered()
         if prompt is not None and self.engine is not None and not isinstance(self.screen, AskScreen):
-            self.push_screen(AskScreen(prompt, partial(self.engine.answer, prompt.number), self._pictures))
+            self.push_screen(AskScreen(prompt, partial(self.engine.answer, prompt.number)))
 
 
 def _what_keys_depend_on(now: Snapshot) -> tuple[bool, ...]:

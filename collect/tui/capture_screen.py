@@ -12,7 +12,7 @@ from textual.content import Content
 from textual.screen import Screen
 from textual.widgets import Footer
 
-from brushloop.collect.tui.pictures import Pictures, binary_picture
+from brushloop.collect.tui.pictures import binary_picture, picture_widget
 from brushloop.collect.tui.widgets import STOP, Line, condition_text, labelled, one_line, plain
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ class CaptureScreen(Screen[None], inherit_bindings=False):
         *(Binding(str(number), f"choose({number - 1})", "Picture", show=False) for number in range(1, 5)),
     ]
 
-    def __init__(self, capture: LastCapture, checks: Sequence[Check], model: str, pictures: Pictures) -> None:
+    def __init__(self, capture: LastCapture, checks: Sequence[Check], model: str) -> None:
         """`model` says what predicts the mark of this capture, or why nothing does."""
         super().__init__()
         self._capture, self._checks, self._model = capture, checks, model
@@ -105,7 +105,7 @@ class CaptureScreen(Screen[None], inherit_bindings=False):
             self._images["overlay"] = over_photograph(photo, predicted)
             self._images["difference"] = difference(binary, predicted)
         self._at = len(self._images) - 1  # the last picture says most
-        self._names, self._picture = Line("large-names"), pictures.make("large-picture")
+        self._names, self._picture = Line("large-names"), picture_widget("large-picture")
 
     def compose(self) -> ComposeResult:
         """Lay out the picture beside the checks."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 from functools import lru_cache
 from itertools import groupby
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from rich.segment import Segment
 from rich.style import Style
@@ -119,17 +119,20 @@ class CellPicture(Widget):
         self._cells = braille(self._image, self.size) if drawn and self._image is not None else None
 
 
-class ImagePicture(Container):
+class PixelPicture(Container):
     """A picture in pixels, drawn by textual-image."""
 
     DEFAULT_CSS = """
-    ImagePicture { width: 1fr; height: 1fr; }
-    ImagePicture > * { width: auto; height: 100%; }
+    PixelPicture { width: 1fr; height: 1fr; }
+    PixelPicture > * { width: auto; height: 100%; }
     """
+    drawn_by: ClassVar[type[Any] | None] = None
+    """textual-image's widget, once `look_for_pixels` has found that this process's terminal has them."""
 
-    def __init__(self, widget: type[Any], id: str | None = None) -> None:  # noqa: A002 - textual's name
+    def __init__(self, id: str | None = None) -> None:  # noqa: A002 - textual's name
         super().__init__(id=id)
-        self._inner: Any = widget()
+        assert self.drawn_by is not None
+        self._inner: Any = self.drawn_by()
         self._image: NDArray[np.uint8] | None = None
 
     def compose(self) -> ComposeResult:
@@ -145,25 +148,22 @@ class ImagePicture(Container):
             self._inner.image = None if image is None else Image.fromarray(image)
 
 
-class Pictures:
-    """Makes picture widgets: in pixels, if asked for, where textual-image finds that this terminal draws them.
+def look_for_pixels() -> None:
+    """Draw pictures in pixels from now on, where textual-image finds that the terminal can.
 
-    Make it before the app takes the terminal, which textual-image asks what it can do.
+    Call it before an app takes the terminal, which textual-image asks what it can do.
     """
+    # The extra may be missing, or textual-image may not understand the terminal's answer.
+    with contextlib.suppress(ImportError, OSError, ValueError):
+        from textual_image import renderable, widget
 
-    def __init__(self, *, pixels: bool = False) -> None:
-        self._widget: type[Any] | None = None
-        if pixels:
-            # The extra may be missing, or textual-image may not understand the terminal's answer.
-            with contextlib.suppress(ImportError, OSError, ValueError):
-                from textual_image import renderable, widget
+        if renderable.Image in (renderable.SixelImage, renderable.TGPImage):
+            PixelPicture.drawn_by = widget.Image
 
-                if renderable.Image in (renderable.SixelImage, renderable.TGPImage):
-                    self._widget = widget.Image
 
-    def make(self, id: str) -> CellPicture | ImagePicture:  # noqa: A002 - textual's name
-        """Make a widget."""
-        return CellPicture(id) if self._widget is None else ImagePicture(self._widget, id)
+def picture_widget(id: str) -> CellPicture | PixelPicture:  # noqa: A002 - textual's name
+    """A widget that shows pictures as well as this terminal can."""
+    return CellPicture(id) if PixelPicture.drawn_by is None else PixelPicture(id)
 
 
 def binary_picture(binary: NDArray[np.bool_] | None) -> NDArray[np.uint8] | None:

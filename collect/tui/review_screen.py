@@ -32,12 +32,12 @@ from brushloop.collect.engine.snapshot import LastCapture
 from brushloop.collect.operator import Prompt
 from brushloop.collect.rig.paper import Patch
 from brushloop.collect.tui.capture_screen import CaptureScreen
-from brushloop.collect.tui.pictures import Pictures, binary_picture
-from brushloop.collect.tui.question_screens import AskScreen
+from brushloop.collect.tui.pictures import binary_picture, picture_widget
 from brushloop.collect.tui.widgets import (
     HELP_KEY,
     SOFTWARE_STOP,
     STOP,
+    AskScreen,
     Line,
     Rows,
     app_of,
@@ -225,20 +225,17 @@ class ReviewScreen(Screen[None]):
         HELP_KEY,
     ]
 
-    def __init__(
-        self, review: Review, pictures: Pictures, finish: Callable[[Path], None], *, at_work: Callable[[], bool]
-    ) -> None:
+    def __init__(self, review: Review, finish: Callable[[Path], None], *, at_work: Callable[[], bool]) -> None:
         """`finish` offers the next commands. `at_work` says whether a run is in progress: then no text can be typed,
         because `s` stops the arm."""
         super().__init__()
         self._review = review
-        self._made_by = pictures
         self._finish, self._at_work = finish, at_work
         self._capture: ReviewCapture | None = None
         self._alike: dict[Condition, Alike] = {}
         self._title, self._words = Line("review-title"), Line("words")
         self._options = Rows("captures")
-        self._photo, self._binary = pictures.make("review-photo"), pictures.make("review-binary")
+        self._photo, self._binary = picture_widget("review-photo"), picture_widget("review-binary")
 
     def compose(self) -> ComposeResult:
         """Lay out the list, the pictures, the keys."""
@@ -277,7 +274,7 @@ class ReviewScreen(Screen[None]):
             self.notify(plain(str(error)), severity="error")
             return
         if self.is_active:
-            app_of(self).push_screen(CaptureScreen(*large, self._made_by))
+            app_of(self).push_screen(CaptureScreen(*large))
 
     def action_mark(self) -> None:
         """Mark the capture bad, or good again."""

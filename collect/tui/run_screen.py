@@ -28,7 +28,7 @@ from brushloop.collect.engine.snapshot import (
 )
 from brushloop.collect.operator import OperatorRequest
 from brushloop.collect.tui.capture_screen import CaptureScreen, checks_content
-from brushloop.collect.tui.pictures import Pictures, binary_picture
+from brushloop.collect.tui.pictures import binary_picture, picture_widget
 from brushloop.collect.tui.widgets import (
     HELP_KEY,
     SHORT_STOP,
@@ -156,7 +156,7 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
     """
     BINDINGS: ClassVar[list[BindingType]] = [*RUN_BINDINGS]
 
-    def __init__(self, engine: Engine, pictures: Pictures, *, resumable: bool = False) -> None:
+    def __init__(self, engine: Engine, *, resumable: bool = False) -> None:
         """`resumable`: whether this screen can go on with a run that was stopped."""
         super().__init__()
         self.engine = engine
@@ -174,9 +174,8 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
         self._log_pane.border_title = "Log"
         self._capture, self._words = Vertical(id="capture", classes="pane"), Line("capture-words")
         self._capture.border_title = "Last capture: photograph, binarised, CCD-BSM"
-        self._made_by = pictures
-        self._pictures = [pictures.make(name) for name in ("photo", "binary", "model")]
-        self._camera = pictures.make("camera")
+        self._pictures = [picture_widget(name) for name in ("photo", "binary", "model")]
+        self._camera = picture_widget("camera")
         self._camera.add_class("pane")
         self._camera.border_title = "Camera"
         self._note = Line("note", sized=True)
@@ -267,7 +266,7 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
         if (last := self._now.last) is not None:
             model = "CCD-BSM as published" if last.model is not None else "no prediction for this stroke"
             checks = () if last.verdict is None else last.verdict.checks
-            app_of(self).push_screen(CaptureScreen(last, checks, model, self._made_by))
+            app_of(self).push_screen(CaptureScreen(last, checks, model))
 
     def stop_sent(self) -> None:
         """Show at once that a stop key was pressed, before the engine answers."""

@@ -21,8 +21,18 @@ from textual.widgets import Footer, OptionList
 
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.operator import Prompt
-from brushloop.collect.tui.question_screens import YES, AskScreen, yes_or_no
-from brushloop.collect.tui.widgets import HELP_KEY, Line, Rows, app_of, one_line, plain, trouble
+from brushloop.collect.tui.widgets import (
+    HELP_KEY,
+    YES,
+    AskScreen,
+    Line,
+    Rows,
+    app_of,
+    one_line,
+    plain,
+    trouble,
+    yes_or_no,
+)
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.terminal import text_of
 

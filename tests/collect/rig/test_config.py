@@ -9,11 +9,11 @@ from pathlib import Path
 import cv2
 import pytest
 
+from brushloop.collect.commission.notebook import Notebook, TaughtFile, taught
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.check import places_of
 from brushloop.collect.rig.config import RobotConfig, load_rig
-from brushloop.collect.teach.store import Notebook, TaughtFile, taught
 from brushloop.collect.walk import check_protocol
 from brushloop.drivers.sim.brush.spec import SimFileError, load_brush
 from brushloop.drivers.sim.config import SimConfig

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from brushloop.collect.commission.notebook import Notebook, TaughtFile, taught
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.doctor import Finding, examine, numbers_only, scrubber_of, write_report
-from brushloop.collect.teach.store import Notebook, TaughtFile, taught
 from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.arcs_server import ArcsServer

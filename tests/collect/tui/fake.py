@@ -23,7 +23,6 @@ from brushloop.collect.errors import CollectAborted
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
 from brushloop.collect.photograph.checks import Verdict
 from brushloop.collect.tui.app import OperatorApp
-from brushloop.collect.tui.pictures import Pictures
 from brushloop.collect.tui.review_screen import Review, ReviewCapture, ReviewScreen
 from brushloop.collect.tui.start_screen import SessionBrowser
 from brushloop.model.fitted import FittedPress
@@ -284,7 +283,7 @@ class FakeReview(Review):
 
 
 def a_review(folder: Path, app: OperatorApp) -> ReviewScreen:
-    return ReviewScreen(FakeReview(folder), Pictures(), app._finish, at_work=lambda: app.at_work)
+    return ReviewScreen(FakeReview(folder), app._finish, at_work=lambda: app.at_work)
 
 
 def has_picture(text: str) -> bool:

@@ -16,10 +16,9 @@ from brushloop.collect.engine.control import FINAL, State
 from brushloop.collect.errors import CollectAborted, ConfigError
 from brushloop.collect.tui import run_screen
 from brushloop.collect.tui.app import OperatorApp, ScreenCrashed, run_app
-from brushloop.collect.tui.question_screens import AskScreen
 from brushloop.collect.tui.run_screen import COMMAND_GOES_ON, GOES_ON, OVER, STOP_SENT, RunScreen
 from brushloop.collect.tui.terminal import TerminalDriver, _LostWrites
-from brushloop.collect.tui.widgets import SOFTWARE_STOP
+from brushloop.collect.tui.widgets import SOFTWARE_STOP, AskScreen
 from tests.collect.tui.fake import FAILED, SPLIT, FakeEngine, look, picture, shown
 from tests.waiting import PATIENCE_S
 

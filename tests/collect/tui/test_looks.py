@@ -11,8 +11,8 @@ from textual.pilot import Pilot
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.snapshot import Snapshot
 from brushloop.collect.tui.app import OperatorApp
+from tests.collect.tui.commission_fake import Asking, app_of
 from tests.collect.tui.fake import FAILED, SPLIT, TOUCHED, FakeBrowser, FakeEngine, a_review, capture, full_picture
-from tests.collect.tui.teach_fake import Asking, app_of
 
 SMALL, LARGE = (80, 24), (120, 40)
 
@@ -97,5 +97,5 @@ def test_first_day(snap_compare: Callable[..., bool]) -> None:
     try:
         assert snap_compare(app, terminal_size=SMALL, run_before=asked)
     finally:
-        app.teaching.stop()
-        app.teaching._thread.join()
+        app.steps.stop()
+        app.steps._thread.join()

@@ -16,10 +16,10 @@ from brushloop.collect.engine.control import State
 from brushloop.collect.engine.snapshot import Snapshot
 from brushloop.collect.start import engine_for
 from brushloop.collect.tui.app import OperatorApp
-from brushloop.collect.tui.question_screens import AskScreen
 from brushloop.collect.tui.review_screen import ReviewScreen
 from brushloop.collect.tui.run_screen import RunScreen
 from brushloop.collect.tui.start_screen import SessionBrowser, StartScreen
+from brushloop.collect.tui.widgets import AskScreen
 from brushloop.sessions.recording import Recording, remarks_of
 from brushloop.sessions.verify import verify_session
 from tests.collect.tui.fake import has_picture, shown

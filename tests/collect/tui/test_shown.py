@@ -25,8 +25,8 @@ from brushloop.collect.tui.capture_screen import (
     difference,
     over_photograph,
 )
-from brushloop.collect.tui.question_screens import AskScreen
 from brushloop.collect.tui.run_screen import RunScreen, cell_text, spark
+from brushloop.collect.tui.widgets import AskScreen
 from brushloop.sessions.recording import remarks_of
 from brushloop.sessions.records import Condition
 from tests.collect.tui.fake import DONE, FakeEngine, capture, full_picture, has_picture, look, picture, shown

@@ -16,9 +16,9 @@ from textual.pilot import Pilot
 
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.tui.app import OperatorApp
-from brushloop.collect.tui.pictures import CellPicture, Pictures, braille, strip_of
-from brushloop.collect.tui.question_screens import AskScreen
+from brushloop.collect.tui.pictures import CellPicture, braille, look_for_pixels, picture_widget, strip_of
 from brushloop.collect.tui.start_screen import StartScreen
+from brushloop.collect.tui.widgets import AskScreen
 from brushloop.sessions.recording import remarks_of
 from tests.collect.tui.fake import PAUSED, FakeBrowser, FakeEngine, a_review, has_picture, look, picture, shown
 
@@ -160,7 +160,8 @@ async def test_after_a_session_the_next_commands_run_in_the_terminal(
 
 def test_pictures_work_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "textual_image", None)
-    assert isinstance(Pictures(pixels=True).make("x"), CellPicture)
+    look_for_pixels()
+    assert isinstance(picture_widget("x"), CellPicture)
 
 
 def test_a_pixel_is_a_dot_of_its_own_colour_on_the_colour_of_most() -> None:

@@ -3,56 +3,33 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.collect.errors import CannotTeach, StepError
-from brushloop.collect.operator import Choice, Prompt
+from brushloop.collect.commission.notebook import Notebook, StepName, Taught, TaughtFile, Value, taught
+from brushloop.collect.errors import NotAccepted, StepError
+from brushloop.collect.operator import Asker, Choice, Prompt
 from brushloop.collect.rig.check import Check
-from brushloop.collect.teach.store import Notebook, StepName, Taught, TaughtFile, Value, taught
 from brushloop.drivers.host import Clock
 from brushloop.sessions.disk import number
 
 Picture = NDArray[np.uint8]
 """(h, w) gray or (h, w, 3) BGR."""
-TargetKind = Literal[
-    "pin",
-    "upright",
-    "board-corner",
-    "sheet-corner",
-    "well",
-    "well-rim",
-    "wash-pot",
-    "wash-rim",
-    "park",
-    "hold-board",
-    "push-sensor",
-    "clear-view",
-]
 ARM = Choice("a", "let it move: I look at the cell, my hand is at the emergency stop")
 STAY = Choice("x", "leave it where it is")
 YES, NO = Choice("y", "yes"), Choice("n", "no")
 THERE, SKIP = Choice("enter", "it is there"), Choice("k", "skip it")
-
-
-@dataclass(frozen=True, slots=True)
-class Target:
-    """A physical thing that a person brings the tip to, or does something with."""
-
-    kind: TargetKind
-    index: int = 0
-    """Which one, from 0: direction of the pin, turn of the wrist of an upright brush, pose of a held board."""
-    corner: str = ""
-    """Which corner: `lower left`, `lower right`, `upper right` or `upper left`, as the print names it."""
-
-
-Tone = Literal["finding", "warning", "trouble", "progress"]
+MOST_FINDINGS = 200
+"""Findings that can be scrolled back to."""
+Tone = Literal["finding", "warning", "trouble"]
+"""After a warning the step can go on; trouble ends it, and its last line says what to do."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +39,6 @@ class Shown:
     lines: tuple[str, ...]
     picture: Picture | None = None
     tone: Tone = "finding"
-    """After a warning the step can go on; trouble ends it, and its last line says what to do. Progress describes the
-    current work and need not be kept."""
 
 
 class LeftOff(Exception):
@@ -74,27 +49,39 @@ class WentBack(Exception):
     """The person wants to go back one question: what was answered before this one is taken back, and asked again."""
 
 
-class Guide(Protocol):
-    """A person at the rig."""
+class Guide:
+    """Shows things to a person at the rig and asks questions; a screen reads its fields from another thread."""
 
-    async def begin(self, step: str) -> None:
-        """Show which step is taught now."""
-        ...
+    def __init__(self) -> None:
+        self.asker = Asker(watched=True)
+        self.step = ""
+        """Which step is taught now."""
+        self.findings: tuple[Shown, ...] = ()
+        self.picture: Picture | None = None
+        """The newest picture of a finding."""
+        self.live: Picture | None = None
+        """What the camera sees now, while somebody guides something by it."""
+        self.doing: tuple[str, float] = ("", time.monotonic())
+        """What is at work while nothing is asked, empty where no step has said so, and since when."""
 
-    async def show(self, what: Shown) -> None:
-        """Show a finding."""
-        ...
+    def show(self, what: Shown) -> None:
+        """Add a finding, and show its picture if it has one."""
+        self.findings = (*self.findings, what)[-MOST_FINDINGS:]
+        self.picture = self.picture if what.picture is None else what.picture
 
-    def see(self, picture: Picture | None) -> None:
-        """Show what the camera sees now; None once it is not looked at any more."""
-        ...
+    def working(self, what: str) -> None:
+        """Show what is being done until the next question."""
+        self.doing = what, time.monotonic()
 
-    async def ask(self, prompt: Prompt, target: Target | None = None) -> Any:
+    async def ask(self, prompt: Prompt) -> Any:
         """Wait for an answer that the prompt allows. Raises `WentBack` and `LeftOff`.
 
-        Where the person brings something to a `target`, the answer is whether it is there.
+        Where the person brings a thing somewhere, the answer is whether it is there.
         """
-        ...
+        try:
+            return await self.asker.ask(prompt)
+        finally:
+            self.working("")
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +134,7 @@ def choice_of(question: str, choices: tuple[Choice, ...], default: str = "") -> 
     return Prompt(question, choices, default, answers={"enter": default} if default else {})
 
 
-class Day:
+class Visit:
     """One session with a person at one rig. Everything that is kept is on disk when the method returns."""
 
     def __init__(self, guide: Guide, rig_path: Path, clock: Clock, *, armed: bool) -> None:
@@ -202,28 +189,24 @@ class Day:
         """Forget values and touches of these names where they contradict each other; they are asked for again."""
         try:
             yield
-        except (CannotTeach, StepError):
+        except (NotAccepted, StepError):
             self.save(self.notebook.without(*names))
             raise
 
     # The person
 
-    async def say(self, *lines: str, tone: Tone = "finding", picture: Picture | None = None) -> None:
+    def say(self, *lines: str, tone: Tone = "finding", picture: Picture | None = None) -> None:
         """Show lines to the person."""
-        await self.guide.show(Shown(lines, picture, tone))
+        self.guide.show(Shown(lines, picture, tone))
 
-    async def working(self, what: str) -> None:
-        """Show what is being done until the next finding or question."""
-        await self.say(what, tone="progress")
-
-    async def ask(self, prompt: Prompt, target: Target | None = None) -> Any:
+    async def ask(self, prompt: Prompt) -> Any:
         """Ask, and let going back lead here.
 
         A step asks nothing that is in the notebook, so the notebook of now leads it to this question again; answers
         that were not kept are one with those before them.
         """
         notebook = self.notebook
-        answer = await self.guide.ask(prompt, target)
+        answer = await self.guide.ask(prompt)
         if not self._answered or self._answered[-1] is not notebook:
             self._answered.append(notebook)
         return answer
@@ -245,11 +228,11 @@ class Day:
         """Ask for yes or no; Enter is neither."""
         return await self.choose(question, (YES, NO)) == YES.key
 
-    async def brought(self, how: str, target: Target, *, may_skip: bool = False) -> bool:
-        """Ask the person to bring something somewhere; False if it is skipped, where it `may_skip`."""
-        answers = {THERE.key: True, SKIP.key: False} if may_skip else {THERE.key: True}
+    async def brought(self, thing: str, how: str, *, may_skip: bool = False) -> bool:
+        """Ask the person to bring a thing somewhere; False if it is skipped, where it `may_skip`."""
         choices = (THERE, SKIP) if may_skip else (THERE,)
-        return bool(await self.ask(Prompt(how, choices, answers=answers), target))
+        answers = {choice.key: choice is THERE for choice in choices}
+        return bool(await self.ask(Prompt(how, choices, thing=thing, answers=answers)))
 
     async def values(self, step: StepName, *values: Asked) -> None:
         """Ask for each of these values that is not known yet, and keep it."""
@@ -263,12 +246,12 @@ class Day:
             self.keep(step, asked.field, value, how, asked.unit, sigma=asked.sigma)
 
     async def may_move(self, what: str) -> None:
-        """Ask for the key that lets the arm move. Raises `CannotTeach` unless both it and `--arm` are given."""
+        """Ask for the key that lets the arm move. Raises `NotAccepted` unless both it and `--arm` are given."""
         if not self.armed:
-            raise CannotTeach(f"{what}: this moves the arm.", "Start the same command again with --arm.")
+            raise NotAccepted(f"{what}: this moves the arm.", "Start the same command again with --arm.")
         question = f"{what}. The arm moves by itself, slower than 50 mm/s. Is nobody within its reach?"
         if await self.choose(question, (ARM, STAY), STAY.key) != ARM.key:
-            raise CannotTeach("the arm was left where it is.", "Try this step again once it may move.")
+            raise NotAccepted("the arm was left where it is.", "Try this step again once it may move.")
 
 
 class Step(ABC):
@@ -283,8 +266,8 @@ class Step(ABC):
     """Beginnings of fields and kinds of touches that are forgotten when it is taught again."""
 
     @abstractmethod
-    async def teach(self, day: Day) -> None:
-        """Ask, measure and keep. Raises `WentBack`, `LeftOff`, `CannotTeach` and what the devices raise."""
+    async def carry_out(self, visit: Visit) -> None:
+        """Ask, measure and keep. Raises `WentBack`, `LeftOff`, `NotAccepted` and what the devices raise."""
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """Values that follow from the notebook alone; computed again whenever a value they depend on changes."""

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from brushloop.collect.commission.notebook import Notebook, touch_of
+from brushloop.collect.commission.step import Asked, Step, Visit
 from brushloop.collect.rig.doctor import Finding, Scrubber, numbers_only, transcript, write_archive
-from brushloop.collect.teach.day import Asked, Day, Step, Target
-from brushloop.collect.teach.store import Notebook, touch_of
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, Controller
 from brushloop.drivers.arcs.wire import DEVICE, Framing, RpcConnection, answers, numbers, open_arcs
 from brushloop.drivers.devices import Pose
@@ -177,21 +177,19 @@ async def taught_arm(notebook: Notebook) -> AsyncGenerator[ArmReader]:
         yield reader
 
 
-async def touch(
-    day: Day, reader: ArmReader, target: Target, how: str, name: str, *, may_skip: bool = False
-) -> Pose | None:
+async def touch(visit: Visit, reader: ArmReader, thing: str, how: str, *, may_skip: bool = False) -> Pose | None:
     """Ask for the tip to be brought to a thing, and note the flange's pose there; None if the person skips it.
 
     A thing that was touched before is not asked for again.
     """
-    if name in day.notebook.touches:
-        return day.notebook.touches[name].pose()
-    if not await day.brought(how, target, may_skip=may_skip):
+    if thing in visit.notebook.touches:
+        return visit.notebook.touches[thing].pose()
+    if not await visit.brought(thing, how, may_skip=may_skip):
         return None
     flange = await reader.flange()
-    day.save(day.notebook.with_touch(name, touch_of(flange)))
+    visit.save(visit.notebook.with_touch(thing, touch_of(flange)))
     x, y, z = flange.position_mm
-    await day.say(f"{name}: the flange is at ({x:.2f}, {y:.2f}, {z:.2f}) mm")
+    visit.say(f"{thing}: the flange is at ({x:.2f}, {y:.2f}, {z:.2f}) mm")
     return flange
 
 
@@ -219,39 +217,39 @@ class ArmStep(Step):
     needs = ()
     observes = (ADDRESS.field,)
 
-    async def teach(self, day: Day) -> None:
+    async def carry_out(self, visit: Visit) -> None:
         """Ask for the address and read everything else. Raises `DeviceError`."""
-        await day.values("arm", ADDRESS)
-        host, port = address_of(str(day.notebook.get(ADDRESS.field)))
-        await day.working(f"asking {host}:{port} who it is")
+        await visit.values("arm", ADDRESS)
+        host, port = address_of(str(visit.notebook.get(ADDRESS.field)))
+        visit.guide.working(f"asking {host}:{port} who it is")
         framing, cabinet = await find_framing(host, port)
         tcp = [f"{v:.1f}" for v in cabinet.tcp_mm_deg]
-        await day.say(
+        visit.say(
             f"{host}:{port} answers in the {framing} framing: {cabinet.who}",
             f"robot mode {cabinet.robot_mode}, safety {cabinet.safety_mode}, mode switch {cabinet.operational_mode}",
             f"tool set on the pendant: {', '.join(tcp[:3])} mm, turned by {', '.join(tcp[3:])} deg; "
             f"payload {cabinet.payload_kg:g} kg; collision level {cabinet.collision_level}",
         )
         if doubt := doubtful_tool(math.hypot(*cabinet.tcp_mm_deg[:3])):
-            await day.say(doubt, tone="warning")
+            visit.say(doubt, tone="warning")
         if cabinet.safety_mode not in MOVING_ALLOWED:
-            await day.say(
+            visit.say(
                 f"The safety mode is {cabinet.safety_mode}: the arm cannot be guided by hand until it is released.",
                 "Look at the pendant; this program clears nothing.",
                 tone="warning",
             )
         pushed, as_set = await answers(host, RTDE_PORT), "as set on the pendant"
-        with day.together():
-            day.keep("arm", "robot.kind", "aubo-arcs", f"{cabinet.who} answered")
-            day.keep("arm", "robot.host", host, "typed, and answered")
-            day.keep("arm", "robot.port", port, "answered")
-            day.keep("arm", "robot.framing", framing, "the first that the controller answered")
+        with visit.together():
+            visit.keep("arm", "robot.kind", "aubo-arcs", f"{cabinet.who} answered")
+            visit.keep("arm", "robot.host", host, "typed, and answered")
+            visit.keep("arm", "robot.port", port, "answered")
+            visit.keep("arm", "robot.framing", framing, "the first that the controller answered")
             if pushed:
-                day.keep("arm", "robot.rtde_port", RTDE_PORT, "answered, and sends poses")
-            day.keep("arm", "robot.payload_kg", cabinet.payload_kg, as_set, "kg", known="not weighed")
-            day.keep("arm", "robot.payload_cog_mm", list(cabinet.payload_cog_mm), as_set, "mm", known="not measured")
+                visit.keep("arm", "robot.rtde_port", RTDE_PORT, "answered, and sends poses")
+            visit.keep("arm", "robot.payload_kg", cabinet.payload_kg, as_set, "kg", known="not weighed")
+            visit.keep("arm", "robot.payload_cog_mm", list(cabinet.payload_cog_mm), as_set, "mm", known="not measured")
             if cabinet.collision_level:
-                day.keep("arm", "robot.collision_level", cabinet.collision_level, as_set)
+                visit.keep("arm", "robot.collision_level", cabinet.collision_level, as_set)
 
 
 def doubtful_tool(length_mm: float) -> str:

@@ -7,18 +7,18 @@ from typing import Any
 
 import pytest
 
+from brushloop.collect.commission.arm import ADDRESS
+from brushloop.collect.commission.brush import BRUSH, BUS, PORT, BrushStep, ForceStep
+from brushloop.collect.commission.camera import CameraStep
+from brushloop.collect.commission.notebook import Notebook, TaughtFile, taught
+from brushloop.collect.commission.step import Asked, LeftOff, Visit, WentBack
+from brushloop.collect.commission.wizard import Wizard
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.operator import Prompt
-from brushloop.collect.teach.arm import ADDRESS
-from brushloop.collect.teach.brush import BRUSH, BUS, PORT, BrushStep, ForceStep
-from brushloop.collect.teach.camera import CameraStep
-from brushloop.collect.teach.day import Asked, Day, LeftOff, Target, WentBack
-from brushloop.collect.teach.store import Notebook, TaughtFile, taught
-from brushloop.collect.teach.wizard import Wizard
 from brushloop.drivers.errors import DeviceTimeout
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.ink.station import InkStationConfig
-from tests.collect.teach.conftest import Person, day_of
+from tests.collect.commission.conftest import Person, visit_of
 
 BACK, HOW, GIVE, LINE = "<", "How do you want to go on?", "Give 0.5 ml", "Its serial line"
 R, L, DEEPEST, NAME = "R", "L", "Deepest press that this brush can take", "Name of the brush"
@@ -32,7 +32,7 @@ class Typing(Person):
         super().__init__()
         self.answers = list(answers)
 
-    async def ask(self, prompt: Prompt, target: Target | None = None) -> Any:
+    async def ask(self, prompt: Prompt) -> Any:
         self.asked.append(prompt.question.split(":")[0].split(",")[0])
         if not self.answers:
             raise LeftOff
@@ -42,14 +42,14 @@ class Typing(Person):
         return prompt.answer_to(answer) if prompt.read is None else prompt.read(answer)
 
 
-async def led(person: Typing, folder: Path) -> Day:
+async def led(person: Typing, folder: Path) -> Visit:
     """Steps before the brush are done; the person is led through brush and force."""
-    day = day_of(person, folder)
+    visit = visit_of(person, folder)
     for step in ("arm", "camera", "tip", "sheet", "places"):
-        day.save(day.notebook.finished(step))
+        visit.save(visit.notebook.finished(step))
     with pytest.raises(CollectAborted):
-        await Wizard(day, (BrushStep(), ForceStep())).run()
-    return day
+        await Wizard(visit, (BrushStep(), ForceStep())).run()
+    return visit
 
 
 class Station:
@@ -94,11 +94,11 @@ async def test_back_asks_the_question_before_and_no_other(
     monkeypatch.setattr(InkStationConfig, "device", lambda *_: Station())
     monkeypatch.setattr(Station, "doses", 0)
     person = Typing(*answers)
-    day = await led(person, tmp_path)
+    visit = await led(person, tmp_path)
     assert person.asked == asked
     assert Station.doses == answers.count("y")
     if asked[-1] == R:
-        assert not any(field.startswith("brush.") for field in day.notebook.values)
+        assert not any(field.startswith("brush.") for field in visit.notebook.values)
 
 
 @pytest.mark.parametrize(
@@ -115,10 +115,10 @@ async def test_a_step_that_was_refused_goes_on_where_the_person_wants(
     after: tuple[str, ...], asked: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Plugging(Typing):
-        async def ask(self, prompt: Prompt, target: Target | None = None) -> Any:
+        async def ask(self, prompt: Prompt) -> Any:
             if prompt.question == HOW:
                 monkeypatch.setattr(Station, "plugged", True)
-            return await super().ask(prompt, target)
+            return await super().ask(prompt)
 
     monkeypatch.setattr(InkStationConfig, "device", lambda *_: Station())
     monkeypatch.setattr(Station, "plugged", False)
@@ -145,26 +145,26 @@ def test_a_line_that_cannot_be_the_value_is_refused_where_it_is_typed(
     asked: Asked, line: str, said: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ValueError, match=said):
-        asked.value(line, day_of(Person(), tmp_path).notebook)
+        asked.value(line, visit_of(Person(), tmp_path).notebook)
 
 
 async def test_a_step_that_is_taught_again_by_mistake_is_as_it_was_after_back(tmp_path: Path) -> None:
     await led(Typing("6", "48", "20", "", "n", ""), tmp_path)
     again = Typing(BACK)
-    day = Day(again, tmp_path / "rig.toml", HostClock(), armed=False)
-    before = day.notebook
-    await Wizard(day, (BrushStep(), ForceStep())).again("brush")
+    visit = Visit(again, tmp_path / "rig.toml", HostClock(), armed=False)
+    before = visit.notebook
+    await Wizard(visit, (BrushStep(), ForceStep())).again("brush")
     assert again.asked == [R]
-    assert day.notebook == before
+    assert visit.notebook == before
 
 
 async def test_a_step_that_is_taught_again_stays_open_until_it_is_done(tmp_path: Path) -> None:
     source = {"camera.source": taught("camera", "http://192.0.2.8/", "typed")}
     TaughtFile(tmp_path / "rig.toml").save(Notebook().with_values(source).finished("arm").finished("camera"))
-    day = Day(Person(), tmp_path / "rig.toml", HostClock(), armed=False)
+    visit = Visit(Person(), tmp_path / "rig.toml", HostClock(), armed=False)
     with pytest.raises(CollectAborted):
-        await Wizard(day, (CameraStep(),)).again("camera")
-    assert (set(day.notebook.done), day.notebook.values) == ({"arm"}, {})
+        await Wizard(visit, (CameraStep(),)).again("camera")
+    assert (set(visit.notebook.done), visit.notebook.values) == ({"arm"}, {})
 
 
 async def test_a_step_that_failed_says_in_what_state_the_arm_is(
@@ -175,8 +175,8 @@ async def test_a_step_that_failed_says_in_what_state_the_arm_is(
         error.add_note("The arm may still be moving.")
         raise error
 
-    monkeypatch.setattr(CameraStep, "teach", silent)
+    monkeypatch.setattr(CameraStep, "carry_out", silent)
     person = Person()
     with pytest.raises(CollectAborted):
-        await Wizard(Day(person, tmp_path / "rig.toml", HostClock(), armed=True), (CameraStep(),)).run()
+        await Wizard(Visit(person, tmp_path / "rig.toml", HostClock(), armed=True), (CameraStep(),)).run()
     assert person.said[0].endswith("no reply in 1 s. A stop was sent to the arm. The arm may still be moving.")

@@ -9,16 +9,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from brushloop.calibrate.files import read_gray
-from brushloop.collect.errors import CannotTeach, ConfigError
+from brushloop.collect.commission.arm import ArmReader, taught_arm, tip_of, touch
+from brushloop.collect.commission.camera import shown_live, side_by_side, still, taught_camera
+from brushloop.collect.commission.notebook import Notebook, Taught, Value, rig_of, taught
+from brushloop.collect.commission.sheet import Point, corners_of
+from brushloop.collect.commission.step import Asked, Step, Visit
+from brushloop.collect.errors import ConfigError, NotAccepted
 from brushloop.collect.photograph.frames import ARM_SHARE, Thumbnail, changed_share, thumbnail
 from brushloop.collect.rig.check import draw_rig
 from brushloop.collect.rig.config import TRAVEL_CLEARANCE_MM, PaperConfig, RigConfig
 from brushloop.collect.rig.paper import to_base, to_paper
-from brushloop.collect.teach.arm import ArmReader, taught_arm, tip_of, touch
-from brushloop.collect.teach.camera import shown_live, side_by_side, still, taught_camera
-from brushloop.collect.teach.day import Asked, Day, Step, Target, TargetKind
-from brushloop.collect.teach.sheet_fit import Point, corners_of
-from brushloop.collect.teach.store import Notebook, Taught, Value, rig_of, taught
 from brushloop.collect.walk import ask_reach
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose
@@ -33,13 +33,13 @@ LEAST_RADIUS_MM, MOST_RADIUS_MM = 5.0, 100.0
 """From the rim of a well to its middle."""
 APART_MM = 150.0
 """Between two places of the arm: farther apart, no part of it that is in both pictures hides the same in both."""
-AWAY: dict[TargetKind, str] = {
+AWAY = {
     "clear-view": "Guide the arm to any place out of the camera's picture.",
     # Last, because the runs of the proof begin where the arm is left: it has to be within the limits.
     "park": "Now bring the arm to its waiting place: brush upright, above everything, out of the camera's picture, "
     f"{APART_MM:g} mm or more from there: two pictures that agree show the arm in neither.",
 }
-INK: tuple[TargetKind, ...] = ("well-rim", "well", "wash-rim", "wash-pot")
+INK = ("well-rim", "well", "wash-rim", "wash-pot")
 MARGIN_MM = 25.0
 """Room beside what was taught: a brush lifted along a tool axis that leans by 15 deg moves aside by as much."""
 BELOW_MM = 2.0
@@ -66,78 +66,78 @@ class PlacesStep(Step):
     needs = ("camera", "tip", "sheet")
     observes = (*INK, *AWAY, "aside.wipe", "ink.wipe.", "aside.wash", "ink.wash.")
 
-    async def teach(self, day: Day) -> None:
+    async def carry_out(self, visit: Visit) -> None:
         """Have the tip brought to each place; look whether the parked arm is out of the picture."""
-        async with taught_arm(day.notebook) as reader:
-            await touch(day, reader, Target("well-rim"), "Bring the tip to the rim of the ink well.", "well-rim 0")
+        async with taught_arm(visit.notebook) as reader:
+            await touch(visit, reader, "well-rim 0", "Bring the tip to the rim of the ink well.")
             how = "Bring the tip into the middle of the well, as deep as a dip should go: a few mm above its bottom."
-            await touch(day, reader, Target("well"), how, "well 0")
-            with day.asked_again_if_refused("well-rim", "well"):
-                found = check_pot(day.notebook, "well-rim 0", "well 0", "well")
-            await day.say(found)
-            await self._wipe(day, reader)
-            await self._wash(day, reader)
-            if "park 0" not in day.notebook.touches:
-                with day.together():
-                    await self._park(day, reader)
+            await touch(visit, reader, "well 0", how)
+            with visit.asked_again_if_refused("well-rim", "well"):
+                visit.say(check_pot(visit.notebook, "well-rim 0", "well 0", "well"))
+            await self._wipe(visit, reader)
+            await self._wash(visit, reader)
+            if "park 0" not in visit.notebook.touches:
+                with visit.together():
+                    await self._park(visit, reader)
 
-    async def _wipe(self, day: Day, reader: ArmReader) -> None:
+    async def _wipe(self, visit: Visit, reader: ArmReader) -> None:
         """Have the side of the rim touched at which a drop is wiped off, if there is to be a wipe."""
-        if "aside.wipe" in day.notebook.values:
+        if "aside.wipe" in visit.notebook.values:
             return
-        wipe = "well-rim 1" in day.notebook.touches or await day.yes(
+        wipe = "well-rim 1" in visit.notebook.touches or await visit.yes(
             "Shall each dip end with a wipe across the rim of the well, which takes the drop off?"
         )
         if wipe:
             how = "Bring the tip to the rim on the side where the drop shall be wiped off: the one away from the sheet."
-            wipe = await touch(day, reader, Target("well-rim", 1), how, "well-rim 1", may_skip=True) is not None
+            wipe = await touch(visit, reader, "well-rim 1", how, may_skip=True) is not None
         if wipe:
-            with day.asked_again_if_refused("well-rim 1"):
-                check_wipe(day.notebook)
-        day.keep("places", "aside.wipe", wipe, "answered")
+            with visit.asked_again_if_refused("well-rim 1"):
+                check_wipe(visit.notebook)
+        visit.keep("places", "aside.wipe", wipe, "answered")
 
-    async def _wash(self, day: Day, reader: ArmReader) -> None:
+    async def _wash(self, visit: Visit, reader: ArmReader) -> None:
         """Have rim and middle of a pot of water touched, if there is one."""
-        if "aside.wash" in day.notebook.values:
+        if "aside.wash" in visit.notebook.values:
             return
-        wash = "wash-rim 0" in day.notebook.touches or await day.yes("Is there a pot of water to wash the brush in?")
+        question = "Is there a pot of water to wash the brush in?"
+        wash = "wash-rim 0" in visit.notebook.touches or await visit.yes(question)
         if wash:
-            await touch(day, reader, Target("wash-rim"), "Bring the tip to the rim of the pot of water.", "wash-rim 0")
+            await touch(visit, reader, "wash-rim 0", "Bring the tip to the rim of the pot of water.")
             how = "Bring the tip into the middle of the pot of water, as deep as a wash should go."
-            await touch(day, reader, Target("wash-pot"), how, "wash-pot 0")
-            with day.asked_again_if_refused("wash-rim", "wash-pot"):
-                check_pot(day.notebook, "wash-rim 0", "wash-pot 0", "pot of water")
-        day.keep("places", "aside.wash", wash, "answered")
+            await touch(visit, reader, "wash-pot 0", how)
+            with visit.asked_again_if_refused("wash-rim", "wash-pot"):
+                check_pot(visit.notebook, "wash-rim 0", "wash-pot 0", "pot of water")
+        visit.keep("places", "aside.wash", wash, "answered")
 
-    async def _park(self, day: Day, reader: ArmReader) -> None:
+    async def _park(self, visit: Visit, reader: ArmReader) -> None:
         """Have the arm brought out of the picture, to two places.
 
-        Raises `CannotTeach` unless the pictures from there show the same.
+        Raises `NotAccepted` unless the pictures from there show the same.
         """
         # Going back may have left one of the places: its picture has to be taken with the arm there.
-        day.save(day.notebook.without(*AWAY))
+        visit.save(visit.notebook.without(*AWAY))
         pictures: list[Thumbnail] = []
-        async with taught_camera(day.notebook, day.clock) as camera:
+        async with taught_camera(visit.notebook, visit.clock) as camera:
             for kind, how in AWAY.items():
-                async with shown_live(day, camera):
-                    await touch(day, reader, Target(kind), how, f"{kind} 0")
-                await day.working("waiting for a picture without the arm")
-                pictures.append(thumbnail(await still(camera, day.clock)))
-        places = tips(day.notebook)
+                async with shown_live(visit, camera):
+                    await touch(visit, reader, f"{kind} 0", how)
+                visit.guide.working("waiting for a picture without the arm")
+                pictures.append(thumbnail(await still(camera, visit.clock)))
+        places = tips(visit.notebook)
         if (apart_mm := math.dist(places["park 0"], places["clear-view 0"])) < APART_MM:
-            raise CannotTeach(
+            raise NotAccepted(
                 f"the arm was only {apart_mm:.0f} mm apart in the two pictures: they show the same.",
                 f"Bring it to two places {APART_MM:g} mm or more apart; both are asked again.",
             )
         share = changed_share(*pictures)
         if share >= ARM_SHARE:
             beside = side_by_side([picture.astype(np.uint8) for picture in pictures])
-            await day.say("The arm elsewhere (1), and parked (2):", picture=beside)
-            raise CannotTeach(
+            visit.say("The arm elsewhere (1), and parked (2):", picture=beside)
+            raise NotAccepted(
                 f"the arm, or its shadow, is in one of the two pictures: {100 * share:.0f} % of them differs.",
                 "Park it farther from the sheet, or higher; both places are asked again.",
             )
-        await day.say(f"With the arm at both places {100 * share:.1f} % of the picture differs: it is out of both.")
+        visit.say(f"With the arm at both places {100 * share:.1f} % of the picture differs: it is out of both.")
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """Places in the sheet's frame, and the travel height."""
@@ -196,17 +196,18 @@ def sheet_corners(notebook: Notebook) -> list[Point]:
     return [(*to_base(paper, x, y), z) for (x, y), z in zip(corners_of(*paper.size_mm).tolist(), heights, strict=True)]
 
 
-def check_pot(notebook: Notebook, rim: str, middle: str, what: str) -> str:
-    """Describe a well or pot by its two touches. Raises `CannotTeach` if rim and dip contradict each other."""
+def check_pot(notebook: Notebook, rim: str, middle: str, what: str, way_out: str = "") -> str:
+    """Describe a well or pot by its two touches. Raises `NotAccepted` if rim and dip contradict each other."""
     (rim_x, rim_y, rim_z), (x, y, z) = tips(notebook)[rim], tips(notebook)[middle]
     radius_mm = math.dist((rim_x, rim_y), (x, y))
+    way_out = way_out or f"Teach the {what} again: its rim, then its middle."
     if not LEAST_RADIUS_MM <= radius_mm <= MOST_RADIUS_MM:
-        raise CannotTeach(
+        raise NotAccepted(
             f"the dip is {radius_mm:.0f} mm from the rim of the {what}, seen from above: no {what} is that wide.",
-            f"Teach the {what} again: its rim, then its middle.",
+            way_out,
         )
-    if z >= rim_z:
-        raise CannotTeach(f"the dip is no deeper than the rim of the {what}.", "Bring the tip below the rim.")
+    if z >= rim_z - WIPE_BELOW_MM:
+        raise NotAccepted(f"the dip is no deeper than the rim of the {what}.", way_out)
     return f"{what} of radius {radius_mm:.0f} mm, its rim {rim_z - z:.1f} mm above the bottom of a dip"
 
 
@@ -219,19 +220,12 @@ def wipe_of(notebook: Notebook) -> tuple[tuple[float, float], float]:
 
 
 def check_wipe(notebook: Notebook) -> None:
-    """Raise `CannotTeach` for a wipe that leads over the sheet, or that begins elsewhere than in the well."""
-    (x, y), z_mm = wipe_of(notebook)
-    (well_x, well_y, dip_z), (rim_x, rim_y, _) = tips(notebook)["well 0"], tips(notebook)["well-rim 1"]
-    radius_mm = math.dist((well_x, well_y), (rim_x, rim_y))
+    """Raise `NotAccepted` for a wipe that leads over the sheet, or that begins elsewhere than in the well."""
+    check_pot(notebook, "well-rim 1", "well 0", "well", "Touch the rim of the same well; only it is asked again.")
+    (x, y), _ = wipe_of(notebook)
     width, height = notebook.numbers("paper.size_mm")
-    if not LEAST_RADIUS_MM <= radius_mm <= MOST_RADIUS_MM or z_mm <= dip_z:
-        raise CannotTeach(
-            f"that place is {radius_mm:.0f} mm from the middle of the well and {z_mm - dip_z:+.1f} mm above the "
-            "bottom of a dip: no rim can be there.",
-            "Touch the rim of the same well; only this place is asked again.",
-        )
     if 0.0 <= x <= width and 0.0 <= y <= height:
-        raise CannotTeach(
+        raise NotAccepted(
             "the wipe would end over the sheet, and the drop would fall on it.",
             "Touch the rim on another side; only this place is asked again.",
         )
@@ -246,36 +240,36 @@ class LimitsStep(Step):
     needs = ("tip", "sheet", "places", "brush")
     observes = (AGREED, *(asked.field for asked in SPEEDS))
 
-    async def teach(self, day: Day) -> None:
+    async def carry_out(self, visit: Visit) -> None:
         """Show the box, have each limit confirmed, and ask the controller whether the arm reaches every corner."""
-        rig = rig_of(day.notebook.with_values(self.derived(day.notebook)), day.rig_path)
-        picture = day.rig_path.with_name(f"{day.rig_path.stem}.limits.png")
-        await day.working("drawing box and places")
+        rig = rig_of(visit.notebook.with_values(self.derived(visit.notebook)), visit.rig_path)
+        picture = visit.rig_path.with_name(f"{visit.rig_path.stem}.limits.png")
+        visit.guide.working("drawing box and places")
         await asyncio.to_thread(draw_rig, rig, picture)
-        await day.say(
+        visit.say(
             f"{picture} shows box, sheet, board, well and park from above.",
             picture=await asyncio.to_thread(read_gray, picture),
         )
         box = "; ".join(
-            f"{field} {value.value} {value.unit}: {value.how}" for field, value in _box(day.notebook).items()
+            f"{field} {value.value} {value.unit}: {value.how}" for field, value in _box(visit.notebook).items()
         )
-        if day.notebook.get(AGREED) != box:
-            if not await day.yes(f"The box of the tip in the base frame. {box}. Agreed?"):
-                raise CannotTeach(
+        if visit.notebook.get(AGREED) != box:
+            if not await visit.yes(f"The box of the tip in the base frame. {box}. Agreed?"):
+                raise NotAccepted(
                     "the box was not agreed.",
                     "Teach the place again that makes the box too large: `brushloop rig teach`.",
                 )
-            day.keep("limits", AGREED, box, "agreed")
-        await day.values("limits", *SPEEDS)
-        rig = rig_of(day.notebook.with_values(self.derived(day.notebook)), day.rig_path)
+            visit.keep("limits", AGREED, box, "agreed")
+        await visit.values("limits", *SPEEDS)
+        rig = rig_of(visit.notebook.with_values(self.derived(visit.notebook)), visit.rig_path)
         try:
-            count = await ask_reach(day.rig_path, rig, _to_reach(rig, day.notebook))
+            count = await ask_reach(visit.rig_path, rig, _to_reach(rig, visit.notebook))
         except ConfigError as error:
-            raise CannotTeach(
+            raise NotAccepted(
                 f"the arm does not reach the whole sheet: {error.what}.",
                 "Move the board with the sheet nearer to the arm, and teach sheet and places again.",
             ) from None
-        await day.say(f"The controller finds joints for all {count} corners of the space above sheet and well.")
+        visit.say(f"The controller finds joints for all {count} corners of the space above sheet and well.")
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """The box around what was taught, and the defaults that were not taught otherwise."""

@@ -10,13 +10,13 @@ from typing import Any
 import cv2
 import numpy as np
 
+from brushloop.collect.commission.arm import ADDRESS
+from brushloop.collect.commission.brush import BUS
+from brushloop.collect.commission.camera import PRINT
+from brushloop.collect.commission.step import Guide, Shown, Visit
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.operator import Choice
-from brushloop.collect.teach.arm import ADDRESS
-from brushloop.collect.teach.brush import BUS
-from brushloop.collect.teach.camera import PRINT
-from brushloop.collect.teach.day import Day, Shown, Target
-from brushloop.collect.tui.teach_app import ScreenGuide, TeachApp
+from brushloop.collect.tui.commission_app import CommissionApp
 from brushloop.drivers.host import HostClock
 
 FOUND = Shown(("five directions: the tip is known to 0.11 mm", "residuals 0.10, 0.24, 0.08, 0.17, 0.21 mm"))
@@ -37,31 +37,31 @@ class Asking:
         self.answers: list[object] = []
         self.at_work = self.stopped_arm = False
 
-    async def __call__(self, guide: ScreenGuide) -> None:
-        await guide.begin("step 3 of 9: Tip of the brush, about 8 min")
-        await guide.show(FOUND)
-        await guide.show(WARNED)
+    async def __call__(self, guide: Guide) -> None:
+        guide.step = "step 3 of 9: Tip of the brush, about 8 min"
+        guide.show(FOUND)
+        guide.show(WARNED)
         for kind in self.kinds:
             self.answers.append(await self._ask(guide, kind))
         return None
 
-    async def _ask(self, guide: ScreenGuide, kind: str) -> Any:
-        day = Day(guide, Path("rig.toml"), HostClock(), armed=False)
+    async def _ask(self, guide: Guide, kind: str) -> Any:
+        visit = Visit(guide, Path("rig.toml"), HostClock(), armed=False)
         match kind:
             case "choose":
-                return await day.choose("Take this tip?", (YES, NO), "y")
+                return await visit.choose("Take this tip?", (YES, NO), "y")
             case "no default":
-                return await day.yes("Is there a pot of water?")
+                return await visit.yes("Is there a pot of water?")
             case "number":
-                return await day.ask(PRINT[0].prompt(day.notebook))
+                return await visit.ask(PRINT[0].prompt(visit.notebook))
             case "text":
-                return await day.ask(replace(ADDRESS, default="192.0.2.7").prompt(day.notebook))
+                return await visit.ask(replace(ADDRESS, default="192.0.2.7").prompt(visit.notebook))
             case "empty":
-                return await day.ask(BUS.prompt(day.notebook))
+                return await visit.ask(BUS.prompt(visit.notebook))
             case "bring":
-                await guide.show(Shown(("the board as the camera sees it",), board()))
+                guide.show(Shown(("the board as the camera sees it",), board()))
                 how = "Guide the tip to the pin by hand, the brush leaning toward the window, then press Enter."
-                return await day.brought(how, Target("pin", 2), may_skip=True)
+                return await visit.brought("pin 2", how, may_skip=True)
             case _:
                 return await self._move(kind)
 
@@ -77,5 +77,5 @@ class Asking:
             raise
 
 
-def app_of(asking: Asking) -> TeachApp:
-    return TeachApp(asking, "rig.toml")
+def app_of(asking: Asking) -> CommissionApp:
+    return CommissionApp(asking, "rig.toml")

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from brushloop.calibrate.stats import student_95
-from brushloop.collect.errors import CannotTeach
+from brushloop.collect.commission.arm import ArmReader, taught_arm, tip_of, touch
+from brushloop.collect.commission.notebook import Notebook, Taught, taught
+from brushloop.collect.commission.step import Step, Visit
+from brushloop.collect.errors import NotAccepted
 from brushloop.collect.rig.check import brush_square
-from brushloop.collect.teach.arm import ArmReader, taught_arm, tip_of, touch
-from brushloop.collect.teach.day import Day, Step, Target
-from brushloop.collect.teach.store import Notebook, Taught, taught
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import distance
 
@@ -29,10 +29,8 @@ WORST_CONDITION = 60.0
 """Above this the directions are so similar that errors of the touches appear many times larger in the length. If the
 wrist turns along with the lean, all directions are the same: one side of the flange is always up."""
 OUTLIER_SHARE = 4.0
-"""A touch whose residual exceeds the others' standard deviation by this factor is named as a slip."""
+"""A touch or hold that is farther from the others than this many of their standard deviations is a stray."""
 LEAST_OUTLIER_MM = 1.0
-ELSEWHERE_MM = 10.0
-"""A touch that lies farther than this from where the others agree was not made at the pin."""
 HAND_MM = 0.15
 """Smallest plausible error of a touch by hand, in one axis: a few touches may agree by chance."""
 LEAST_OFF_DEG, LEAST_AGREEING = 1.0, 5
@@ -58,6 +56,11 @@ class TipFit:
     """Ratio of the largest to the smallest singular value of the equations."""
 
     @property
+    def touch_mm(self) -> float:
+        """Standard deviation of one touch's distance from the point."""
+        return math.sqrt(3.0 * sum(r * r for r in self.residuals_mm) / self.freedom)
+
+    @property
     def error_mm(self) -> float:
         """Root mean square of the distance by which the offset may be wrong."""
         return math.hypot(*self.sigma_mm)
@@ -67,31 +70,22 @@ class TipFit:
         """Half width of the 95 % interval of the worst component, by Student's t."""
         return student_95(self.freedom) * max(self.sigma_mm)
 
-    def slip(self) -> tuple[int, float] | None:
-        """Number of the touch that does not fit the others, and its residual in mm; None if all do."""
-        worst = int(np.argmax(self.residuals_mm))
-        others = [r for k, r in enumerate(self.residuals_mm) if k != worst]
-        typical_mm = math.sqrt(sum(r * r for r in others) / len(others))
-        limit_mm = max(LEAST_OUTLIER_MM, OUTLIER_SHARE * typical_mm)
-        off_mm = self.residuals_mm[worst]
-        return (worst, off_mm) if off_mm > limit_mm and len(others) >= LEAST_TOUCHES else None
-
 
 def find_tip(flanges: Sequence[Pose]) -> TipFit:
     """Solve R_i t + p_i = c for the offset t and the point c by least squares (pivot calibration, e.g. Yaniv 2015).
 
-    R_i and p_i are the poses of the flange. Raises `CannotTeach` for fewer than four touches, and for directions that
+    R_i and p_i are the poses of the flange. Raises `NotAccepted` for fewer than four touches, and for directions that
     are too alike.
     """
     if len(flanges) < LEAST_TOUCHES:
-        raise CannotTeach(f"{len(flanges)} touches of the pin", f"do not give the tip: {LEAST_TOUCHES} are needed.")
+        raise NotAccepted(f"{len(flanges)} touches of the pin", f"do not give the tip: {LEAST_TOUCHES} are needed.")
     turns = np.array([Rotation.from_quat(pose.quaternion).as_matrix() for pose in flanges])
     places = np.array([pose.position_mm for pose in flanges])
     equations = np.concatenate([np.concatenate([turn, -np.eye(3)], axis=1) for turn in turns])
     _, sizes, _ = np.linalg.svd(equations, full_matrices=False)
     condition = float(sizes[0] / max(sizes[-1], 1e-12))
     if condition > WORST_CONDITION:
-        raise CannotTeach(
+        raise NotAccepted(
             f"the touches of the pin are too alike (condition {condition:.0f}, limit {WORST_CONDITION:g}):",
             "lean the brush by 30 deg or more to all four sides, and do not turn the wrist along with it.",
         )
@@ -110,23 +104,23 @@ def find_tip(flanges: Sequence[Pose]) -> TipFit:
     )
 
 
-def elsewhere(flanges: Sequence[Pose]) -> tuple[int, float] | None:
-    """Number of the one touch that was made elsewhere, and its distance in mm from the point of the others.
+def stray_touch(flanges: Sequence[Pose]) -> tuple[int, float] | None:
+    """Number of the touch that does not fit the others, and its distance in mm from their point; None if all fit.
 
-    Such a touch spoils the residuals of all, so each touch is compared with a fit of the others alone. None if there
-    is none, or for fewer than five touches.
+    A touch that slipped, or was never made at the pin, spoils the residuals of all, so each is compared with a fit of
+    the others alone. None also for fewer than five touches.
     """
-    worst, farthest_mm = None, ELSEWHERE_MM
+    stray, worst = None, 1.0
     for k in range(len(flanges)):
-        others = [pose for n, pose in enumerate(flanges) if n != k]
         try:
-            fit = find_tip(others)
-        except CannotTeach:
+            fit = find_tip([pose for n, pose in enumerate(flanges) if n != k])
+        except NotAccepted:
             continue
         off_mm = math.dist(tip_of(flanges[k], fit.offset_mm), fit.pin_mm)
-        if off_mm > max(farthest_mm, 2.0 * OUTLIER_SHARE * max(fit.residuals_mm)):
-            worst, farthest_mm = (k, off_mm), off_mm
-    return worst
+        excess = off_mm / max(LEAST_OUTLIER_MM, OUTLIER_SHARE * fit.touch_mm)
+        if excess > worst:
+            stray, worst = (k, off_mm), excess
+    return stray
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,72 +216,71 @@ class TipStep(Step):
     needs = ("arm",)
     observes = ("pin", "upright")
 
-    async def teach(self, day: Day) -> None:
-        """Have the pin touched until the tip is known well enough. Raises `CannotTeach`."""
-        await day.say(
+    async def carry_out(self, visit: Visit) -> None:
+        """Have the pin touched until the tip is known well enough. Raises `NotAccepted`."""
+        visit.say(
             "Fix a pin upright where all sides of it can be reached; put the pendant into hand guiding.",
             "Touch its point with the tip of the dry brush, each time leaning to another side, and hold still.",
         )
-        async with taught_arm(day.notebook) as reader:
-            await self._pin(day, reader)
-            await day.say("Now the direction of the brush: hold it upright, a set square on the table beside it.")
-            await self._uprights(day, reader)
+        async with taught_arm(visit.notebook) as reader:
+            await self._pin(visit, reader)
+            visit.say("Now the direction of the brush: hold it upright, a set square on the table beside it.")
+            await self._uprights(visit, reader)
 
-    async def _pin(self, day: Day, reader: ArmReader) -> None:
+    async def _pin(self, visit: Visit, reader: ArmReader) -> None:
         for index in range(MOST_TOUCHES):
-            if f"pin {index}" in day.notebook.touches:
+            if f"pin {index}" in visit.notebook.touches:
                 continue
-            if await self._known(day):
+            if self._known(visit):
                 return
             how = (
                 f"Touch {index + 1}: bring the tip to the pin, the brush leaning by 30 deg or more "
                 f"{SIDES[index % 4]}; lean it without turning the wrist with it."
             )
-            await touch(day, reader, Target("pin", index), how, f"pin {index}", may_skip=True)
-        if await self._known(day):
+            await touch(visit, reader, f"pin {index}", how, may_skip=True)
+        if self._known(visit):
             return
-        with day.asked_again_if_refused("pin"):
-            fit = find_tip(list(day.notebook.touched("pin").values()))
+        with visit.asked_again_if_refused("pin"):
+            fit = find_tip(list(visit.notebook.touched("pin").values()))
             if fit.error_mm > WORST_MM:
-                raise CannotTeach(
+                raise NotAccepted(
                     f"after {MOST_TOUCHES} touches the tip is known to {fit.error_mm:.2f} mm only.",
                     "Fix pin and brush firmly, hold still while you press Enter, and touch the pin again.",
                 )
 
-    async def _known(self, day: Day) -> bool:
-        touches = day.notebook.touched("pin")
+    def _known(self, visit: Visit) -> bool:
+        touches = visit.notebook.touched("pin")
         if len(touches) < LEAST_TOUCHES:
             return False
         try:
             fit = find_tip(list(touches.values()))
-        except CannotTeach as error:
-            await day.say(str(error), tone="warning")
+        except NotAccepted as error:
+            visit.say(str(error), tone="warning")
             return False
-        slip, off_mm = elsewhere(list(touches.values())) or fit.slip() or (None, 0.0)
-        if slip is not None:
-            name = list(touches)[slip]
-            await day.say(f"Touch {int(name) + 1} lies {off_mm:.1f} mm off: it is left out.", tone="warning")
-            day.save(day.notebook.without(f"pin {name}"))
+        if (stray := stray_touch(list(touches.values()))) is not None:
+            name, off_mm = list(touches)[stray[0]], stray[1]
+            visit.say(f"Touch {int(name) + 1} lies {off_mm:.1f} mm off: it is left out.", tone="warning")
+            visit.save(visit.notebook.without(f"pin {name}"))
             return False
         x, y, z = fit.offset_mm
         if fit.error_mm > UNKNOWN_MM:
             more = f"{len(touches)} touches do not give the tip yet; if Enter was pressed too early, the next"
-            await day.say(f"{more} touches will show which one lies off.", tone="warning")
+            visit.say(f"{more} touches will show which one lies off.", tone="warning")
             return False
-        await day.say(
+        visit.say(
             f"{len(touches)} touches: the tip is at ({x:.2f}, {y:.2f}, {z:.2f}) mm from the flange, with a standard "
             f"error of {fit.error_mm:.3f} mm (goal: {GOOD_MM:g} mm); "
             f"no touch is more than {max(fit.residuals_mm):.2f} mm off."
         )
         return fit.error_mm <= GOOD_MM
 
-    async def _uprights(self, day: Day, reader: ArmReader) -> None:
-        """Have the brush held upright until its direction is known well enough. Raises `CannotTeach`."""
-        while not await self._direction_known(day):
-            free = (n for n in range(MOST_UPRIGHTS) if f"upright {n}" not in day.notebook.touches)
+    async def _uprights(self, visit: Visit, reader: ArmReader) -> None:
+        """Have the brush held upright until its direction is known well enough. Raises `NotAccepted`."""
+        while not self._direction_known(visit):
+            free = (n for n in range(MOST_UPRIGHTS) if f"upright {n}" not in visit.notebook.touches)
             if (index := next(free, None)) is None:
-                with day.asked_again_if_refused("upright"):
-                    raise CannotTeach(
+                with visit.asked_again_if_refused("upright"):
+                    raise NotAccepted(
                         f"after {MOST_UPRIGHTS} holds the direction of the brush is not known to {WORST_DEG:g} deg.",
                         "Hold the brush along a set square, not by eye; or skip the holds: it is then not measured.",
                     )
@@ -295,14 +288,14 @@ class TipStep(Step):
                 f"Upright {index + 1} of {UPRIGHTS}: the brush upright along the set square"
                 f"{', the wrist turned differently than before' if index else ''}, anywhere over the table."
             )
-            if await touch(day, reader, Target("upright", index), how, f"upright {index}", may_skip=True) is None:
-                if measured_axis(day.notebook) is None:
-                    await day.say("The direction of the brush is not measured.", tone="warning")
+            if await touch(visit, reader, f"upright {index}", how, may_skip=True) is None:
+                if measured_axis(visit.notebook) is None:
+                    visit.say("The direction of the brush is not measured.", tone="warning")
                 return
 
-    async def _direction_known(self, day: Day) -> bool:
+    def _direction_known(self, visit: Visit) -> bool:
         """Judge each hold by itself and by the others, name those that were not upright, and forget them."""
-        holds = day.notebook.touched("upright")
+        holds = visit.notebook.touched("upright")
         if not holds:
             return False
         *before, newest = holds
@@ -317,15 +310,15 @@ class TipStep(Step):
         else:
             wrong = {list(holds)[k]: f"{names[k]} is {axis.off_deg[k]:.1f} deg from the others" for k in axis.strays}
             if wrong and not axis.clear:
-                await day.say(*wrong.values(), "The next holds will show which were not upright.", tone="warning")
+                visit.say(*wrong.values(), "The next holds will show which were not upright.", tone="warning")
                 return False
         if wrong:
-            await day.say(*wrong.values(), "Left out, and asked for again.", tone="warning")
-            day.save(day.notebook.without(*(f"upright {name}" for name in wrong)))
+            visit.say(*wrong.values(), "Left out, and asked for again.", tone="warning")
+            visit.save(visit.notebook.without(*(f"upright {name}" for name in wrong)))
             return False
         if len(holds) >= LEAST_UPRIGHTS:
             known = f"known to {axis.sigma_deg:.2f} deg (limit {WORST_DEG:g})"
-            await day.say(f"{axis.holds} holds: the direction of the brush is {known}.")
+            visit.say(f"{axis.holds} holds: the direction of the brush is {known}.")
         return axis.holds >= UPRIGHTS and axis.sigma_deg <= WORST_DEG
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:

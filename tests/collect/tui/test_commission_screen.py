@@ -12,12 +12,12 @@ from contextlib import asynccontextmanager
 import pytest
 from textual.pilot import Pilot
 
+from brushloop.collect.commission.step import LeftOff, WentBack
 from brushloop.collect.errors import CollectAborted
-from brushloop.collect.teach.day import LeftOff, WentBack
-from brushloop.collect.tui.question_screens import AskScreen
-from brushloop.collect.tui.teach_app import TeachApp, Teaching
+from brushloop.collect.tui.commission_app import CommissionApp, Steps
+from brushloop.collect.tui.widgets import AskScreen
+from tests.collect.tui.commission_fake import Asking, app_of
 from tests.collect.tui.fake import shown
-from tests.collect.tui.teach_fake import Asking, app_of
 from tests.waiting import PATIENCE_S
 
 SIZE = (80, 24)
@@ -30,7 +30,7 @@ async def until(condition: Callable[[], bool]) -> None:
 
 
 @asynccontextmanager
-async def running(asking: Asking) -> AsyncIterator[tuple[TeachApp, Pilot[None]]]:
+async def running(asking: Asking) -> AsyncIterator[tuple[CommissionApp, Pilot[None]]]:
     app = app_of(asking)
     async with app.run_test(size=SIZE) as pilot:
         await until(lambda: app.first_day.is_mounted and (app.first_day.prompt is not None or not asking.kinds))
@@ -38,11 +38,11 @@ async def running(asking: Asking) -> AsyncIterator[tuple[TeachApp, Pilot[None]]]
         try:
             yield app, pilot
         finally:
-            app.teaching.stop()
-            app.teaching._thread.join()
+            app.steps.stop()
+            app.steps._thread.join()
 
 
-async def seen(app: TeachApp, pilot: Pilot[None], condition: Callable[[], bool]) -> None:
+async def seen(app: CommissionApp, pilot: Pilot[None], condition: Callable[[], bool]) -> None:
     await until(condition)
     await pilot.pause()
 
@@ -83,8 +83,8 @@ async def test_a_number_out_of_range_is_refused_with_the_range() -> None:
 async def test_escape_goes_back_and_q_leaves(keys: list[str], raised: type[Exception]) -> None:
     async with running(Asking("bring")) as (app, pilot):
         await pilot.press(*keys)
-        await seen(app, pilot, lambda: app.teaching.finished)
-    assert isinstance(app.teaching.error, raised)
+        await seen(app, pilot, lambda: app.steps.finished)
+    assert isinstance(app.steps.error, raised)
 
 
 @pytest.mark.parametrize(("key", "work"), [("s", "move"), ("ctrl+c", "move"), ("s", "run")])
@@ -98,7 +98,7 @@ async def test_a_stop_key_stops_what_is_at_work_and_ends_the_screen(key: str, wo
         await until(lambda: not app.is_running)
     assert asking.stopped_arm
     with pytest.raises(CollectAborted, match=r"look at the arm\. The same command resumes"):
-        app.teaching.join()
+        app.steps.join()
 
 
 def test_a_second_stop_key_works_at_once() -> None:
@@ -111,13 +111,13 @@ def test_a_second_stop_key_works_at_once() -> None:
         moving.set()
         await asyncio.sleep(60.0)
 
-    teaching = Teaching(moves_twice)
-    teaching.start()
-    teaching.stop()
+    steps = Steps(moves_twice)
+    steps.start()
+    steps.stop()
     assert moving.wait(PATIENCE_S)
-    teaching.stop()
+    steps.stop()
     with pytest.raises(CollectAborted):
-        teaching.join()
+        steps.join()
 
 
 async def test_leaving_while_something_is_at_work_asks_and_the_stop_key_works_over_it() -> None:

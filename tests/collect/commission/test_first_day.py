@@ -11,17 +11,17 @@ from types import SimpleNamespace
 
 import pytest
 
+from brushloop.collect.commission import camera, proof
+from brushloop.collect.commission.notebook import Notebook, TaughtFile
+from brushloop.collect.commission.proof import ProofStep, read_proof
+from brushloop.collect.commission.step import Visit
+from brushloop.collect.commission.wizard import Wizard
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.rig.doctor import Finding
-from brushloop.collect.teach import camera, proof
-from brushloop.collect.teach.day import Day, Target
-from brushloop.collect.teach.proof import ProofStep, read_proof
-from brushloop.collect.teach.store import Notebook, TaughtFile
-from brushloop.collect.teach.wizard import Wizard
 from brushloop.drivers.host import Clock, HostClock
 from brushloop.drivers.sim.lab_facts import Trap
 from brushloop.sessions.events import SelfCheckResult, ZeroTouchResult
-from tests.collect.teach.unknown import Errors, InLab, errors, first_day, in_lab, newest_session
+from tests.collect.commission.unknown import Errors, InLab, errors, first_day, in_lab, newest_session
 
 SMALL_PX = (800, 600)
 FAST = 30.0
@@ -93,8 +93,8 @@ def hurried(person: InLab) -> InLab:
     """A person who leaves the lens out."""
     bring = person.bring
 
-    async def without_lens(target: Target) -> bool:
-        return target.kind != "hold-board" and await bring(target)
+    async def without_lens(thing: str) -> bool:
+        return not thing.startswith("hold-board") and await bring(thing)
 
     person.bring = without_lens
     return person
@@ -129,7 +129,7 @@ async def test_killed_again_and_again_it_asks_nothing_twice_and_a_step_taught_ag
     assert kills > 10
     assert "this moves the arm. Start the same command again with --arm." in person.trouble
     assert len(person.brought) == len(set(person.brought)), "something was brought twice"
-    kinds = [target.kind for target in person.brought]
+    kinds = [thing.split()[0] for thing in person.brought]
     assert kinds.index("clear-view") < kinds.index("park"), "the proof begins where the arm is left: within the limits"
     once = ("R:", "L:", "Squares", "Side of a square", "Address of the cabinet")
     typed = [question for question in person.asked if question.startswith(once)]
@@ -141,9 +141,9 @@ async def test_killed_again_and_again_it_asks_nothing_twice_and_a_step_taught_ag
     _within_a_hands_error(errors(rig, person.lab), load_rig(rig).camera.latency_ms)
 
     before, brought = TaughtFile(rig).load(), len(person.brought)
-    await Wizard(Day(person, rig, HostClock(), armed=False)).again("tip")
+    await Wizard(Visit(person, rig, HostClock(), armed=False)).again("tip")
     after = TaughtFile(rig).load()
-    assert {target.kind for target in person.brought[brought:]} == {"pin", "upright"}
+    assert {thing.split()[0] for thing in person.brought[brought:]} == {"pin", "upright"}
     changed = {field for field, taught in after.values.items() if taught.value != before.values[field].value}
     assert {"robot.tcp_offset_mm", "paper.origin_mm", "ink.dip_z_mm"} <= changed
     assert {field.split(".")[0] for field in changed} <= {"robot", "paper", "ink", "motion", "board", "aside", "touch"}
@@ -171,7 +171,7 @@ async def _killed_in_each_part_of_the_proof(person: InLab, rig: Path, monkeypatc
         reached("doctor")
         return found
 
-    async def run(_step: ProofStep, _day: Day, folder: Path, _protocol: str, *, dry: bool) -> Path:
+    async def run(_step: ProofStep, _day: Visit, folder: Path, _protocol: str, *, dry: bool) -> Path:
         reached("dry run" if dry else "presses")
         return folder
 
@@ -239,7 +239,7 @@ async def test_thirty_labs(seed: int, tmp_path: Path) -> None:
         rig = tmp_path / "rig.toml"
         made = await first_day(person, rig)
         if trap is Trap.WRONG_BOARD_SIZE:  # the way out that is named: the camera's step depends on the board's size
-            assert await Wizard(Day(person, rig, HostClock(), armed=True)).again("camera") is None
+            assert await Wizard(Visit(person, rig, HostClock(), armed=True)).again("camera") is None
             made = await first_day(person, rig)
         assert trap is None or _named(person, trap), person.trouble
         if trap is not None:

@@ -1,21 +1,27 @@
-"""Where sheet and board lie, from their touched corners and by the camera; and which corners were mistaken."""
+"""Step 4: the sheet and the board under it, by their touched corners; and which corners were mistaken.
+
+A sheet that was named turned by half a turn together with its board looks right here; the three marks of the proof's
+self-check show it.
+"""
 
 from __future__ import annotations
 
 import itertools
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from brushloop.calibrate.board.lens import apply, homography
-from brushloop.calibrate.board.pix2len import paper_mm
-from brushloop.calibrate.board.spec import BoardSpec, BoardView, size_mm
-from brushloop.collect.errors import CannotTeach
+from brushloop.calibrate.board.spec import BoardSpec, size_mm
+from brushloop.collect.commission.arm import taught_arm, tip_of, touch
+from brushloop.collect.commission.camera import board_of
+from brushloop.collect.commission.notebook import Notebook, Taught, taught
+from brushloop.collect.commission.step import Step, Visit
+from brushloop.collect.errors import NotAccepted
 from brushloop.collect.rig.paper import PaperPlane, fit_plane
 
 Floats = NDArray[np.float64]
@@ -31,6 +37,123 @@ EXPLAINED, LEAST_MM = 0.2, 0.3
 """Names were mixed up if that explains all but this share of the largest misfit, or leaves no more than this."""
 ASKEW_DEG = 0.5
 """A sheet that is turned by more against its board must be laid straight: `rig.toml` has one turn for both."""
+BOARD, SHEET = "board-corner", "sheet-corner"
+THINGS = ((BOARD, "the board's outermost square"), (SHEET, "the sheet"))
+GOOD_MM = 0.13
+"""Standard error of the sheet's origin, in each axis, at which touching ends."""
+MOST_ROUNDS = 5
+WORST_MM = 0.25
+EASY_M = (0.25, 0.7)
+"""Distances from the foot of the arm at which it holds a brush upright without being folded up or stretched out."""
+INSET_MM = 2.0
+"""Distance of the touch point from the sheet's edges: beside every patch."""
+
+
+class SheetStep(Step):
+    """Origin, turn, size and plane of the sheet, and the board's place on it."""
+
+    name = "sheet"
+    title = "Sheet and board"
+    minutes = 8
+    needs = ("camera", "tip")
+    observes = (BOARD, SHEET)
+
+    async def carry_out(self, visit: Visit) -> None:
+        """Have the corners touched until the origin is known well enough. Raises `NotAccepted`, `StepError`."""
+        visit.say(
+            "Lay the board where the sheet will lie, in the middle of the picture, and the sheet on it, its edges "
+            "along the squares.",
+            "Touch each corner with the brush upright (hold a set square beside it), and hold still.",
+        )
+        async with taught_arm(visit.notebook) as reader:
+            for number in range(MOST_ROUNDS):
+                for kind, thing in THINGS:
+                    if number and kind == BOARD and number % 2:
+                        continue  # the sheet's own corners give its origin, and need more touches
+                    for corner in CORNERS:
+                        how = f"Bring the tip to the {corner} corner of {thing}" + (" once more." if number else ".")
+                        await touch(visit, reader, f"{kind} {number} {corner}", how, may_skip=True)
+                    if kind == BOARD:
+                        with visit.asked_again_if_refused(BOARD):
+                            check_board(all_corners(visit.notebook, BOARD), board_of(visit.notebook))
+                with visit.asked_again_if_refused(SHEET):
+                    fit = fitted(visit.notebook)
+                visit.say(*in_words(fit))
+                if fit.origin_sigma_mm <= GOOD_MM:
+                    break
+            with visit.asked_again_if_refused(BOARD, SHEET):
+                if (sigma_mm := fitted(visit.notebook).origin_sigma_mm) > WORST_MM:
+                    raise NotAccepted(
+                        f"the corner of the sheet is known to {sigma_mm:.2f} mm only.",
+                        "Fix the sheet, hold still while you press Enter, and touch the corners again.",
+                    )
+
+    def derived(self, notebook: Notebook) -> dict[str, Taught]:
+        """Everything that follows from the touched corners and the tip."""
+        fit = fitted(notebook)
+        plane, sigma_mm, point = fit.plane, fit.origin_sigma_mm, touch_point(fit)
+        touches = len(notebook.touched(BOARD)) + len(notebook.touched(SHEET))
+        how = f"{touches} corners of board and sheet touched by hand"
+        known = f"residuals up to {max(fit.residuals_mm.values()):.2f} mm"
+        leaning = f"the sheet leans by {plane.slope_deg:.2f} deg; not yet measured by touch"
+        z_mm, depth_mm = plane.touch_z_mm(*point), fit.depth_sigma_mm
+        return {
+            "paper.origin_mm": taught("sheet", list(fit.origin_mm), how, "mm", sigma=sigma_mm, known=known),
+            "paper.yaw_deg": taught("sheet", fit.yaw_deg, how, "deg", sigma=fit.yaw_sigma_deg, known=known),
+            "paper.size_mm": taught("sheet", list(fit.size_mm), how, "mm", sigma=sigma_mm, known=known),
+            "paper.touch_point_mm": taught("sheet", list(point), "beside every patch", "mm"),
+            "paper.touch_z_mm": taught("sheet", z_mm, how, "mm", sigma=depth_mm, known=leaning),
+            "board.origin_mm": taught("sheet", list(fit.board_origin_mm), how, "mm", sigma=sigma_mm, known=known),
+            "aside.plane": taught(
+                "sheet", [plane.z0_mm, plane.slope_x, plane.slope_y], how, "mm", sigma=depth_mm, known=known
+            ),
+        }
+
+
+def touch_point(fit: SheetFit) -> tuple[float, float]:
+    """Inside the lowest corner of the sheet: the floor of every press is counted from there."""
+    middle = np.array(fit.size_mm) / 2.0
+    points = middle + (corners_of(*fit.size_mm) - middle) * (1.0 - INSET_MM / middle)
+    x, y = min(points.tolist(), key=lambda at: fit.plane.touch_z_mm(at[0], at[1]))
+    return round(x, 3), round(y, 3)
+
+
+def all_corners(notebook: Notebook, kind: str) -> dict[str, list[Point]]:
+    """The tip at every touch of each corner, in the base frame. Raises `NotAccepted` where a corner was skipped."""
+    offset_mm, found = notebook.numbers("robot.tcp_offset_mm"), defaultdict[str, list[Point]](list)
+    for name, flange in notebook.touched(kind).items():
+        found[name.split(" ", 1)[1]].append(tip_of(flange, offset_mm))
+    thing = kind.removesuffix("-corner")
+    if missing := [f"{thing} {name}" for name in CORNERS if name not in found]:
+        nearest_m, farthest_m = EASY_M
+        raise NotAccepted(
+            f"not touched: {', '.join(missing)}.",
+            "All four corners of both are needed. What the arm does not reach by hand is out of its reach: move the "
+            f"board with the sheet, so that all corners are {nearest_m:g} to {farthest_m:g} m from the arm's foot, or "
+            "turn its wrist the other way round, and touch all corners again.",
+        )
+    return dict(found)
+
+
+def fitted(notebook: Notebook) -> SheetFit:
+    """The sheet from everything touched so far. Raises `NotAccepted` where a corner was skipped."""
+    return fit_sheet(all_corners(notebook, BOARD), all_corners(notebook, SHEET), board_of(notebook))
+
+
+def in_words(fit: SheetFit) -> tuple[str, ...]:
+    """The result in words for the person."""
+    (x, y), (width, height) = fit.origin_mm, fit.size_mm
+    worst = max(fit.residuals_mm, key=lambda name: fit.residuals_mm[name])
+    return (
+        f"sheet of {width:.1f} x {height:.1f} mm, origin ({x:.2f}, {y:.2f}) mm, known to {fit.origin_sigma_mm:.2f} mm "
+        f"(goal {GOOD_MM:g}), turned by {fit.yaw_deg:.2f} +- {fit.yaw_sigma_deg:.2f} deg, leaning by "
+        f"{fit.plane.slope_deg:.2f} deg",
+        f"largest residual: {worst}, {fit.residuals_mm[worst]:.2f} mm; "
+        f"the board measures {100 * fit.scale:.2f} % of its printed size",
+    )
+
+
+# From touched corners to the sheet
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,14 +183,14 @@ def corners_of(size_x_mm: float, size_y_mm: float) -> Floats:
 
 
 def check_board(board: Mapping[str, Sequence[Point]], spec: BoardSpec) -> None:
-    """Raise `CannotTeach` where the touched corners of the board do not form the printed one, and say why.
+    """Raise `NotAccepted` where the touched corners of the board do not form the printed one, and say why.
 
     Names swapped or given as in a mirror, a print of another size, or one corner that was touched badly.
     """
     printed = corners_of(*size_mm(spec))
     touched = np.array([np.mean(board[name], axis=0)[:2] for name in CORNERS])
     if problem := _mixed_up(touched, printed):
-        raise CannotTeach(
+        raise NotAccepted(
             f"the corners of the board {problem}.",
             "The name on the print is along its lower edge; seen from above, the corners follow counter-clockwise.",
         )
@@ -76,13 +199,13 @@ def check_board(board: Mapping[str, Sequence[Point]], spec: BoardSpec) -> None:
     if max(distances) > WORST_CORNER_MM:
         listed = ", ".join(f"{name} {off:.1f}" for name, off in zip(CORNERS, distances, strict=True))
         size_x_mm, size_y_mm = size_mm(spec)
-        raise CannotTeach(
+        raise NotAccepted(
             f"the corners of the board do not form its rectangle of {size_x_mm:g} x {size_y_mm:g} mm (off by, in mm: "
             f"{listed}).",
             "Touch the corner that is off again, or correct the description of the print in the camera step.",
         )
     if abs(scale - 1.0) > WORST_SCALE:
-        raise CannotTeach(
+        raise NotAccepted(
             f"the board is {100.0 * scale:.1f} % of its printed size: its squares measure "
             f"{scale * spec.square_mm:.2f} mm, not {spec.square_mm:g} mm.",
             "Print it again at 100 %, without `fit to page`, or measure ten squares with calipers and teach the camera "
@@ -115,7 +238,7 @@ def _mixed_up(touched: Floats, printed: Floats) -> str:
 def fit_sheet(board: Mapping[str, Sequence[Point]], sheet: Mapping[str, Sequence[Point]], spec: BoardSpec) -> SheetFit:
     """Least squares over all touches of four board corners and four sheet corners, by name; base frame, in mm.
 
-    The board gives most of the turn, the sheet's own corners its origin and its size. Raises `CannotTeach` for a sheet
+    The board gives most of the turn, the sheet's own corners its origin and its size. Raises `NotAccepted` for a sheet
     that lies askew on its board or whose corners were named otherwise, and `StepError` where it leans too much.
     """
     printed = corners_of(*size_mm(spec))
@@ -167,18 +290,18 @@ def _check_askew(b: Floats, bk: list[int], s: Floats, sk: list[int], printed: Fl
     along = (mean[1] - mean[0]) + (mean[2] - mean[3])
     up = (mean[3] - mean[0]) + (mean[2] - mean[1])
     if along[0] * up[1] - along[1] * up[0] <= 0.0:
-        raise CannotTeach(
+        raise NotAccepted(
             "the corners of the sheet were named as in a mirror.", "Seen from above they follow counter-clockwise."
         )
     own = math.atan2(along[1] - up[0], along[0] + up[1])
     askew = math.degrees(math.remainder(own - _turn_and_scale(printed[bk], b)[0], math.tau))
     if abs(abs(askew) - 180.0) < 30.0 or abs(abs(askew) - 90.0) < 30.0:
-        raise CannotTeach(
+        raise NotAccepted(
             f"the corners of the sheet were named turned by {askew:.0f} deg against those of the board.",
             "The lower left corner of both is the one beside the print's name.",
         )
     if abs(askew) > ASKEW_DEG:
-        raise CannotTeach(
+        raise NotAccepted(
             f"the sheet lies turned by {askew:+.1f} deg on its board.", "Lay its edges along the squares; touch again."
         )
 
@@ -200,87 +323,3 @@ def _distances(printed: Floats, touched: Floats) -> list[float]:
     turn = _rotation(_turn_and_scale(printed, touched)[0])
     off = touched - touched.mean(axis=0) - (printed - printed.mean(axis=0)) @ turn.T
     return [float(v) for v in np.linalg.norm(off, axis=1)]
-
-
-# Where the camera sees the sheet end on its board
-
-
-Margins = tuple[float, float, float, float]
-"""How much of the board is free beside the sheet in mm: left, right, lower, upper."""
-SIDES = ("left", "right", "lower", "upper")
-STEP_MM = 0.25
-MIDDLE = 0.5
-"""Share of the sheet's width or height over which an edge is looked for: corners may be bent."""
-LEAST_CONTRAST = 12.0
-"""Least difference in gray levels between the board's pattern and the plain sheet, as standard deviations along it."""
-TIMES_PLAIN = 2.5
-"""Least ratio of the two: a board without a sheet must not pass for plain paper."""
-OFF_MM = 2.5
-"""A touched edge that the camera sees farther off than this is doubted: hand and camera together err by 1 mm."""
-MISTAKEN = (
-    ((1, 0, 3, 2), "the corners were named turned by half a turn: upper for lower, right for left"),
-    ((1, 0, 2, 3), "left and right corners were taken for one another, as in a mirror"),
-    ((0, 1, 3, 2), "lower and upper corners were taken for one another, as in a mirror"),
-)
-"""Which touched side each seen one is, if corners were taken for one another."""
-
-
-def touched_margins(fit: SheetFit, spec: BoardSpec) -> Margins:
-    """As they follow from the touched corners."""
-    (x, y), (width, height), (board_width, board_height) = fit.board_origin_mm, fit.size_mm, size_mm(spec)
-    return -x, board_width + x - width, -y, board_height + y - height
-
-
-def seen_margins(image: NDArray[np.uint8], view: BoardView, spec: BoardSpec, touched: Margins) -> Margins | None:
-    """Where the board's pattern ends on each side, looking outward from the middle of the touched sheet.
-
-    `image` is an undistorted photograph, `view` its board, whose spec has its origin at (0, 0). None where an edge is
-    not seen.
-    """
-    left, right, lower, upper = touched
-    board = np.array(size_mm(spec))
-    to_pixels = homography(paper_mm(view, spec), view.pixels, "camera")
-    middle = (np.array([left - right, lower - upper]) + board) / 2.0
-    half = MIDDLE * (board - [left + right, lower + upper]) / 2.0
-    seen: list[float] = []
-    for axis, outward in ((0, -1), (0, 1), (1, -1), (1, 1)):
-        far = middle[axis] if outward < 0 else board[axis] - middle[axis]
-        out_mm = np.arange(0.0, far, STEP_MM)
-        beside_mm = np.arange(-half[1 - axis], half[1 - axis], STEP_MM)
-        points = np.empty((len(out_mm), len(beside_mm), 2))
-        points[..., axis] = middle[axis] + outward * out_mm[:, None]
-        points[..., 1 - axis] = middle[1 - axis] + beside_mm
-        at = apply(to_pixels, points.reshape(-1, 2)).reshape(points.shape).astype(np.float32)
-        gray = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
-        # The spread along the edge rises from that of plain paper to that of the pattern.
-        spread = np.asarray(gray, np.float64).std(axis=1)
-        plain, pattern = float(np.median(spread[: len(spread) // 3])), float(np.quantile(spread, 0.95))
-        if pattern - plain < LEAST_CONTRAST or pattern < TIMES_PLAIN * plain:
-            return None
-        seen.append(float(far - out_mm[int(np.argmax(spread > (plain + pattern) / 2.0))]))
-    return seen[0], seen[1], seen[2], seen[3]
-
-
-def check_seen(seen: Margins, touched: Margins) -> float:
-    """How far the touched edges are from the seen ones at worst, in mm.
-
-    Raises `CannotTeach` where that is more than `OFF_MM`, and says whether sides were taken for one another.
-    """
-
-    def off_mm(sides: tuple[int, ...]) -> float:
-        return max(abs(seen[k] - touched[side]) for k, side in enumerate(sides))
-
-    if (as_named_mm := off_mm((0, 1, 2, 3))) <= OFF_MM:
-        return as_named_mm
-    for sides, what in MISTAKEN:
-        if off_mm(sides) <= OFF_MM:
-            raise CannotTeach(
-                f"the camera sees the sheet elsewhere on its board: {what}.",
-                "Touch the corners of board and sheet again; lower left is the one beside the beginning of its name.",
-            )
-    pairs = zip(SIDES, seen, touched, strict=True)
-    listed = ", ".join(f"{side} {far:.1f} mm ({by_hand:.1f} touched)" for side, far, by_hand in pairs)
-    raise CannotTeach(
-        f"the camera sees other margins of the board beside the sheet than were touched: {listed}.",
-        "Sheet or board has moved, or a corner was touched beside the sheet: touch all corners again.",
-    )

@@ -6,17 +6,17 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.collect.errors import CannotTeach, CollectAborted, ConfigError, StepError
+from brushloop.collect.commission.arm import ArmStep
+from brushloop.collect.commission.brush import BrushStep, ForceStep
+from brushloop.collect.commission.camera import CameraStep
+from brushloop.collect.commission.notebook import Notebook, Value, write_rig
+from brushloop.collect.commission.places import LimitsStep, PlacesStep
+from brushloop.collect.commission.proof import ProofStep
+from brushloop.collect.commission.sheet import SheetStep
+from brushloop.collect.commission.step import LeftOff, Step, Visit, WentBack, choice_of
+from brushloop.collect.commission.tip import TipStep
+from brushloop.collect.errors import CollectAborted, ConfigError, NotAccepted, StepError
 from brushloop.collect.operator import Choice
-from brushloop.collect.teach.arm import ArmStep
-from brushloop.collect.teach.brush import BrushStep, ForceStep
-from brushloop.collect.teach.camera import CameraStep
-from brushloop.collect.teach.day import Day, LeftOff, Step, WentBack, choice_of
-from brushloop.collect.teach.places import LimitsStep, PlacesStep
-from brushloop.collect.teach.proof import ProofStep
-from brushloop.collect.teach.sheet import SheetStep
-from brushloop.collect.teach.store import Notebook, Value, write_rig
-from brushloop.collect.teach.tip import TipStep
 from brushloop.drivers.errors import DeviceError
 
 STEPS = (
@@ -32,14 +32,14 @@ STEPS = (
 )
 AGAIN, AFRESH = Choice("a", "try this step again, where it was"), Choice("f", "teach this step from its beginning")
 STOPPED = "stopped; the same command resumes from there"
-REFUSED = (CannotTeach, DeviceError, CalibrationError, StepError, ConfigError)
+REFUSED = (NotAccepted, DeviceError, CalibrationError, StepError, ConfigError)
 
 
 class Wizard:
     """Leads a person through the steps."""
 
-    def __init__(self, day: Day, steps: Sequence[Step] = STEPS) -> None:
-        self._day = day
+    def __init__(self, visit: Visit, steps: Sequence[Step] = STEPS) -> None:
+        self._visit = visit
         self._steps = tuple(steps)
 
     async def run(self) -> Path:
@@ -47,9 +47,9 @@ class Wizard:
 
         Raises `CollectAborted` where the person stops: the same command resumes from there.
         """
-        while step := next((step for step in self._steps if step.name not in self._day.notebook.done), None):
+        while step := next((step for step in self._steps if step.name not in self._visit.notebook.done), None):
             await self._attempt(step)
-        return await self._written()
+        return self._written()
 
     async def again(self, name: str) -> Path | None:
         """Teach one step again; returns the path of `rig.toml` if it could be written.
@@ -59,21 +59,21 @@ class Wizard:
         step = next((step for step in self._steps if step.name == name), None)
         if step is None:
             raise ConfigError("STEP", "", f"{name!r} is not one of {', '.join(step.name for step in self._steps)}")
-        missing = [need for need in step.needs if need not in self._day.notebook.done]
+        missing = [need for need in step.needs if need not in self._visit.notebook.done]
         if missing:
             raise CollectAborted(
                 f"`{name}` depends on {', '.join(missing)}, which is not taught yet: `brushloop rig new` resumes there"
             )
         self._forget(step)
-        while step.name not in self._day.notebook.done:
+        while step.name not in self._visit.notebook.done:
             await self._attempt(step)
-        open_steps = [step.name for step in self._steps if step.name not in self._day.notebook.done]
-        return await self._written() if open_steps in ([], ["proof"]) else None
+        open_steps = [step.name for step in self._steps if step.name not in self._visit.notebook.done]
+        return self._written() if open_steps in ([], ["proof"]) else None
 
     def _forget(self, step: Step) -> None:
         """Forget what a step observed; going back undoes that."""
-        self._day.mark()
-        self._day.save(self._day.notebook.without(*step.observes).reopened(step.name))
+        self._visit.mark()
+        self._visit.save(self._visit.notebook.without(*step.observes).reopened(step.name))
 
     async def _attempt(self, step: Step) -> None:
         """Teach a step once. Where the person goes back, or where it fails, the notebook says what comes next.
@@ -81,37 +81,37 @@ class Wizard:
         Raises `CollectAborted` where the person stops.
         """
         number = self._steps.index(step) + 1
-        await self._day.guide.begin(f"step {number} of {len(self._steps)}: {step.title}, about {step.minutes} min")
+        self._visit.guide.step = f"step {number} of {len(self._steps)}: {step.title}, about {step.minutes} min"
         if step.name == "proof":
-            await self._written()
+            self._written()
         try:
-            await self._teach(step)
+            await self._carry_out(step)
         except LeftOff:
             raise CollectAborted(STOPPED) from None
         except WentBack:
-            self._day.back()
+            self._visit.back()
 
-    async def _teach(self, step: Step) -> None:
+    async def _carry_out(self, step: Step) -> None:
         """Teach a step and finish it, or ask how to go on where it is refused."""
-        before = self._day.notebook
+        before = self._visit.notebook
         try:
-            await step.teach(self._day)
-            await self._derive(step, before)
+            await step.carry_out(self._visit)
+            self._derive(step, before)
         except REFUSED as error:
-            await self._day.say(*_in_lines(error), tone="trouble")
+            self._visit.say(*_in_lines(error), tone="trouble")
             how = choice_of("How do you want to go on?", (AGAIN, AFRESH), AGAIN.key)
-            if await self._day.guide.ask(how) == AFRESH.key:
+            if await self._visit.guide.ask(how) == AFRESH.key:
                 self._forget(step)
 
-    async def _derive(self, step: Step, before: Notebook) -> None:
+    def _derive(self, step: Step, before: Notebook) -> None:
         """Finish a step: compute again what depends on it, list what changed, and void an earlier proof."""
-        notebook, resting = self._day.notebook, {step.name}
+        notebook, resting = self._visit.notebook, {step.name}
         for other in self._steps:
             if resting & set(other.needs):
                 resting.add(other.name)
             if other.name == step.name or (other.name in resting and other.name in notebook.done):
                 notebook = notebook.with_values(other.derived(notebook))
-        self._day.save(notebook.finished(step.name))
+        self._visit.save(notebook.finished(step.name))
         changed = [
             f"{field}: {_shown(old.value)} -> {_shown(new.value)}"
             for field, new in notebook.values.items()
@@ -120,20 +120,20 @@ class Wizard:
             and _shown(old.value) != _shown(new.value)
         ]
         if changed:
-            await self._day.say("Changed with it, because it depends on this step:", *changed)
-        await self._day.say(f"{step.title}: done")
+            self._visit.say("Changed with it, because it depends on this step:", *changed)
+        self._visit.say(f"{step.title}: done")
 
-    async def _written(self) -> Path:
+    def _written(self) -> Path:
         """Write `rig.toml`, which says whether it is proven."""
-        path, kept = write_rig(self._day.rig_path, self._day.notebook)
+        path, kept = write_rig(self._visit.rig_path, self._visit.notebook)
         before = "" if kept is None else f"; as it was before: {kept}"
-        await self._day.say(f"{path}: written, with how each value was obtained{before}")
+        self._visit.say(f"{path}: written, with how each value was obtained{before}")
         return path
 
 
 def _in_lines(error: Exception) -> tuple[str, ...]:
     match error:
-        case CannotTeach():
+        case NotAccepted():
             return error.what, error.way_out
         case DeviceError():
             # With the notes: one of them may say that the arm was not seen at rest.

@@ -8,18 +8,18 @@ import math
 import threading
 from collections.abc import Iterator
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from brushloop.collect.commission.step import Guide, LeftOff, Shown, Visit
+from brushloop.collect.commission.wizard import Wizard
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.operator import Prompt
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.paper import to_base
-from brushloop.collect.teach.day import Day, LeftOff, Picture, Shown, Target
-from brushloop.collect.teach.wizard import Wizard
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.lab import UnknownLab
 from brushloop.drivers.sim.lab_facts import Trap
@@ -29,32 +29,26 @@ from tests.waiting import PATIENCE_S
 KEYS = {"station": "i", "pump": "p", "none": "n"}
 
 
-@dataclass
-class InLab:
+class InLab(Guide):
     """A person in an unknown lab, whose servers run in another thread."""
 
-    lab: UnknownLab
-    loop: asyncio.AbstractEventLoop
-    lines: list[str] = field(default_factory=list)
-    asked: list[str] = field(default_factory=list)
-    brought: list[Target] = field(default_factory=list)
-    leave_after: int | None = None
-    """Number of requests to bring something after which the session is cut."""
-    mends: bool = False
-    """Whether the person sees to what the wizard names, and goes on."""
+    def __init__(self, lab: UnknownLab, loop: asyncio.AbstractEventLoop) -> None:
+        super().__init__()
+        self.lab, self.loop = lab, loop
+        self.lines: list[str] = []
+        self.asked: list[str] = []
+        self.brought: list[str] = []
+        self.leave_after: int | None = None
+        """Number of requests to bring something after which the session is cut."""
+        self.mends = False
+        """Whether the person sees to what the wizard names, and goes on."""
 
-    async def begin(self, step: str) -> None:
-        self.lines.append(step)
-
-    async def show(self, what: Shown) -> None:
+    def show(self, what: Shown) -> None:
         self.lines += [f"{what.tone}: {line}" for line in what.lines]
 
-    def see(self, picture: Picture | None) -> None:
-        pass
-
-    async def ask(self, prompt: Prompt, target: Target | None = None) -> Any:
-        if target is not None:
-            return await self.bring(target)
+    async def ask(self, prompt: Prompt) -> Any:
+        if prompt.thing:
+            return await self.bring(prompt.thing)
         self.asked.append(prompt.question)
         if prompt.read is not None:
             return prompt.read(self._typed(prompt.question) or prompt.default)
@@ -93,11 +87,12 @@ class InLab:
         }
         return next((v for start, v in read.items() if question.startswith(start)), "")
 
-    async def bring(self, target: Target) -> bool:
+    async def bring(self, thing: str) -> bool:
         if self.leave_after is not None and len(self.brought) >= self.leave_after:
             raise LeftOff
-        self.brought.append(target)
-        answer = await self._in_lab(self.lab.bring(target.kind, target.index, target.corner))
+        self.brought.append(thing)
+        kind, index, *corner = thing.split(" ", 2)
+        answer = await self._in_lab(self.lab.bring(kind, int(index), *corner))
         self.lines.append(f"person: {answer['says']}")
         return bool(answer["reached"])
 
@@ -139,7 +134,7 @@ def in_lab(seed: int, trap: Trap | None = None, **options: Any) -> Iterator[InLa
 async def first_day(person: InLab, rig_path: Path, *, armed: bool = True) -> Path | None:
     """Run the wizard once; None where the person left off."""
     try:
-        return await Wizard(Day(person, rig_path, HostClock(), armed=armed)).run()
+        return await Wizard(Visit(person, rig_path, HostClock(), armed=armed)).run()
     except CollectAborted:
         return None
 

@@ -9,14 +9,14 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+from brushloop.collect.commission.notebook import rig_of
+from brushloop.collect.commission.step import Step, Visit
 from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.open_or_resume import CollectRequest, Opening
-from brushloop.collect.errors import CannotTeach
+from brushloop.collect.errors import NotAccepted
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.doctor import examine
 from brushloop.collect.rig.paper import PaperPlane
-from brushloop.collect.teach.day import Day, Step
-from brushloop.collect.teach.store import rig_of
 from brushloop.collect.walk import check_protocol
 from brushloop.drivers.host import finished
 from brushloop.sessions.events import CaptureResult, SelfCheckResult, ZeroTouchResult
@@ -44,75 +44,78 @@ class ProofStep(Step):
     minutes = 20
     needs = ("arm", "camera", "tip", "sheet", "places", "brush", "force", "limits")
 
-    async def teach(self, day: Day) -> None:
-        """Prove what was taught, and measure height and delay by it. Raises `CannotTeach` and what the run raises."""
-        rig = rig_of(day.notebook, day.rig_path)
-        await self._doctor(day, rig)
+    async def carry_out(self, visit: Visit) -> None:
+        """Prove what was taught, and measure height and delay by it. Raises `NotAccepted` and what the run raises."""
+        rig = rig_of(visit.notebook, visit.rig_path)
+        await self._doctor(visit, rig)
         depth_mm = min(PRESS_SHARE * rig.brush.max_depth_mm, DEEPEST_DRY_MM)
         protocol = f'kind = "grid"\ndepths_mm = [{depth_mm:g}]\ntilts_deg = [0.0]\nrepeats = {PRESSES}\n'
-        await day.may_move(f"Dry run, {ABOVE_MM:g} mm above the sheet")
+        await visit.may_move(f"Dry run, {ABOVE_MM:g} mm above the sheet")
         with tempfile.TemporaryDirectory(prefix="brushloop-proof-") as folder:
-            await self._run(day, Path(folder), protocol, dry=True)
-        await day.say("The dry run made every move of a press without touching anything.")
-        await day.may_move(
+            await self._run(visit, Path(folder), protocol, dry=True)
+        visit.say("The dry run made every move of a press without touching anything.")
+        await visit.may_move(
             f"Touch the sheet, press three marks and {PRESSES} strokes: the well must hold ink, the sheet be blank"
         )
-        session = await self._run(day, folder_beside(day.rig_path), protocol, dry=False)
-        await day.say(f"Recorded in {session}.")
-        await self._keep(day, *read_proof(session))
+        session = await self._run(visit, folder_beside(visit.rig_path), protocol, dry=False)
+        visit.say(f"Recorded in {session}.")
+        await self._keep(visit, *read_proof(session))
 
-    async def _doctor(self, day: Day, rig: RigConfig) -> None:
-        await day.working("asking every device")
-        findings = await examine(rig, day.clock)
+    async def _doctor(self, visit: Visit, rig: RigConfig) -> None:
+        visit.guide.working("asking every device")
+        findings = await examine(rig, visit.clock)
         for finding in findings:
-            await day.say(f"{finding.device}: {finding.identity or finding.address}; {finding.notes}")
+            visit.say(f"{finding.device}: {finding.identity or finding.address}; {finding.notes}")
         ill = [finding for finding in findings if not finding.well]
         if ill:
-            raise CannotTeach(f"{ill[0].device}: {ill[0].problem}.", ill[0].remedy or "Check power, cable and address.")
+            raise NotAccepted(f"{ill[0].device}: {ill[0].problem}.", ill[0].remedy or "Check power, cable and address.")
 
-    async def _run(self, day: Day, folder: Path, protocol: str, *, dry: bool) -> Path:
+    async def _run(self, visit: Visit, folder: Path, protocol: str, *, dry: bool) -> Path:
         """Run the protocol slowly on what was taught; returns the session's folder.
 
         Raises `ConfigError` before anything is connected if a pose would lie outside the limits.
         """
         protocol_path = folder / "protocol.toml"
         protocol_path.write_text(protocol, encoding="utf-8")
-        request = CollectRequest(day.rig_path, protocol_path, folder / "sessions", armed=True, on_screen=True)
+        request = CollectRequest(visit.rig_path, protocol_path, folder / "sessions", armed=True, on_screen=True)
         opening = Opening.load(replace(request, dry_run_mm=ABOVE_MM if dry else None))
         opening = replace(opening, rig=slowly(opening.rig))
-        check_protocol(day.rig_path, protocol_path, opening.rig, opening.protocol)
-        engine = Engine(opening, None, day.clock)
+        check_protocol(visit.rig_path, protocol_path, opening.rig, opening.protocol)
+        engine = Engine(opening, None, visit.clock)
         engine.start()
         try:
-            await self._followed(day, engine)
+            await self._followed(visit, engine)
         finally:
             if not engine.finished:
                 engine.stop()
             await finished(asyncio.to_thread(engine.join))
         return Path(engine.snapshot().folder)
 
-    async def _followed(self, day: Day, engine: Engine) -> None:
+    async def _followed(self, visit: Visit, engine: Engine) -> None:
         """Show what the run does and reports, and pass its questions on to the person."""
         shown, doing = 0, ""
         while True:
             over, now = engine.finished, engine.snapshot()
             if lines := now.messages[max(shown - now.messages_before, 0) :]:
-                await day.say(*lines)
+                visit.say(*lines)
             shown = now.messages_before + len(now.messages)
             if over:
                 return
             if now.step != doing:
                 doing = now.step
-                await day.working(f"run: {doing}")
+                visit.guide.working(f"run: {doing}")
             if (asked := now.prompt) is not None:
-                engine.answer(asked.number, str(await day.guide.ask(asked)))
+                engine.answer(asked.number, str(await visit.guide.ask(asked)))
             await asyncio.sleep(POLL_S)
 
     async def _keep(
-        self, day: Day, touch: ZeroTouchResult, check: SelfCheckResult, captures: list[CaptureResult]
+        self, visit: Visit, touch: ZeroTouchResult, check: SelfCheckResult, captures: list[CaptureResult]
     ) -> None:
-        plane, by_hand_mm = PaperPlane(touch.touch_z_mm, touch.slope_x, touch.slope_y), day.notebook.number(HEIGHT)
-        x_mm, y_mm = day.notebook.numbers("paper.touch_point_mm")
+        plane, by_hand_mm = (
+            PaperPlane(touch.touch_z_mm, touch.slope_x, touch.slope_y),
+            visit.notebook.number(HEIGHT),
+        )
+        x_mm, y_mm = visit.notebook.numbers("paper.touch_point_mm")
         z_mm, worst_mm = plane.touch_z_mm(x_mm, y_mm), max(map(abs, touch.residuals_mm), default=0.0)
         sigmas_mm = [sigma_mm for point in touch.points for sigma_mm in point.sigma_mm if sigma_mm is not None]
         sigma_mm = max([*sigmas_mm, LEAST_SIGMA_MM])
@@ -121,23 +124,23 @@ class ProofStep(Step):
         known = f"residuals up to {worst_mm:.3f} mm; by hand it was {by_hand_mm:.2f} mm"
         again = sum(capture.retake for capture in captures)
         later = "the arm was seen to leave the picture later than it did"
-        with day.together():
-            day.keep("proof", HEIGHT, z_mm, how, "mm", sigma=sigma_mm, known=known)
-            day.keep("proof", "aside.plane", [plane.z0_mm, plane.slope_x, plane.slope_y], how, "mm", sigma=sigma_mm)
-            day.keep("proof", "camera.latency_ms", delay_ms, later, "ms", known=f"trips differ by {jitter_ms:.0f} ms")
-        await day.say(
+        with visit.together():
+            visit.keep("proof", HEIGHT, z_mm, how, "mm", sigma=sigma_mm, known=known)
+            visit.keep("proof", "aside.plane", [plane.z0_mm, plane.slope_x, plane.slope_y], how, "mm", sigma=sigma_mm)
+            visit.keep("proof", "camera.latency_ms", delay_ms, later, "ms", known=f"trips differ by {jitter_ms:.0f} ms")
+        visit.say(
             f"touch height {z_mm:.3f} mm ({z_mm - by_hand_mm:+.2f} mm from the touch by hand), {known}",
             f"self-check: marks {check.offset_mm[0]:+.1f}, {check.offset_mm[1]:+.1f} mm from where they were "
             f"commanded, turned by {check.turn_deg:+.2f} deg",
             f"{PRESSES} presses passed the quality checks, {again} were repeated; camera delay {delay_ms:.0f} ms",
         )
         if delay_ms > SLOW_CAMERA_MS:
-            await day.say(
+            visit.say(
                 f"The camera is slow: {delay_ms / 1e3:.1f} s. Each photograph waits for it.",
                 "Use a cable instead of Wi-Fi, MJPEG instead of H.264, fewer pixels, or no buffer in between.",
                 tone="warning",
             )
-        await day.say("Lay a fresh sheet before the first session: this one has the marks of the proof.", "READY")
+        visit.say("Lay a fresh sheet before the first session: this one has the marks of the proof.", "READY")
 
 
 def slowly(rig: RigConfig) -> RigConfig:
@@ -155,7 +158,7 @@ def slowly(rig: RigConfig) -> RigConfig:
 
 
 def read_proof(session: Path) -> tuple[ZeroTouchResult, SelfCheckResult, list[CaptureResult]]:
-    """Touch, self-check and captures of the session. Raises `CannotTeach` unless all presses passed the quality checks.
+    """Touch, self-check and captures of the session. Raises `NotAccepted` unless all presses passed the quality checks.
 
     Captures that failed a check and were repeated on another patch are among them.
     """
@@ -165,14 +168,14 @@ def read_proof(session: Path) -> tuple[ZeroTouchResult, SelfCheckResult, list[Ca
     passed = [capture for capture in last if capture.kept and not capture.verdict]
     if len(passed) < PRESSES:
         why = sorted({capture.verdict or "left out" for capture in last if capture not in passed})
-        raise CannotTeach(
+        raise NotAccepted(
             f"{len(passed)} of {PRESSES} presses passed the quality checks "
             f"({', '.join(why) or 'the others were not made'}).",
             "Look at their pictures above: ink, light, sheet; then run the proof again.",
         )
     touches, checks = state.results(ZeroTouchResult), state.results(SelfCheckResult)
     if not touches or not checks:
-        raise CannotTeach("the run had no touch or no self-check.", "Report this as a defect.")
+        raise NotAccepted("the run had no touch or no self-check.", "Report this as a defect.")
     return touches[-1], checks[-1], captures
 
 

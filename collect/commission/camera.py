@@ -23,11 +23,11 @@ from brushloop.calibrate.board.lens import (
 from brushloop.calibrate.board.spec import BoardSpec, BoardView, describe
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_gray
-from brushloop.collect.errors import CannotTeach
+from brushloop.collect.commission.notebook import Notebook
+from brushloop.collect.commission.step import Asked, Step, Visit
+from brushloop.collect.errors import NotAccepted
 from brushloop.collect.operator import Choice
 from brushloop.collect.photograph.frames import gray
-from brushloop.collect.teach.day import Asked, Day, Step, Target
-from brushloop.collect.teach.store import Notebook
 from brushloop.drivers.camera import CameraTable, Locked, OpenCvCamera, found_settings
 from brushloop.drivers.devices import Stamp
 from brushloop.drivers.errors import DeviceError
@@ -91,144 +91,144 @@ class CameraStep(Step):
     needs = ("arm",)
     observes = ("camera.", *PRINTED, "aside.sources", VIEW)
 
-    async def teach(self, day: Day) -> None:
-        """Ask for source and print, measure the rest. Raises `CannotTeach`, `DeviceError`, `CalibrationError`."""
-        if "board.squares" not in day.notebook.values:
-            await self._print(day)
-        if "camera.source" not in day.notebook.values:
-            await self._source(day)
-        async with taught_camera(day.notebook, day.clock) as camera:
-            await day.working("looking for the board")
-            await self._first_look(day, await still(camera, day.clock))
-            await self._lens(day, camera)
+    async def carry_out(self, visit: Visit) -> None:
+        """Ask for source and print, measure the rest. Raises `NotAccepted`, `DeviceError`, `CalibrationError`."""
+        if "board.squares" not in visit.notebook.values:
+            await self._print(visit)
+        if "camera.source" not in visit.notebook.values:
+            await self._source(visit)
+        async with taught_camera(visit.notebook, visit.clock) as camera:
+            visit.guide.working("looking for the board")
+            await self._first_look(visit, await still(camera, visit.clock))
+            await self._lens(visit, camera)
 
-    async def _print(self, day: Day) -> None:
-        await day.say("The board: a print of `brushloop camera board`. Its name stands along its lower edge.")
-        await day.values("camera", *PRINT)
-        squares: list[float] = [int(day.notebook.number(f"aside.squares_{side}")) for side in ("across", "along")]
-        with day.asked_again_if_refused(*PRINTED), day.together():
-            day.keep("camera", "board.squares", squares, FROM_PRINT)
+    async def _print(self, visit: Visit) -> None:
+        visit.say("The board: a print of `brushloop camera board`. Its name stands along its lower edge.")
+        await visit.values("camera", *PRINT)
+        squares: list[float] = [int(visit.notebook.number(f"aside.squares_{side}")) for side in ("across", "along")]
+        with visit.asked_again_if_refused(*PRINTED), visit.together():
+            visit.keep("camera", "board.squares", squares, FROM_PRINT)
             try:
-                board_of(day.notebook)
+                board_of(visit.notebook)
             except ValueError as error:
-                raise CannotTeach(f"no such board: {error}".splitlines()[0] + ".", "Read the print again.") from None
+                raise NotAccepted(f"no such board: {error}".splitlines()[0] + ".", "Read the print again.") from None
 
-    async def _source(self, day: Day) -> None:
+    async def _source(self, visit: Visit) -> None:
         devices = sorted((p.name[5:] for p in Path("/dev").glob("video*") if p.name[5:].isdecimal()), key=int)
         if devices:
-            await day.say(f"Video devices of this computer: {', '.join(devices)}")
+            visit.say(f"Video devices of this computer: {', '.join(devices)}")
         question = "Address of the camera's stream, as http://192.0.2.8/stream.mjpg (several: separated by spaces)"
-        await day.values("camera", Asked("aside.sources", question))
-        typed = str(day.notebook.get("aside.sources")).split()
-        seen = {source: await self._looked_at(day, source) for source in dict.fromkeys([*typed, *devices])}
+        await visit.values("camera", Asked("aside.sources", question))
+        typed = str(visit.notebook.get("aside.sources")).split()
+        seen = {source: await self._looked_at(visit, source) for source in dict.fromkeys([*typed, *devices])}
         usable = {source: look for source, look in seen.items() if look is not None}
         if not usable:
-            day.save(day.notebook.without("aside.sources"))
-            raise CannotTeach("no camera gives a picture.", "Check power, cable and address; then try again.")
+            visit.save(visit.notebook.without("aside.sources"))
+            raise NotAccepted("no camera gives a picture.", "Check power, cable and address; then try again.")
         source = max(usable, key=lambda source: usable[source][0])
         if len(usable) > 1:
             choices = tuple(Choice(str(number), source) for number, source in enumerate(usable, 1))
             pictures = side_by_side([picture for _, picture in usable.values()])
-            await day.say(f"{len(usable)} cameras give a picture, numbered as below.", picture=pictures)
+            visit.say(f"{len(usable)} cameras give a picture, numbered as below.", picture=pictures)
             best = next(choice.key for choice in choices if choice.label == source)
-            chosen = await day.choose("Which of them looks at the sheet?", choices, best)
+            chosen = await visit.choose("Which of them looks at the sheet?", choices, best)
             source = next(choice.label for choice in choices if choice.key == chosen)
         # What a device chose by itself; the settings of a stream only its own set-up can change.
         locked = await asyncio.to_thread(found_settings, int(source), SETTLE_S) if source.isdecimal() else {}
         if not locked:
-            await day.say(
+            visit.say(
                 "The settings of a stream cannot be set from here: switch automatic exposure, white balance and focus "
                 "off in the camera's own set-up.",
                 tone="warning",
             )
-        with day.together():
-            day.keep("camera", "camera.kind", "opencv", "the only kind")
+        with visit.together():
+            visit.keep("camera", "camera.kind", "opencv", "the only kind")
             for name, value in locked.items():
                 whole = int(value) if name in ("width", "height") else value
-                day.keep("camera", f"camera.locked.{name}", whole, "chosen by the camera itself, locked, read back")
-            day.keep("camera", "camera.source", source, "typed or found, and its picture was seen")
+                visit.keep("camera", f"camera.locked.{name}", whole, "chosen by the camera itself, locked, read back")
+            visit.keep("camera", "camera.source", source, "typed or found, and its picture was seen")
 
-    async def _looked_at(self, day: Day, source: str) -> tuple[int, Gray] | None:
+    async def _looked_at(self, visit: Visit, source: str) -> tuple[int, Gray] | None:
         """Show a picture of a camera; return how many corners of the board it shows, and the picture, if any."""
-        await day.working(f"waiting for a picture of {source}")
+        visit.guide.working(f"waiting for a picture of {source}")
         try:
-            async with opened(source, day.clock) as camera:
-                picture = await still(camera, day.clock)
+            async with opened(source, visit.clock) as camera:
+                picture = await still(camera, visit.clock)
         except DeviceError as error:
-            await day.say(f"{source}: {error.what}", tone="warning")
+            visit.say(f"{source}: {error.what}", tone="warning")
             return None
         height, width = picture.shape
         try:
-            corners = len((await asyncio.to_thread(find_board, picture, board_of(day.notebook), source)).ids)
+            corners = len((await asyncio.to_thread(find_board, picture, board_of(visit.notebook), source)).ids)
             what = f"{corners} corners of the board are seen"
         except CalibrationError as error:
             corners, what = 0, error.what
-        await day.say(f"{source}: {width} x {height} px; {what}", picture=picture)
+        visit.say(f"{source}: {width} x {height} px; {what}", picture=picture)
         return corners, picture
 
-    async def _first_look(self, day: Day, picture: Gray) -> None:
+    async def _first_look(self, visit: Visit, picture: Gray) -> None:
         """The board where it lies: a mirrored camera and a wrong print show at once."""
         try:
-            await asyncio.to_thread(find_board, picture, board_of(day.notebook), "camera")
+            await asyncio.to_thread(find_board, picture, board_of(visit.notebook), "camera")
         except CalibrationError as error:
             if "mirrored" in error.what:
-                raise CannotTeach(f"{error.what}.", MIRRORED) from None
+                raise NotAccepted(f"{error.what}.", MIRRORED) from None
             if "another board" in error.what or "arranged" in error.what:
-                day.save(day.notebook.without(*PRINTED))
-                raise CannotTeach(f"{error.what}.", OTHER_PRINT) from None
-            await day.say(f"The board is not seen yet: {error.what}", picture=picture, tone="warning")
+                visit.save(visit.notebook.without(*PRINTED))
+                raise NotAccepted(f"{error.what}.", OTHER_PRINT) from None
+            visit.say(f"The board is not seen yet: {error.what}", picture=picture, tone="warning")
 
-    async def _lens(self, day: Day, camera: OpenCvCamera) -> None:
+    async def _lens(self, visit: Visit, camera: OpenCvCamera) -> None:
         """Fit the lens to photographs of the held board; nothing where the person skips the first ones."""
-        spec, folder = board_of(day.notebook), day.rig_path.with_name(f"{day.rig_path.stem}.lens")
+        spec, folder = board_of(visit.notebook), visit.rig_path.with_name(f"{visit.rig_path.stem}.lens")
         folder.mkdir(exist_ok=True)
-        taken = [folder / str(name) for name in day.notebook.table(VIEW).values()]
+        taken = [folder / str(name) for name in visit.notebook.table(VIEW).values()]
         views = [
             await asyncio.to_thread(find_board, read_gray(path), spec, path.name) for path in taken if path.is_file()
         ]
         for index in range(MOST_VIEWS):
-            if f"{VIEW}{index:02d}" in day.notebook.values:
+            if f"{VIEW}{index:02d}" in visit.notebook.values:
                 continue
             if len(views) >= GOOD_VIEWS and not still_missing(views):
                 break
-            if not await self._held(day, camera, folder, index, views) and not views:
-                await day.say("Without a lens file, straight lines must look straight in the picture.", tone="warning")
+            if not await self._held(visit, camera, folder, index, views) and not views:
+                visit.say("Without a lens file, straight lines must look straight in the picture.", tone="warning")
                 return
             if views and (todo := still_missing(views)):
-                await day.say(*todo)
-        await day.working("computing the lens")
+                visit.say(*todo)
+        visit.guide.working("computing the lens")
         digests = {view.name: hashlib.sha256((folder / view.name).read_bytes()).hexdigest() for view in views}
         file = await asyncio.to_thread(fit_lens, views, describe(spec), digests, {})
         for warning in (*file.warnings, *file.guidance):
-            await day.say(warning, tone="warning")
-        path, reach = file.save(day.rig_path.parent), file.focal_reach_px
+            visit.say(warning, tone="warning")
+        path, reach = file.save(visit.rig_path.parent), file.focal_reach_px
         how = f"fitted to {len(file.residuals_px)} photographs of the board held in {file.ways} ways"
         known = f"residual {file.rms_px:.2f} px"
         known += "" if reach is None else f", focal length to +-{max(reach):.1f} px (95 %)"
-        day.keep("camera", "camera.lens_file", str(path.relative_to(day.rig_path.parent)), how, known=known)
-        await day.say(f"Lens: residual {file.rms_px:.2f} px over {len(file.residuals_px)} photographs.")
+        visit.keep("camera", "camera.lens_file", str(path.relative_to(visit.rig_path.parent)), how, known=known)
+        visit.say(f"Lens: residual {file.rms_px:.2f} px over {len(file.residuals_px)} photographs.")
 
-    async def _held(self, day: Day, camera: OpenCvCamera, folder: Path, index: int, views: list[BoardView]) -> bool:
+    async def _held(self, visit: Visit, camera: OpenCvCamera, folder: Path, index: int, views: list[BoardView]) -> bool:
         """Take one photograph of the held board, so that a resumed session does not; False if the person skips it."""
         where = HOLD[index] if index < len(HOLD) else "where it is still missing"
         how = f"Cover the sheet, and hold the board before the camera, {where}, all of it sharp; keep still."
-        async with shown_live(day, camera):
-            if not await day.brought(how, Target("hold-board", index), may_skip=True):
+        async with shown_live(visit, camera):
+            if not await visit.brought(f"hold-board {index}", how, may_skip=True):
                 return False
-        await day.working("looking for the board in the picture")
-        picture = await still(camera, day.clock)
+        visit.guide.working("looking for the board in the picture")
+        picture = await still(camera, visit.clock)
         coded = cv2.imencode(".png", picture)[1].tobytes()
         # Named after its content: a photograph that is taken once more does not replace one that going back restores.
         name = f"{hashlib.sha256(coded).hexdigest()[:16]}.png"
         try:
-            view = await asyncio.to_thread(find_board, picture, board_of(day.notebook), name)
+            view = await asyncio.to_thread(find_board, picture, board_of(visit.notebook), name)
         except CalibrationError as error:
             if "mirrored" in error.what:
-                raise CannotTeach(f"{error.what}.", MIRRORED) from None
-            await day.say(f"not used: {error.what}", picture=picture, tone="warning")
+                raise NotAccepted(f"{error.what}.", MIRRORED) from None
+            visit.say(f"not used: {error.what}", picture=picture, tone="warning")
             return True
         (folder / name).write_bytes(coded)
-        day.keep("camera", f"{VIEW}{index:02d}", name, "photograph of the board held in hand")
+        visit.keep("camera", f"{VIEW}{index:02d}", name, "photograph of the board held in hand")
         views.append(view)
         return True
 
@@ -279,7 +279,7 @@ async def still(camera: OpenCvCamera, clock: Clock) -> Gray:
 
 
 @contextlib.asynccontextmanager
-async def shown_live(day: Day, camera: OpenCvCamera) -> AsyncGenerator[None]:
+async def shown_live(visit: Visit, camera: OpenCvCamera) -> AsyncGenerator[None]:
     """Show what the camera sees until the block ends."""
 
     async def look() -> None:
@@ -288,7 +288,7 @@ async def shown_live(day: Day, camera: OpenCvCamera) -> AsyncGenerator[None]:
             while True:
                 frame = await camera.fresh(after)
                 after = Stamp(frame.exposed_after_ns + 1)
-                day.guide.see(gray(frame.image))
+                visit.guide.live = gray(frame.image)
                 await asyncio.sleep(LIVE_S)
 
     task = asyncio.create_task(look(), name="live picture")
@@ -297,7 +297,7 @@ async def shown_live(day: Day, camera: OpenCvCamera) -> AsyncGenerator[None]:
     finally:
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
-        day.guide.see(None)
+        visit.guide.live = None
 
 
 def side_by_side(pictures: Sequence[Gray]) -> Gray:

@@ -21,23 +21,26 @@ from textual.content import Content
 from textual.screen import Screen
 from textual.widgets import Footer, Input
 
+from brushloop.collect.commission.step import Guide, LeftOff, Shown, WentBack
 from brushloop.collect.engine.snapshot import REFRESH_S
 from brushloop.collect.errors import CollectAborted
-from brushloop.collect.operator import Asker, Prompt, stop_signals
+from brushloop.collect.operator import Prompt, stop_signals
 from brushloop.collect.photograph.frames import gray
-from brushloop.collect.teach.day import LeftOff, Picture, Shown, Target, WentBack
-from brushloop.collect.tui.pictures import Pictures
-from brushloop.collect.tui.question_screens import YES, AskScreen, question_content, yes_or_no
+from brushloop.collect.tui.pictures import picture_widget
 from brushloop.collect.tui.terminal import PlainApp
 from brushloop.collect.tui.widgets import (
     HELP_KEY,
     SHORT_STOP,
     SOFTWARE_STOP,
     STOP,
+    YES,
+    AskScreen,
     Line,
     one_line,
     plain,
+    question_content,
     trouble,
+    yes_or_no,
 )
 
 AT_WORK = yes_or_no("A step is running: stop it and leave?", "stop and leave", "go on")
@@ -45,52 +48,7 @@ STOPPED = "stopped: look at the arm. The same command resumes from there"
 DONE = "This is done. q leaves."
 TYPING_STOP = "ctrl-c: software stop; red button: emergency stop; ctrl-q: leave, all is kept"
 TONES = {"finding": ("", ""), "warning": ("! ", "bold $text-warning"), "trouble": ("✗ ", "bold $text-error")}
-MOST_FINDINGS = 200
-"""Findings that can be scrolled back to."""
-
-
-class ScreenGuide:
-    """`Guide` for a screen, which reads its fields from another thread."""
-
-    def __init__(self) -> None:
-        self.asker = Asker(watched=True)
-        self.step = ""
-        self.findings: tuple[Shown, ...] = ()
-        self.picture: Picture | None = None
-        """The newest picture of a finding."""
-        self.live: Picture | None = None
-        """What the camera sees now, while somebody guides something by it."""
-        self.target: Target | None = None
-        """What is to be brought somewhere now."""
-        self.doing: tuple[str, float] = ("", time.monotonic())
-        """What is at work while nothing is asked, empty where no step has said so, and since when."""
-
-    async def begin(self, step: str) -> None:
-        """Show which step is taught now."""
-        self.step = step
-
-    async def show(self, what: Shown) -> None:
-        """Add a finding, and show its picture if it has one; progress is shown until there is something newer."""
-        if what.tone == "progress":
-            self.doing = " ".join(what.lines), time.monotonic()
-            return
-        self.findings = (*self.findings, what)[-MOST_FINDINGS:]
-        self.picture = self.picture if what.picture is None else what.picture
-
-    def see(self, picture: Picture | None) -> None:
-        """Show what the camera sees now."""
-        self.live = picture
-
-    async def ask(self, prompt: Prompt, target: Target | None = None) -> Any:
-        """Wait for the answer."""
-        self.target = target
-        try:
-            return await self.asker.ask(prompt)
-        finally:
-            self.target, self.doing = None, ("", time.monotonic())
-
-
-Work = Callable[[ScreenGuide], Coroutine[Any, Any, Path | None]]
+Work = Callable[[Guide], Coroutine[Any, Any, Path | None]]
 
 
 class StopUnsure(Exception):
@@ -102,11 +60,11 @@ class StopUnsure(Exception):
         super().__init__(f"{what} Use the emergency stop, the red button, if it moves.")
 
 
-class Teaching:
+class Steps:
     """The steps in a thread of their own."""
 
     def __init__(self, work: Work) -> None:
-        self.guide = ScreenGuide()
+        self.guide = Guide()
         self.error: BaseException | None = None
         """What ended it."""
         self.written: Path | None = None
@@ -163,7 +121,7 @@ class Teaching:
         self.written = await self._task
 
 
-class TeachScreen(Screen[None], inherit_bindings=False):
+class CommissionScreen(Screen[None], inherit_bindings=False):
     """Shows what the guide holds; its keys answer the question."""
 
     AUTO_FOCUS = ""
@@ -175,19 +133,21 @@ Page up and down turn the pages of what was found.
 {SOFTWARE_STOP} While you type, s is a letter and ctrl-c the stop.
 """
     DEFAULT_CSS = """
-    TeachScreen #title {
+    CommissionScreen #title {
         height: 1; padding: 0 1; background: $panel; text-style: bold; text-wrap: nowrap; text-overflow: ellipsis;
     }
-    TeachScreen #found { width: 1fr; height: 1fr; padding: 0 1; }
-    TeachScreen #picture { width: 36%; height: 100%; padding: 0 1; }
-    TeachScreen.-narrow #picture { display: none; }
-    TeachScreen.-narrow.-picture #picture { display: block; width: 1fr; }
-    TeachScreen.-narrow.-picture #found { display: none; }
-    TeachScreen #question-box { height: auto; max-height: 13; padding: 0 1; border: heavy $warning; display: none; }
-    TeachScreen.-asking #question-box { display: block; }
-    TeachScreen #note { height: 1; padding: 0 1; background: $panel; text-wrap: nowrap; }
-    TeachScreen #answer { display: none; height: 1; border: none; padding: 0; background: $boost; }
-    TeachScreen.-typing #answer { display: block; }
+    CommissionScreen #found { width: 1fr; height: 1fr; padding: 0 1; }
+    CommissionScreen #picture { width: 36%; height: 100%; padding: 0 1; }
+    CommissionScreen.-narrow #picture { display: none; }
+    CommissionScreen.-narrow.-picture #picture { display: block; width: 1fr; }
+    CommissionScreen.-narrow.-picture #found { display: none; }
+    CommissionScreen #question-box {
+        height: auto; max-height: 13; padding: 0 1; border: heavy $warning; display: none;
+    }
+    CommissionScreen.-asking #question-box { display: block; }
+    CommissionScreen #note { height: 1; padding: 0 1; background: $panel; text-wrap: nowrap; }
+    CommissionScreen #answer { display: none; height: 1; border: none; padding: 0; background: $boost; }
+    CommissionScreen.-typing #answer { display: block; }
     """
     BINDINGS: ClassVar[list[BindingType]] = [
         STOP,
@@ -197,11 +157,11 @@ Page up and down turn the pages of what was found.
         HELP_KEY,
     ]
 
-    def __init__(self, guide: ScreenGuide, name: str, pictures: Pictures) -> None:
+    def __init__(self, guide: Guide, name: str) -> None:
         super().__init__()
         self._title, self._found = Line("title"), Line("found-text")
         self._asked, self._note = Line("question-text"), Line("note")
-        self._picture = pictures.make("picture")
+        self._picture = picture_widget("picture")
         self._found_pane = VerticalScroll(id="found", can_focus=False)
         self._guide = guide
         self._name = name
@@ -312,33 +272,33 @@ def _busy_text(doing: str, since_s: float, columns: int) -> str:
     return (what if len(what) <= room else f"{what[: room - 1]}…") + after
 
 
-class TeachApp(PlainApp):
+class CommissionApp(PlainApp):
     """Runs the steps, shows them, and carries the keys to them."""
 
     BINDINGS: ClassVar[list[BindingType]] = [Binding("ctrl+q", "quit", "Leave", show=False, priority=True)]
 
-    def __init__(self, work: Work, name: str, pictures: Pictures | None = None) -> None:
+    def __init__(self, work: Work, name: str) -> None:
         super().__init__()
-        self.teaching = Teaching(work)
-        self.first_day = TeachScreen(self.teaching.guide, name, pictures or Pictures())
+        self.steps = Steps(work)
+        self.first_day = CommissionScreen(self.steps.guide, name)
         self._leaving = False
 
     def on_mount(self) -> None:
         """Start the steps; then look ten times a second."""
         self.push_screen(self.first_day)
-        self.teaching.start()
+        self.steps.start()
         self.set_interval(REFRESH_S, self._poll)
 
     def stops(self, event: events.Key) -> bool:
         """Stop keys stop the steps on every screen; `s` is a letter only while a line is typed."""
         typing = self.first_day.typing and self.screen is self.first_day
-        return not self.teaching.finished and not (typing and event.is_printable)
+        return not self.steps.finished and not (typing and event.is_printable)
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
         """Disable the keys that would do nothing now."""
         match action:
             case "stop":
-                return not self.teaching.finished and not self.first_day.typing
+                return not self.steps.finished and not self.first_day.typing
             case "leave" | "help":
                 return not self.first_day.typing
             case _:
@@ -346,7 +306,7 @@ class TeachApp(PlainApp):
 
     def action_stop(self) -> None:
         """Stop whatever is under way, and say so at once."""
-        self.teaching.stop()
+        self.steps.stop()
         if self.first_day.is_mounted:
             self.first_day.stop_sent()
 
@@ -358,40 +318,40 @@ class TeachApp(PlainApp):
         """Leave; where something is at work, ask first."""
         if isinstance(self.screen, AskScreen):
             return
-        if self.teaching.finished:
+        if self.steps.finished:
             self.exit()
         elif self.first_day.prompt is not None:
             self._leaving = True
-            self.teaching.guide.asker.abandon(LeftOff)
+            self.steps.guide.asker.abandon(LeftOff)
         else:
             self.push_screen(AskScreen(AT_WORK), lambda key: self.stop_and_leave() if key == YES else None)
 
     def stop_and_leave(self) -> None:
         """Stop whatever is under way, and end the app once it has stopped. From any thread."""
         self._leaving = True
-        self.teaching.stop()
+        self.steps.stop()
 
     def _poll(self) -> None:
         """Draw; a step that was stopped or failed ends the app, and is reported in the terminal."""
         if not self.is_running or not self.first_day.is_mounted:
             return
-        over = self.teaching.finished
-        if over and (self._leaving or self.teaching.error is not None):
+        over = self.steps.finished
+        if over and (self._leaving or self.steps.error is not None):
             self.exit()
         else:
             self.first_day.show(over=over)
 
 
-def run_teaching(work: Work, name: str, pictures: Pictures | None = None) -> Path | None:
+def run_commission(work: Work, name: str) -> Path | None:
     """Show the screen until the person leaves; returns the `rig.toml` that was written, raises what ended the steps.
 
     However the screen ends, nobody watches the arm from here on: whatever moves it is stopped.
     """
-    app = TeachApp(work, name, pictures)
+    app = CommissionApp(work, name)
     with stop_signals(lambda _: app.stop_and_leave()):
         try:
             app.run()
         finally:
-            if not app.teaching.finished:
-                app.teaching.stop()
-    return app.teaching.join()
+            if not app.steps.finished:
+                app.steps.stop()
+    return app.steps.join()

@@ -9,12 +9,12 @@ import statistics
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.collect.errors import CannotTeach
+from brushloop.collect.commission.notebook import Notebook, Taught, taught
+from brushloop.collect.commission.sheet import corners_of
+from brushloop.collect.commission.step import Asked, Step, Visit
+from brushloop.collect.errors import NotAccepted
 from brushloop.collect.operator import Choice
 from brushloop.collect.rig.check import Check, brush_shorter_than_tool, deepest_press
-from brushloop.collect.teach.day import Asked, Day, Step, Target
-from brushloop.collect.teach.sheet_fit import corners_of
-from brushloop.collect.teach.store import Notebook, Taught, taught
 from brushloop.drivers.devices import ForceSample
 from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL, ForceTable, SriM8123
 from brushloop.drivers.ink.port import InkTable
@@ -95,36 +95,36 @@ class BrushStep(Step):
     needs = ("tip", "places")
     observes = ("brush.", "ink.device.", "ink.name", "aside.ink")
 
-    async def teach(self, day: Day) -> None:
-        """Ask for what calipers say, and find the device at the well. Raises `CannotTeach`, `DeviceError`."""
-        await day.values("brush", *BRUSH)
-        kind = day.notebook.get("aside.ink")
-        if kind != NONE.key and "ink.device.kind" not in day.notebook.values:
-            await day.values("brush", PORT)
-            port = str(day.notebook.get(PORT.field))
+    async def carry_out(self, visit: Visit) -> None:
+        """Ask for what calipers say, and find the device at the well. Raises `NotAccepted`, `DeviceError`."""
+        await visit.values("brush", *BRUSH)
+        kind = visit.notebook.get("aside.ink")
+        if kind != NONE.key and "ink.device.kind" not in visit.notebook.values:
+            await visit.values("brush", PORT)
+            port = str(visit.notebook.get(PORT.field))
             device: InkTable = InkStationConfig(kind="ink-station", port=port)
             if kind == PUMP.key:
-                await day.values("brush", DELIVERY)
-                ml = day.notebook.number(DELIVERY.field)
+                await visit.values("brush", DELIVERY)
+                ml = visit.notebook.number(DELIVERY.field)
                 device = ModbusPumpConfig(kind="modbus-pump", port=port, ml_per_revolution=ml)
-            await self._primed(day, device)
-            day.keep("brush", "ink.device.kind", device.kind, "answered on its line")
-        await day.values("brush", Asked("ink.name", "Name of the ink, for the record", default="ink"))
+            await self._primed(visit, device)
+            visit.keep("brush", "ink.device.kind", device.kind, "answered on its line")
+        await visit.values("brush", Asked("ink.name", "Name of the ink, for the record", default="ink"))
 
-    async def _primed(self, day: Day, config: InkTable) -> None:
-        await day.working(f"asking {config.port} who it is")
-        device = config.device(day.clock)
+    async def _primed(self, visit: Visit, config: InkTable) -> None:
+        visit.guide.working(f"asking {config.port} who it is")
+        device = config.device(visit.clock)
         try:
             identity = await device.connect()
             level = await device.level()
             gauge = "no gauge" if level is None else f"well {level:.0%} full"
-            await day.say(f"{identity.model} {identity.firmware}: {gauge}")
-            while await day.yes(f"Give {PRIME_ML:g} ml, to fill its tube? The well must stand under it."):
-                await day.working(f"giving {PRIME_ML:g} ml")
+            visit.say(f"{identity.model} {identity.firmware}: {gauge}")
+            while await visit.yes(f"Give {PRIME_ML:g} ml, to fill its tube? The well must stand under it."):
+                visit.guide.working(f"giving {PRIME_ML:g} ml")
                 await device.dose(min(PRIME_ML, config.dose_ml))
                 level = await device.level()
                 if level is not None:
-                    await day.say(f"well {level:.0%} full")
+                    visit.say(f"well {level:.0%} full")
         finally:
             await device.close()
 
@@ -180,41 +180,41 @@ class ForceStep(Step):
     needs = ("sheet",)
     observes = ("force.", "touch.", "aside.bus")
 
-    async def teach(self, day: Day) -> None:
-        """Find the sensor and have it pushed. Raises `CannotTeach`, `DeviceError`."""
-        await day.values("force", BUS)
-        with day.together():
-            for field, value in _addressed(str(day.notebook.get("aside.bus"))).items():
-                day.keep("force", f"force.{field}", value, "typed")
-            if day.notebook.get("force.channel") == LOOPBACK_CHANNEL:
+    async def carry_out(self, visit: Visit) -> None:
+        """Find the sensor and have it pushed. Raises `NotAccepted`, `DeviceError`."""
+        await visit.values("force", BUS)
+        with visit.together():
+            for field, value in _addressed(str(visit.notebook.get("aside.bus"))).items():
+                visit.keep("force", f"force.{field}", value, "typed")
+            if visit.notebook.get("force.channel") == LOOPBACK_CHANNEL:
                 how = "simulated time may run faster than rounds arrive: allowed on the loopback rig's bus alone"
-                day.keep("force", "force.stale_ms", LOOPBACK_STALE_MS, how, "ms")
-        if not day.notebook.get("aside.bus"):
-            await day.say(
+                visit.keep("force", "force.stale_ms", LOOPBACK_STALE_MS, how, "ms")
+        if not visit.notebook.get("aside.bus"):
+            visit.say(
                 "Without a force sensor the height of the paper is found by jogging with keys, when a session starts."
             )
             return
-        if "touch.force.push_axis" not in day.notebook.values:
-            await self._pushed(day)
+        if "touch.force.push_axis" not in visit.notebook.values:
+            await self._pushed(visit)
 
-    async def _pushed(self, day: Day) -> None:
+    async def _pushed(self, visit: Visit) -> None:
         samples = list[ForceSample]()
-        sensor = SriM8123(ForceTable.model_validate(day.notebook.table("force.")), day.clock)
+        sensor = SriM8123(ForceTable.model_validate(visit.notebook.table("force.")), visit.clock)
         try:
-            await day.working("listening to the sensor; let nothing touch the brush")
+            visit.guide.working("listening to the sensor; let nothing touch the brush")
             identity = await sensor.connect()
             await sensor.bias(REST_S)
             sensor.listen(samples.append)
             await asyncio.sleep(REST_S)
             noise_n = _noise(samples)
-            await day.say(f"{identity.model}: {sensor.stream.rate_hz():.0f} rounds/s, noise {noise_n:.4f} N")
+            visit.say(f"{identity.model}: {sensor.stream.rate_hz():.0f} rounds/s, noise {noise_n:.4f} N")
             samples.clear()
             how = (
                 "Push the tip of the brush gently up with a finger for a second, along the brush toward the flange, "
                 "then take the finger away."
             )
-            await day.brought(how, Target("push-sensor"))
-            await day.working("waiting for the end of the push")
+            await visit.brought("push-sensor 0", how)
+            visit.guide.working("waiting for the end of the push")
             force_n = await self._push(samples)
         finally:
             sensor.listen(None)
@@ -222,11 +222,11 @@ class ForceStep(Step):
         axis = judged_push(force_n, noise_n)
         how = f"a finger pushed the tip with {float(np.linalg.norm(force_n)):.1f} N"
         if axis[2] > 0.0:
-            await day.say(
+            visit.say(
                 "The sensor counts a push toward the flange as positive: it is mounted, or wired, the other way round "
                 "than usual. push_axis takes this into account; nothing has to be changed."
             )
-        day.keep("force", "touch.force.push_axis", axis, how, known="direction within 35 deg, sign certain")
+        visit.keep("force", "touch.force.push_axis", axis, how, known="direction within 35 deg, sign certain")
 
     async def _push(self, samples: list[ForceSample]) -> NDArray[np.float64]:
         """Mean force of the strongest tenth of a second, once the push is over or has been waited for."""
@@ -265,26 +265,26 @@ def strongest(samples: list[ForceSample], over: int = 20) -> NDArray[np.float64]
 
 
 def judged_push(force_n: NDArray[np.float64], noise_n: float) -> list[float]:
-    """The sensor's axis along which the paper pushes, with its sign. Raises `CannotTeach` for an unlikely push."""
+    """The sensor's axis along which the paper pushes, with its sign. Raises `NotAccepted` for an unlikely push."""
     size_n = float(np.linalg.norm(force_n))
     if noise_n > MOST_NOISE_N:
-        raise CannotTeach(
+        raise NotAccepted(
             f"the sensor's noise is {noise_n:.3f} N, limit {MOST_NOISE_N:g} N.",
             "Let nothing touch the brush; check shielding and termination.",
         )
     if size_n < LEAST_PUSH_N:
-        raise CannotTeach(
+        raise NotAccepted(
             f"no push was felt (at most {size_n:.3f} N).",
             "Push harder and longer; check that this is the sensor's bus.",
         )
     if size_n > MOST_PUSH_N:
-        raise CannotTeach(
+        raise NotAccepted(
             f"the push reads {size_n:.0f} N, more than a finger gives.",
             "The sensor's scale or unit is wrong: see its sheet.",
         )
     if abs(float(force_n[2])) < STRAIGHT * size_n:
         listed = ", ".join(f"{v:+.2f}" for v in force_n.tolist())
-        raise CannotTeach(
+        raise NotAccepted(
             f"the push reads ({listed}) N, not along the sensor's z.",
             "Push along the brush; the sensor's z must lie along the tool.",
         )
