@@ -103,7 +103,8 @@ def _not_arrived(what: str) -> MotionFailed:
         DEVICE,
         "moveLine",
         what,
-        remedy="Look on the pendant for a message, as of a pose out of reach; close other clients that stop the arm.",
+        remedy="Look at the pendant for a message, and for another client that stops the arm. "
+        "`brushloop collect plan --ask` tells whether a pose is out of reach.",
     )
 
 
