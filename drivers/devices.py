@@ -66,7 +66,7 @@ class PoseSample:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """An image as the camera gave it: (h, w) uint8 gray or (h, w, 3) uint8 BGR.
+    """An image of the camera in (h, w) uint8 gray levels.
 
     `stamp.host_ns` is the arrival; `exposed_after_ns` is the earliest time at which it can have been exposed.
     """

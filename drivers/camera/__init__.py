@@ -237,8 +237,9 @@ class _Grabber:
         def over() -> bool:
             return self._ended is not None or self._closing.is_set()
 
+        left_s = until_s - time.monotonic()
         with self._condition:
-            if not self._condition.wait_for(lambda: late_enough() or over(), until_s - time.monotonic()):
+            if left_s < 0.0 or not self._condition.wait_for(lambda: late_enough() or over(), left_s):
                 raise DeviceTimeout(
                     DEVICE,
                     "fresh",
