@@ -91,13 +91,13 @@ def notices() -> list[str]:
 
 @pytest.fixture
 async def camera(feed: Feed, sources: list[Feed], notices: list[str]) -> AsyncIterator[OpenCvCamera]:
-    """Connected, over a feed that has shown one picture; it gives up after a second."""
+    """Connected, over a feed that has shown one picture; it gives up after two seconds."""
     table = CameraTable(kind="opencv", source="rtsp://camera", latency_ms=0.0)
     camera = OpenCvCamera(table, feed, notices.append)
     feed.show(page())
     await camera.connect()
     assert camera._grabber is not None
-    camera._grabber._table = table.model_copy(update={"timeout_s": 1.0})
+    camera._grabber._table = table.model_copy(update={"timeout_s": 2.0})
     yield camera
     feed.show(None)
     await camera.close()
