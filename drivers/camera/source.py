@@ -82,7 +82,8 @@ AUTOMATIC = {
 SETTING_TOLERANCE = 0.01
 """Relative difference up to which a setting that is read back counts as applied."""
 MAX_JPEG_BYTES = 64 * 1024 * 1024
-MAX_LINE_BYTES = 64 * 1024
+MAX_GAP_BYTES = 1024 * 1024
+"""Most bytes between two pictures: where no part begins in them, this is another kind of stream."""
 
 
 class JpegStream:
@@ -124,10 +125,14 @@ class JpegStream:
         self._response.close()
 
     def _part(self) -> bytes:
-        """The body of the next part. Raises `OSError` at the end, and ValueError where its length is not given."""
-        while not (line := self._response.readline(MAX_LINE_BYTES)).startswith(b"--"):
+        """The body of the next part. Raises `OSError` at the end, and ValueError for none with a length."""
+        left = MAX_GAP_BYTES
+        while not (line := self._response.readline(MAX_GAP_BYTES)).startswith(b"--"):
+            left -= len(line)
             if not line:
                 raise ConnectionError("the stream ended")
+            if left < 0:
+                raise ValueError("no part of a multipart stream")
         length = int(http.client.parse_headers(self._response)["Content-Length"] or 0)
         if not 0 < length <= MAX_JPEG_BYTES:
             raise ValueError(f"a part of {length} bytes")

@@ -350,6 +350,12 @@ async def test_a_stream_without_lengths_is_read_by_ffmpeg():
         await camera.close()
 
 
+async def test_a_stream_in_which_no_part_begins_is_given_up_as_another_kind():
+    async with serving(MULTIPART + b"boundary\r\n" * 200_000) as address:
+        with pytest.raises(ValueError, match="no part"):
+            await asyncio.to_thread(JpegStream, CameraTable(kind="opencv", source=address))
+
+
 async def test_an_address_that_is_refused_says_why():
     async with serving(b"HTTP/1.0 401 Unauthorized\r\n\r\n") as address:
         with pytest.raises(ConnectionLost, match="HTTP Error 401: Unauthorized"):
