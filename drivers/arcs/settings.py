@@ -32,7 +32,6 @@ from brushloop.drivers.limits import Limits
 
 Finite = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Turn = Annotated[float, Field(ge=-180.0, le=180.0)]
-POSE_LAG_MS = 100.0
 
 
 class ArcsTable(BaseModel, frozen=True, extra="forbid"):
@@ -43,14 +42,13 @@ class ArcsTable(BaseModel, frozen=True, extra="forbid"):
     port: int = Field(30004, ge=1, le=65535)
     tcp_offset_mm: tuple[Finite, Finite, Finite]
     """Flange to brush tip, along the flange's axes."""
-    tcp_rotation_deg: Annotated[tuple[Turn, Turn, Turn], Field(exclude_if=lambda turn: not any(turn))] = (0.0, 0.0, 0.0)
-    """Turn from the flange's axes to the brush's: about x, then y, then z of the flange. The brush is along its z.
-    It is not written if it is zero, so that sessions older than this field can be resumed."""
+    tcp_rotation_deg: tuple[Turn, Turn, Turn] = (0.0, 0.0, 0.0)
+    """Turn from the flange's axes to the brush's: about x, then y, then z of the flange. The brush is along its z."""
     framing: Framing = "sof"
     """`sof` as in the maker's client, `bare` as in the maker's documentation."""
     rtde_port: int | None = Field(None, ge=1, le=65535)
     """Port that pushes poses (30010); if left out, poses are polled."""
-    max_pose_lag_ms: Annotated[float, Field(ge=60.0, le=5000.0, exclude_if=lambda ms: ms == POSE_LAG_MS)] = POSE_LAG_MS
+    max_pose_lag_ms: Annotated[float, Field(ge=60.0, le=5000.0)] = 100.0
     """Presses and touches during which poses arrive later than this are void: at 20 mm/s the recorded tip is 2 mm away
     from where force and camera saw it after 100 ms. Below 60 ms a busy computer's own lag would count."""
     watchdog_s: Annotated[float, Field(ge=0.5, le=60.0)] | None = None

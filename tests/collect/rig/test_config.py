@@ -13,7 +13,7 @@ from brushloop.collect.commission.notebook import Notebook, TaughtFile, taught
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.check import places_of
-from brushloop.collect.rig.config import RobotConfig, load_rig
+from brushloop.collect.rig.config import load_rig
 from brushloop.collect.walk import check_protocol
 from brushloop.drivers.sim.brush.spec import SimFileError, load_brush
 from brushloop.drivers.sim.config import SimConfig
@@ -145,16 +145,6 @@ def test_what_the_rig_cannot_do_is_refused_before_anything_is_connected(
     rig_path, protocol_path = rig_file(tmp_path, old, new), protocol_file(tmp_path, protocol)
     with pytest.raises(ConfigError, match=message):
         check_protocol(rig_path, protocol_path, load_rig(rig_path), load_protocol(protocol_path))
-
-
-def test_a_turn_of_the_tool_is_recorded_only_where_there_is_one():
-    """A session that an earlier version began has no such field, and must not look changed."""
-    limits = {"x_mm": (0, 1), "y_mm": (0, 1), "z_mm": (0, 1)}
-    table = {"kind": "aubo-arcs", "host": "192.0.2.7", "tcp_offset_mm": (0, 0, 180), "limits": limits}
-    square = RobotConfig.model_validate(table)
-    turned = square.model_copy(update={"tcp_rotation_deg": (2.0, 0.0, 0.0)})
-    assert "tcp_rotation_deg" not in square.model_dump()
-    assert turned.model_dump()["tcp_rotation_deg"] == (2.0, 0.0, 0.0)
 
 
 DIGITS = "9" * 10_000
