@@ -105,23 +105,29 @@ class Recovered:
         yield f"{header.session_id}: {many} presses recovered by {self.model} ({header.source})"
         for name, unit in (("H", "mm"), ("alpha", "deg")):
             off, sd = np.transpose([row.off[name] for row in self.rows])
-            scatter = f", sd {off.std(ddof=1):.3f}" if many > 1 else ""
-            inside = f"{float((np.abs(off) <= NORMAL_95 * sd).mean()):.0%} of {many} in the interval"
-            yield f"{name}: recovered - commanded {off.mean():+.3f} {unit}{scatter}; {inside}"
+            scatter = f" ± {off.std(ddof=1):.2f}" if many > 1 else ""
+            inside = int((np.abs(off) <= NORMAL_95 * sd).sum())
+            yield (
+                f"{name}: recovered {off.mean():+.2f}{scatter} {unit} from what was commanded; "
+                f"{inside} of {many} intervals (95 %) hold the command"
+            )
         yield (
             "alpha follows from how far the mark lies from the zero-touch point, and is as accurate as the model's "
             "prediction of that distance; the shape of the mark alone does not determine it."
         )
         if bare := self._flagged(NO_MODEL_ERROR):
-            yield f"warning: {bare} without model error in their intervals: too few cells"
+            yield (
+                f"warning: the intervals of {bare} presses leave out the error of the model: fewer than "
+                f"{LEAST_CONDITIONS} other combinations of H and alpha were pressed"
+            )
         for name, flag in NOT_INFORMATIVE.items():
             if vague := self._flagged(flag):
-                yield f"warning: {vague} not informative on {name}: the interval covers most of the commanded range"
+                yield f"warning: {vague} presses do not tell {name}: the interval covers most of the commanded range"
         bound = self._flagged(Flag.AT_BOUND)
         if 2 * bound > many:
-            yield f"warning: {bound} at a bound: the model does not fit this brush; do not press these again"
+            yield f"warning: {bound} presses end at a bound: the model does not fit this brush; do not repeat these"
         elif bound:
-            yield f"warning: {bound} at a bound of the range: their intervals are valid on one side at most"
+            yield f"warning: {bound} presses end at a bound of the range: their intervals hold on one side at most"
         for stroke_id, why in self.refused:
             yield f"not used: {stroke_id}: {why}"
         yield str(self.out)

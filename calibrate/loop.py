@@ -144,14 +144,13 @@ class LoopRecord(Sealed):
                 None, f"{self.again}: no original condition was pressed twice, so its repeatability is unknown."
             )
         least = min(self.verdicts, key=lambda verdict: verdict.difference)
-        failed = sum(not verdict.holds for verdict in self.verdicts)
-        how = "at most" if not failed else f"in {failed} of {len(self.verdicts)} comparisons more than"
-        where = f"{least.difference:+.2f} points, {least.measure.upper()}, {least.alignment}, {least.tone}"
-        sure = "" if all(verdict.certain for verdict in self.verdicts) else "; not certain in all"
+        how = f"{least.measure.upper()}, {least.alignment}, {least.tone}"
+        sure = "" if all(verdict.certain for verdict in self.verdicts) else "; so few strokes do not make it certain"
+        asked = f"the goal is at most {self.goal_points:g}"
         return Point(
-            not failed,
-            f"Strokes pressed again ({self.again}) are {how} {self.goal_points:g} point less similar to their "
-            f"originals than other presses of the same condition (least: {where}{sure}).",
+            all(verdict.holds for verdict in self.verdicts),
+            f"Strokes pressed again ({self.again}) are {max(0.0, -least.difference):.1f} points less similar to their "
+            f"originals than other presses of the same condition, at worst ({how}); {asked}{sure}.",
         )
 
 

@@ -1,7 +1,7 @@
 """Fit `model.fitted` to coverage images: its parameters by least squares with a prior, then what they cannot express.
 
 No press repeats exactly: width, place and lengths differ from press to press, each by one amount along the whole mark.
-These differences (`STRAYS`) are integrated out of the likelihood, linearised at the fit.
+The fit allows for these differences (`STRAYS`): each stroke may have its own, at the cost that their spread says.
 
 What the parameters cannot express are residuals of the edges and ends, by empirical Bayes. Each stroke is compared with
 the fitted parameters: how much further its tip and its heel reach, and by which sines each of its edges differs from

@@ -143,7 +143,9 @@ class FitResult:
         else:
             yield f"Intervals of the sizes of the marks need {FEWEST_CELLS} combinations of depth and tilt."
         if self.held_out:
-            scores = Table("model", "n", "CSIM", "SSIM", title=f"leave one cell out, mm, binary, percent ({label})")
+            scores = Table(
+                "model", "n", "CSIM", "SSIM", title=f"on combinations left out of the fit in turn, percent ({label})"
+            )
             for row in self.held_out:
                 scores.add_row(row.model, str(row.n), f"{row.csim:.2f}", f"{row.ssim:.2f}")
             yield scores

@@ -114,9 +114,9 @@ def test_the_command_compares_with_what_was_commanded(tmp_path: Path) -> None:
     assert ran.returncode == 0, ran.stderr
     words = " ".join(ran.stdout.split())
     assert "3 presses recovered by ccd-bsm (imported photographs)" in words
-    assert "H: recovered - commanded -0.0" in words
-    assert "100% of 3 in the interval" in words
-    assert "warning: 3 without model error in their intervals" in words
+    assert "H: recovered -0.0" in words
+    assert "3 of 3 intervals (95 %) hold the command" in words
+    assert "warning: the intervals of 3 presses leave out the error of the model" in words
     assert load_protocol(tmp_path / "again" / PROTOCOL).kind == "replay"
 
 

@@ -31,7 +31,7 @@ def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> Non
     ran = narrow.invoke(app, ["fit", str(session), "--mm-per-px", "0.4"])
     assert ran.exit_code == 0, ran.output
     said = " ".join(ran.output.split())
-    for words in ("heel", "width", "95 %", "leave one cell out", "refitted Bezier", "uncalibrated"):
+    for words in ("heel", "width", "95 %", "left out of the fit in turn", "refitted Bezier", "uncalibrated"):
         assert words in said
     assert "…" not in said, "a size is cut in 60 columns"
     assert not any(name in said for name in NAMES), "a parameter alone says nothing about another brush"
