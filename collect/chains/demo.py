@@ -138,18 +138,24 @@ class Demo:
                 run()
             say(f"  ✓   {time.monotonic() - step_began_s:.0f} s")
         self._rig.end()
-        from brushloop.calibrate.validate.findings import headline, verdict  # slow to import
-
-        session, report = self._session, self._validated.report
-        assert report is not None, "the demo presses"
-        say("", f"How much of the ink is predicted (average CSIM; {report.label}):")
-        for label, percent in headline(report):
-            say(f"  {label:30} {'█' * round(percent / 100 * BAR):{BAR}} {percent:.1f} %")
-        say(*verdict(report))
+        self._say_answer()
+        session = self._session
         say("", f"Done in {time.monotonic() - began_s:.0f} s, simulated: nothing here is a result on paper.")
         say(f"Report: {_report(session)}", f"MCAP:   {session / f'{session.name}.mcap'}")
         if self._left_out:
             raise StrokesLeftOut(self._left_out)
+
+    def _say_answer(self) -> None:
+        """Print how much of the ink is predicted, and what follows."""
+        from brushloop.calibrate.validate.findings import headline, verdict  # slow to import
+
+        report = self._validated.report
+        if report is None:
+            return
+        say("", f"How much of the ink is predicted (average CSIM; {report.label}):")
+        for label, percent in headline(report):
+            say(f"  {label:30} {'█' * round(percent / 100 * BAR):{BAR}} {percent:.1f} %")
+        say(*verdict(report))
 
     @contextmanager
     def _logged(self) -> Generator[None]:
