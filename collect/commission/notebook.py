@@ -177,12 +177,9 @@ class TaughtFile:
 
     def save(self, notebook: Notebook) -> None:
         """Replace the whole file, safe against a loss of power. Raises `ConfigError`."""
-        text = notebook.model_dump_json(indent=1)
-        if len(text) > MAX_BYTES:
-            raise ConfigError(self.path, "", f"would be larger than {MAX_BYTES} bytes")
         try:
             with replacing(self.path) as part, part.open("w", encoding="utf-8") as file:
-                file.write(text)
+                file.write(notebook.model_dump_json(indent=1))
                 sync(file)
             fsync_folder(self.path.absolute().parent)
         except OSError as error:

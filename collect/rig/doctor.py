@@ -84,17 +84,8 @@ class Finding:
     ) -> Finding:
         """The same with what the device says of itself, and what is wrong with it."""
         notes += ", simulated" if identity.simulated else ""
-        return Finding(
-            self.device,
-            self.address,
-            answers=True,
-            identity=identity.model,
-            firmware=identity.firmware,
-            latency_ms=latency_ms,
-            notes=notes,
-            problem=problem,
-            remedy=remedy,
-        )
+        who = replace(self, answers=True, identity=identity.model, firmware=identity.firmware)
+        return replace(who, latency_ms=latency_ms, notes=notes, problem=problem, remedy=remedy)
 
 
 async def examine(config: RigConfig, clock: Clock) -> list[Finding]:

@@ -45,19 +45,11 @@ from brushloop.collect.tui.widgets import (
 
 AT_WORK = yes_or_no("A step is running: stop it and leave?", "stop and leave", "go on")
 STOPPED = "stopped: look at the arm. The same command resumes from there"
+RED_BUTTON = "Use the emergency stop, the red button, if it moves."
 DONE = "This is done. q leaves."
 TYPING_STOP = "ctrl-c: software stop; red button: emergency stop; ctrl-q: leave, all is kept"
 TONES = {"finding": ("", ""), "warning": ("! ", "bold $text-warning"), "trouble": ("✗ ", "bold $text-error")}
 Work = Callable[[Guide], Coroutine[Any, Any, Path | None]]
-
-
-class StopUnsure(Exception):
-    """The arm was asked to stop and was not seen at rest."""
-
-    exit_code = 4
-
-    def __init__(self, what: str) -> None:
-        super().__init__(f"{what} Use the emergency stop, the red button, if it moves.")
 
 
 class Steps:
@@ -106,7 +98,7 @@ class Steps:
         except asyncio.CancelledError as stopped:
             # The notes say whether the arm was seen at rest.
             notes = getattr(stopped, "__notes__", [])
-            self.error = StopUnsure(" ".join(notes)) if notes else CollectAborted(STOPPED)
+            self.error = CollectAborted(" ".join([*notes, RED_BUTTON]) if notes else STOPPED)
         except CollectAborted as error:
             # A run within the steps has its own word for the stop that it was sent.
             self.error = CollectAborted(STOPPED) if self._stop_sent else error

@@ -71,7 +71,10 @@ class ReviewCapture:
 
     result: CaptureResult
     file: str
-    remark: Remark | None
+    marked_bad: bool = False
+    """Whether a person marked it bad."""
+    note: str = ""
+    """What a person wrote about it."""
     unlike: str = ""
     """How its time from dip to touch differs from that of the session's other strokes; empty if it does not differ."""
 
@@ -84,16 +87,6 @@ class ReviewCapture:
     def counts(self) -> bool:
         """Whether it counts: kept by the run, and not marked bad afterwards."""
         return self.result.kept and not self.marked_bad
-
-    @property
-    def marked_bad(self) -> bool:
-        """Whether a person marked it bad."""
-        return self.remark is not None and self.remark.bad
-
-    @property
-    def note(self) -> str:
-        """What a person wrote about it."""
-        return "" if self.remark is None else self.remark.note
 
 
 class Review:
@@ -126,11 +119,13 @@ class Review:
         state, remarks = replay(self.folder / JOURNAL_NAME), remarks_of(self.folder)
         self.open = state.is_open
         odd = odd_waits(waits_of(state))
-        captures = [
-            ReviewCapture(result, step.file, remarks.get(result.still), odd.get(result.still, ""))
-            for step in state.files.values()
-            if isinstance(result := step.result, CaptureResult)
-        ]
+        captures: list[ReviewCapture] = []
+        for step in state.files.values():
+            if isinstance(result := step.result, CaptureResult):
+                capture = ReviewCapture(result, step.file, unlike=odd.get(result.still, ""))
+                if (remark := remarks.get(result.still)) is not None:
+                    capture = replace(capture, marked_bad=remark.bad, note=remark.note)
+                captures.append(capture)
         captures.sort(key=lambda c: (c.press.condition, c.press.stroke_id, c.result.still))
         self.captures = tuple(captures)
 

@@ -21,7 +21,7 @@ from brushloop.collect.rig.doctor import Finding
 from brushloop.drivers.host import Clock, HostClock
 from brushloop.drivers.sim.lab_facts import Trap
 from brushloop.sessions.events import SelfCheckResult, ZeroTouchResult
-from tests.collect.commission.unknown import Errors, InLab, errors, first_day, in_lab, newest_session
+from tests.collect.commission.conftest import Errors, InLab, errors, first_day, in_lab, newest_session
 
 SMALL_PX = (800, 600)
 FAST = 30.0

@@ -35,8 +35,7 @@ from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import Addresses, rig_toml
 from brushloop.drivers.sim.world import tool_of
-from tests.collect.commission.conftest import Person, visit_of
-from tests.collect.commission.unknown import in_lab
+from tests.collect.commission.conftest import Person, in_lab, visit_of
 
 
 @pytest.mark.parametrize(

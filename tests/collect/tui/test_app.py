@@ -180,18 +180,6 @@ async def test_what_is_over_can_only_be_left(state: State) -> None:
         assert not app.is_running
 
 
-async def test_help_names_every_key_and_goes_away() -> None:
-    app = OperatorApp(FakeEngine(picture()))
-    async with app.run_test(size=(120, 50)) as pilot:
-        await look(app, pilot)
-        await pilot.press("question_mark")
-        text = await look(app, pilot)
-        for part in ("Stop the arm at once", "Pause before the next step", "Retake", "New sheet", "Jog", "! bad takes"):
-            assert part in text
-        await pilot.press("question_mark")
-        assert "Stop the arm at once" not in await look(app, pilot)
-
-
 @pytest.mark.parametrize("unseen", [False, True])
 async def test_enter_resumes_a_stopped_session_and_leaves_the_question_to_the_engine(unseen: bool) -> None:
     stopped = FakeEngine(picture(state=State.STOPPED, folder="sessions/2026-11-21-grid-01", rest_unknown=unseen))

@@ -16,8 +16,7 @@ from brushloop.collect.commission.step import LeftOff, WentBack
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.tui.commission_app import CommissionApp, Steps
 from brushloop.collect.tui.widgets import AskScreen
-from tests.collect.tui.commission_fake import Asking, app_of
-from tests.collect.tui.fake import shown
+from tests.collect.tui.fake import Asking, commission_app_of, shown
 from tests.waiting import PATIENCE_S
 
 SIZE = (80, 24)
@@ -31,7 +30,7 @@ async def until(condition: Callable[[], bool]) -> None:
 
 @asynccontextmanager
 async def running(asking: Asking) -> AsyncIterator[tuple[CommissionApp, Pilot[None]]]:
-    app = app_of(asking)
+    app = commission_app_of(asking)
     async with app.run_test(size=SIZE) as pilot:
         await until(lambda: app.first_day.is_mounted and (app.first_day.prompt is not None or not asking.kinds))
         await pilot.pause()

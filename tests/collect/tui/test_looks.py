@@ -11,8 +11,18 @@ from textual.pilot import Pilot
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.snapshot import Snapshot
 from brushloop.collect.tui.app import OperatorApp
-from tests.collect.tui.commission_fake import Asking, app_of
-from tests.collect.tui.fake import FAILED, SPLIT, TOUCHED, FakeBrowser, FakeEngine, a_review, capture, full_picture
+from tests.collect.tui.fake import (
+    FAILED,
+    SPLIT,
+    TOUCHED,
+    Asking,
+    FakeBrowser,
+    FakeEngine,
+    a_review,
+    capture,
+    commission_app_of,
+    full_picture,
+)
 
 SMALL, LARGE = (80, 24), (120, 40)
 
@@ -87,7 +97,7 @@ def test_review(
 
 
 def test_first_day(snap_compare: Callable[..., bool]) -> None:
-    app = app_of(Asking("bring"))
+    app = commission_app_of(Asking("bring"))
 
     async def asked(pilot: Pilot[None]) -> None:
         while app.first_day.prompt is None:

@@ -1,19 +1,25 @@
-"""What the run screen shows: literal text, captures, questions, marks; and how often it is drawn."""
+"""The screens around and during a run: what they show as literal text, and what their keys do."""
 
 from __future__ import annotations
 
+import io
+import subprocess
+import sys
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from textual.geometry import Region
+from textual.geometry import Region, Size
+from textual.pilot import Pilot
 from textual.widget import Widget
 from textual.widgets import Static
 
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.snapshot import CellCount
+from brushloop.collect.errors import ConfigError
 from brushloop.collect.operator import Choice, Prompt
 from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.capture_screen import (
@@ -25,11 +31,23 @@ from brushloop.collect.tui.capture_screen import (
     difference,
     over_photograph,
 )
+from brushloop.collect.tui.pictures import CellPicture, braille, look_for_pixels, picture_widget, strip_of
 from brushloop.collect.tui.run_screen import RunScreen, cell_text, spark
 from brushloop.collect.tui.widgets import AskScreen
 from brushloop.sessions.recording import remarks_of
 from brushloop.sessions.records import Condition
-from tests.collect.tui.fake import DONE, FakeEngine, capture, full_picture, has_picture, look, picture, shown
+from tests.collect.tui.fake import (
+    PAUSED,
+    FakeBrowser,
+    FakeEngine,
+    a_review,
+    capture,
+    full_picture,
+    has_picture,
+    look,
+    picture,
+    shown,
+)
 
 
 async def test_what_comes_from_outside_is_shown_as_it_is() -> None:
@@ -43,21 +61,6 @@ async def test_what_comes_from_outside_is_shown_as_it_is() -> None:
         assert r"a\u001b[31mb" in text
         assert "a]0;ownedb 31m ltr" in text
         assert not set(text) & set("\x1b\x07\x9b\u202e")
-
-
-async def test_tab_turns_to_the_capture_and_the_camera_where_there_is_no_room_for_all() -> None:
-    app = OperatorApp(FakeEngine(full_picture()))
-    async with app.run_test(size=(80, 24)) as pilot:
-        assert "Log" in await look(app, pilot)
-        await pilot.press("tab")
-        text = await look(app, pilot)
-        for part in ("H15-a5-r01", "✓ all 4 checks", "CCD-BSM as published, right: CSIM"):
-            assert part in text
-        assert has_picture(text)
-        await pilot.press("tab")
-        assert "Camera" in await look(app, pilot)
-        await pilot.press("tab")
-        assert "Log" in await look(app, pilot)
 
 
 async def test_what_did_not_change_is_not_drawn_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -168,19 +171,6 @@ def test_a_difference_has_four_colours_and_an_overlay_the_line_of_the_prediction
     assert not line[:140].any()
 
 
-async def test_a_finished_session_offers_what_comes_next() -> None:
-    engine = FakeEngine(picture(folder="sessions/2026-11-21-grid-01"))
-    app = OperatorApp(engine, again=lambda _session_id: engine)
-    async with app.run_test(size=(120, 24)) as pilot:
-        await look(app, pilot)
-        engine.now = replace(DONE, folder="sessions/2026-11-21-grid-01")
-        text = await look(app, pilot)
-        for part in ("with sessions/2026-11-21-grid-01", "v  look through", "c  brushloop calibrate", "30/30"):
-            assert part in text
-        await pilot.press("q")
-        assert isinstance(app.screen, RunScreen)
-
-
 async def test_a_key_answers_the_question_that_is_shown_and_the_next_one_comes() -> None:
     engine = FakeEngine(picture(state=State.ASKING, step="wait for an answer", prompt=PROMPT))
     app = OperatorApp(engine)
@@ -206,3 +196,129 @@ async def test_q_over_a_question_leaves_it_unanswered_and_parks() -> None:
             assert app.screen.own
             await pilot.press(answer)
             assert engine.calls == calls
+
+
+class Beginning(FakeBrowser):
+    """Notes which session is gone on with."""
+
+    def engine(self, session_id: str | None) -> Any:
+        self.asked.append(session_id)
+        if session_id is None:
+            raise ConfigError("rig.toml", "robot", "another brushloop is driving the arm")
+        return FakeEngine(picture())
+
+
+async def ready(app: OperatorApp, pilot: Pilot[None]) -> str:
+    await pilot.pause()
+    await app.workers.wait_for_complete()
+    await pilot.pause()
+    return shown(app)
+
+
+async def test_enter_goes_on_with_an_open_session_and_n_asks_for_a_blank_sheet_first() -> None:
+    browser = Beginning()
+    app = OperatorApp(browser=browser)
+    async with app.run_test(size=(80, 24)) as pilot:
+        text = await ready(app, pilot)
+        for part in ("▶ 2026-11-21-grid-02 open", "13 of 30 planned", "13 capture", "the process", "H15-a5-r01"):
+            assert part in text
+        await pilot.press("n")
+        assert "30 strokes on 1 sheet" in await ready(app, pilot)
+        await pilot.press("n")
+        assert browser.asked == []
+        await pilot.press("n")
+        await ready(app, pilot)
+        await pilot.press("y")
+        text = await ready(app, pilot)
+        assert browser.asked == [None]
+        assert "rig.toml: robot: another brushloop is driving the arm" in text
+        await pilot.press("enter")
+        await ready(app, pilot)
+        assert browser.asked[1:] == ["2026-11-21-grid-02"]
+        assert isinstance(app.engine, FakeEngine)
+        assert app.engine.calls == ["start"]
+        await look(app, pilot)
+        await pilot.press("s")
+        assert "stop" in app.engine.calls
+
+
+async def test_other_files_can_be_typed_and_letters_of_stop_keys_too() -> None:
+    browser = FakeBrowser()
+    app = OperatorApp(browser=browser)
+    async with app.run_test(size=(80, 24)) as pilot:
+        await ready(app, pilot)
+        await pilot.press("e", "ctrl+u", *"s2.toml", "enter", "ctrl+u", "enter")
+        text = await ready(app, pilot)
+        assert "rig s2.toml   protocol protocol.toml" in text, "an emptied field leaves the file as it was"
+        await pilot.press("e", *"x", "escape", *"s", "enter")
+        assert "rig s2.toml   protocol protocol.tomls" in await ready(app, pilot)
+
+
+async def test_no_note_is_typed_while_a_run_is_in_progress(tmp_path: Path) -> None:
+    engine = FakeEngine(PAUSED)
+    app = OperatorApp(engine)
+    async with app.run_test(size=(120, 40)) as pilot:
+        await look(app, pilot)
+        app.push_screen(review := a_review(tmp_path, app))
+        text = await ready(app, pilot)
+        for words in ("red button", "s STOP"):
+            assert words in text
+        assert "o Note" not in text
+        await pilot.press("o", "f", "s")
+        assert engine.calls == ["stop"]
+        assert app.screen is review
+
+
+async def test_after_a_session_the_next_commands_run_in_the_terminal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ran: list[list[str]] = []
+
+    def run(command: list[str], *, check: bool) -> subprocess.CompletedProcess[str]:
+        ran.append(command[3:])
+        return subprocess.CompletedProcess(command, 0)
+
+    monkeypatch.chdir(tmp_path)
+    app = OperatorApp(browser=FakeBrowser())
+    monkeypatch.setattr(app, "suspend", nullcontext)
+    monkeypatch.setattr("subprocess.run", run)
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+    async with app.run_test(size=(120, 40)) as pilot:
+        await ready(app, pilot)
+        app.push_screen(a_review(Path(), app))
+        await ready(app, pilot)
+        await pilot.press("f")
+        assert "c  brushloop calibrate" in await ready(app, pilot)
+        for key in ("f", "c", "t", "w"):
+            await pilot.press(key)
+            await ready(app, pilot)
+            assert isinstance(app.screen, AskScreen), "back at the question"
+        await pilot.press("escape", "escape", "d")
+    folder = "2026-11-21-grid-01"
+    assert ran == [
+        ["sessions", "verify", folder],
+        ["calibrate", folder],
+        ["fit", folder],
+        ["validate", folder],
+        ["doctor", "--config", "rig.toml"],
+    ]
+
+
+def test_pictures_work_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "textual_image", None)
+    look_for_pixels()
+    assert isinstance(picture_widget("x"), CellPicture)
+
+
+def test_a_pixel_is_a_dot_of_its_own_colour_on_the_colour_of_most() -> None:
+    paper = np.full((4, 4), 255, np.uint8)
+    paper[0, 0] = paper[3, 3] = 0
+    [line] = braille(paper, Size(2, 1))
+    assert strip_of(line).text == "⠁⢀"
+    colours = np.full((4, 4, 3), 255, np.uint8)
+    colours[:, 2:] = (0, 114, 181)
+    colours[0, 3] = 255
+    [line] = braille(colours, Size(2, 1))
+    strip = strip_of(line)
+    assert strip.text == "⠀⠈"
+    assert str(list(strip)[1].style) == "rgb(255,255,255) on rgb(0,115,180)"
