@@ -130,7 +130,7 @@ def plan(
     if arm or not rig.robot.on_this_machine:
         rig = rig.settled(arm)
     check_protocol(config, protocol, rig, wanted)
-    made = make_plan(rig, wanted)
+    planned = make_plan(rig, wanted)
     asked = None
     if ask:
         from brushloop.collect.walk import ask_reach
@@ -140,11 +140,11 @@ def plan(
     if picture is not None:
         from brushloop.collect.plan import draw_plan
 
-        draw_plan(rig, wanted, made, picture)
+        draw_plan(rig, wanted, planned, picture)
     if as_json:
-        say(json.dumps(made.as_json() | {"poses_in_reach": asked}))
+        say(json.dumps(planned.as_json() | {"poses_in_reach": asked}))
         return
-    say(plan_table(made))
+    say(plan_table(planned))
     if asked is not None:
         say(f"The controller finds joints for all {asked} poses.")
 

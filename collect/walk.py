@@ -53,8 +53,8 @@ from brushloop.collect.rig.paper import PaperPlane, Patch, Sheet
 from brushloop.collect.touch.camera import SPOTS_PER_DIP
 from brushloop.collect.touch.heights import EXTENT_MM, lowest_z_mm, patch_spots, touch_rects
 from brushloop.collect.touch.selfcheck import partners, triangle_in, triangle_on
-from brushloop.drivers.arcs.controller import Controller
-from brushloop.drivers.arcs.wire import RpcConnection, numbers, open_arcs
+from brushloop.drivers.arcs.controller import only_asking
+from brushloop.drivers.arcs.wire import numbers
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import LimitExceeded, ProtocolViolation
 from brushloop.drivers.geometry import from_wire, inverse, product, to_wire, turned
@@ -404,11 +404,7 @@ async def ask_reach(rig_path: Path, config: RigConfig, poses: Iterable[tuple[Pos
     for pose, _, name in poses:
         names.setdefault(pose, name)
     own_tool = from_wire([*(v / 1e3 for v in robot.tcp_offset_mm), *map(math.radians, robot.tcp_rotation_deg)])
-    controller = Controller(RpcConnection(robot.host, robot.port, framing=robot.framing))
-    try:
-        await open_arcs(controller.connection)
-        await controller.connection.login()
-        [controller.robot, *_] = await controller.robot_names()
+    async with only_asking(robot.host, robot.port, robot.framing) as controller:
         set_tool = from_wire(numbers("getTcpOffset", await controller.ask("RobotConfig.getTcpOffset")))
         near = await controller.joint_positions()
         for pose, name in names.items():
@@ -426,9 +422,7 @@ async def ask_reach(rig_path: Path, config: RigConfig, poses: Iterable[tuple[Pos
                     )
                 case other:
                     raise ProtocolViolation("robot", "inverseKinematics", f"no return code: {other!r}")
-        return len(names)
-    finally:
-        await controller.connection.close()
+    return len(names)
 
 
 def _for_tool(tip: Pose, own_tool: Pose, set_tool: Pose) -> Pose:

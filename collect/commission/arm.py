@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from brushloop.collect.commission.notebook import Notebook, touch_of
 from brushloop.collect.commission.step import Asked, Step, Visit
 from brushloop.collect.rig.doctor import Finding, Scrubber, numbers_only, transcript, write_archive
-from brushloop.drivers.arcs.controller import MOVING_ALLOWED, Controller
-from brushloop.drivers.arcs.wire import DEVICE, Framing, RpcConnection, answers, numbers, open_arcs
+from brushloop.drivers.arcs.controller import MOVING_ALLOWED, Controller, only_asking
+from brushloop.drivers.arcs.wire import DEVICE, Framing, answers, numbers
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, ProtocolViolation, RpcError
 from brushloop.drivers.geometry import distance, from_wire
@@ -156,25 +156,11 @@ def tip_of(flange: Pose, offset_mm: Sequence[float]) -> tuple[float, float, floa
 
 
 @contextlib.asynccontextmanager
-async def reading(host: str, port: int, framing: Framing) -> AsyncGenerator[ArmReader]:
-    """Connect to a controller, yield a reader, and disconnect. Raises `WrongGeneration` and other `DeviceError`s."""
-    connection = RpcConnection(host, port, framing=framing)
-    controller = Controller(connection)
-    try:
-        await open_arcs(connection)
-        await connection.login()
-        [controller.robot, *_] = await controller.robot_names()
-        yield ArmReader(controller)
-    finally:
-        await connection.close()
-
-
-@contextlib.asynccontextmanager
 async def taught_arm(notebook: Notebook) -> AsyncGenerator[ArmReader]:
     """The arm that was taught, for reading only."""
     host, port = str(notebook.get("robot.host")), int(notebook.number("robot.port"))
-    async with reading(host, port, notebook.framing) as reader:
-        yield reader
+    async with only_asking(host, port, notebook.framing) as controller:
+        yield ArmReader(controller)
 
 
 async def touch(visit: Visit, reader: ArmReader, thing: str, how: str, *, may_skip: bool = False) -> Pose | None:
@@ -198,8 +184,8 @@ async def find_framing(host: str, port: int) -> tuple[Framing, Cabinet]:
     first: DeviceError | None = None
     for framing in FRAMINGS:
         try:
-            async with reading(host, port, framing) as reader:
-                return framing, await reader.cabinet()
+            async with only_asking(host, port, framing) as controller:
+                return framing, await ArmReader(controller).cabinet()
         except ConnectionLost:
             raise
         except (DeviceTimeout, ProtocolViolation) as error:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.collect.commission.notebook import Notebook, Taught, taught
-from brushloop.collect.commission.sheet import corners_of
+from brushloop.collect.commission.sheet import inside_corners
 from brushloop.collect.commission.step import Asked, Step, Visit
 from brushloop.collect.errors import NotAccepted
 from brushloop.collect.operator import Choice
@@ -241,8 +241,7 @@ class ForceStep(Step):
         """How zero touch is done: by force, or by jogging, at four points."""
         size_x_mm, size_y_mm = notebook.numbers("paper.size_mm")
         method, why = ("force", "a sensor was found") if notebook.get("aside.bus") else ("jog", "no sensor")
-        middle = np.array([size_x_mm, size_y_mm]) / 2.0
-        points = middle + (corners_of(size_x_mm, size_y_mm) - middle) * (1.0 - INSET_MM / middle)
+        points = inside_corners((size_x_mm, size_y_mm), INSET_MM)
         _, slope_x, slope_y = notebook.numbers("aside.plane")
         lean_deg = math.degrees(math.atan(math.hypot(slope_x, slope_y)))
         widest_deg = min(max(math.ceil(10.0 * (lean_deg + LEAN_ROOM_DEG)) / 10.0, 1.0), 3.0)

@@ -318,12 +318,12 @@ def _within(notebook: Notebook) -> list[Point]:
 def _to_reach(rig: RigConfig, notebook: Notebook) -> list[tuple[Pose, float, str]]:
     """Poses over and in the sheet's corners and the well, and the park position, upright and at the cone's edge."""
     yaw, speed, tilt = rig.paper.yaw_deg, rig.motion.press_speed_mm_s, rig.robot.limits.tilt_deg
-    found: list[tuple[Pose, float, str]] = []
+    poses: list[tuple[Pose, float, str]] = []
     for number, (x, y, z) in enumerate(sheet_corners(notebook), 1):
-        found.append((brush_pose(x, y, rig.motion.safe_z_mm, heading_deg=yaw), speed, f"over corner {number}"))
+        poses.append((brush_pose(x, y, rig.motion.safe_z_mm, heading_deg=yaw), speed, f"over corner {number}"))
         low_mm = z - rig.brush.max_depth_mm
-        found.append((brush_pose(x, y, low_mm, heading_deg=yaw, tilt_deg=tilt), speed, f"pressed at corner {number}"))
+        poses.append((brush_pose(x, y, low_mm, heading_deg=yaw, tilt_deg=tilt), speed, f"pressed at corner {number}"))
     x, y, z = tips(notebook)["well 0"]
-    found.append((brush_pose(x, y, z, heading_deg=yaw), speed, "in the well"))
-    found.append((brush_pose(*rig.motion.park_mm, heading_deg=yaw), speed, "parked"))
-    return found
+    poses.append((brush_pose(x, y, z, heading_deg=yaw), speed, "in the well"))
+    poses.append((brush_pose(*rig.motion.park_mm, heading_deg=yaw), speed, "parked"))
+    return poses

@@ -112,19 +112,18 @@ class SheetStep(Step):
 
 def touch_point(fit: SheetFit) -> tuple[float, float]:
     """Inside the lowest corner of the sheet: the floor of every press is counted from there."""
-    middle = np.array(fit.size_mm) / 2.0
-    points = middle + (corners_of(*fit.size_mm) - middle) * (1.0 - INSET_MM / middle)
+    points = inside_corners(fit.size_mm, INSET_MM)
     x, y = min(points.tolist(), key=lambda at: fit.plane.touch_z_mm(at[0], at[1]))
     return round(x, 3), round(y, 3)
 
 
 def all_corners(notebook: Notebook, kind: str) -> dict[str, list[Point]]:
     """The tip at every touch of each corner, in the base frame. Raises `NotAccepted` where a corner was skipped."""
-    offset_mm, found = notebook.numbers("robot.tcp_offset_mm"), defaultdict[str, list[Point]](list)
+    offset_mm, corners = notebook.numbers("robot.tcp_offset_mm"), defaultdict[str, list[Point]](list)
     for name, flange in notebook.touched(kind).items():
-        found[name.split(" ", 1)[1]].append(tip_of(flange, offset_mm))
+        corners[name.split(" ", 1)[1]].append(tip_of(flange, offset_mm))
     thing = kind.removesuffix("-corner")
-    if missing := [f"{thing} {name}" for name in CORNERS if name not in found]:
+    if missing := [f"{thing} {name}" for name in CORNERS if name not in corners]:
         nearest_m, farthest_m = EASY_M
         raise NotAccepted(
             f"not touched: {', '.join(missing)}.",
@@ -132,7 +131,7 @@ def all_corners(notebook: Notebook, kind: str) -> dict[str, list[Point]]:
             f"board with the sheet, so that all corners are {nearest_m:g} to {farthest_m:g} m from the arm's foot, or "
             "turn its wrist the other way round, and touch all corners again.",
         )
-    return dict(found)
+    return dict(corners)
 
 
 def fitted(notebook: Notebook) -> SheetFit:
@@ -180,6 +179,12 @@ class SheetFit:
 def corners_of(size_x_mm: float, size_y_mm: float) -> Floats:
     """(4, 2) corners of a rectangle in the order of `CORNERS`, from its lower left one."""
     return np.array([[0.0, 0.0], [size_x_mm, 0.0], [size_x_mm, size_y_mm], [0.0, size_y_mm]])
+
+
+def inside_corners(size_mm: tuple[float, float], by_mm: float) -> Floats:
+    """(4, 2) points inside the corners of a sheet, this far from its edges, in the order of `CORNERS`."""
+    middle = np.array(size_mm) / 2.0
+    return middle + (corners_of(*size_mm) - middle) * (1.0 - by_mm / middle)
 
 
 def check_board(board: Mapping[str, Sequence[Point]], spec: BoardSpec) -> None:
@@ -286,7 +291,7 @@ def fit_sheet(board: Mapping[str, Sequence[Point]], sheet: Mapping[str, Sequence
 
 
 def _check_askew(b: Floats, bk: list[int], s: Floats, sk: list[int], printed: Floats) -> None:
-    mean = [s[[k for k, one in enumerate(sk) if one == corner]].mean(axis=0) for corner in range(4)]
+    mean = [s[[k for k, number in enumerate(sk) if number == corner]].mean(axis=0) for corner in range(4)]
     along = (mean[1] - mean[0]) + (mean[2] - mean[3])
     up = (mean[3] - mean[0]) + (mean[2] - mean[1])
     if along[0] * up[1] - along[1] * up[0] <= 0.0:

@@ -89,14 +89,14 @@ def find_tip(flanges: Sequence[Pose]) -> TipFit:
             f"the touches of the pin are too alike (condition {condition:.0f}, limit {WORST_CONDITION:g}):",
             "lean the brush by 30 deg or more to all four sides, and do not turn the wrist along with it.",
         )
-    found = np.asarray(np.linalg.lstsq(equations, -places.ravel(), rcond=None)[0], np.float64)
-    off = (equations @ found + places.ravel()).reshape(-1, 3)
+    solution = np.asarray(np.linalg.lstsq(equations, -places.ravel(), rcond=None)[0], np.float64)
+    off = (equations @ solution + places.ravel()).reshape(-1, 3)
     freedom = 3 * len(flanges) - 6
     noise_mm = max(math.sqrt(float((off**2).sum()) / freedom), HAND_MM)
     spread = noise_mm * np.sqrt(np.diag(np.linalg.inv(equations.T @ equations)))
     return TipFit(
-        _triple(found[:3]),
-        _triple(found[3:]),
+        _triple(solution[:3]),
+        _triple(solution[3:]),
         tuple(float(r) for r in np.linalg.norm(off, axis=1)),
         _triple(spread[:3]),
         freedom,

@@ -60,7 +60,7 @@ def load_protocol(path: Path) -> ProtocolConfig:
             values["presses"] = _rows_of(path, values, "presses", kind.row, MAX_STROKES)
         return _PROTOCOL.validate_python(values)
     except ValidationError as error:
-        raise refusal(path, error, TaggedProtocol, tagged=True) from None
+        raise refusal(path, error, TaggedProtocol) from None
 
 
 def _rows_of(

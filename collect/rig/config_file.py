@@ -61,25 +61,17 @@ def read_toml(path: Path, max_bytes: int) -> dict[str, Any]:
 
 
 def refusal(
-    path: Path,
-    error: ValidationError,
-    of: object,
-    *,
-    tagged: bool = False,
-    environment: Mapping[tuple[str, ...], str] | None = None,
+    path: Path, error: ValidationError, of: object, *, environment: Mapping[tuple[str, ...], str] | None = None
 ) -> ConfigError:
     """The first error in one line. An unknown key comes first, because it is often a missing key misspelt.
 
-    `of` is the model, or the union of models; `tagged` says that it is a union, whose tag pydantic puts in front of
-    each field's name. `environment` maps each path to the variable that sets it: an error in such a value names the
-    variable.
+    `of` is the model, or the union of models. `environment` maps each path to the variable that sets it: an error in
+    such a value names the variable.
     """
     errors = error.errors()
     first = min(errors, key=lambda e: e["type"] != "extra_forbidden")
-    what = _what(first, of)
-    key = first["loc"][-1:] if first["type"] == "extra_forbidden" else ()
-    within = first["loc"][1 if tagged else 0 : len(first["loc"]) - len(key)]
-    loc = [*(part for part in within if not _is_tag(part)), *key]
+    models, loc = located(of, first["loc"])
+    what = _what(first, models)
     if first["type"].startswith("union_tag"):
         loc.append("kind")
     more = f"; and {len(errors) - 1} more" if len(errors) > 1 else ""
@@ -92,17 +84,16 @@ def refusal(
     return ConfigError(where, ".".join(str(part) for part in loc), what + more)
 
 
-def _what(first: ErrorDetails, of: object) -> str:
-    """What is wrong."""
-    loc = first["loc"]
+def _what(first: ErrorDetails, models: Sequence[type[BaseModel]]) -> str:
+    """What is wrong in a table of these models."""
     match first["type"]:
         case "extra_forbidden":
-            known = fields(models_at(of, loc[:-1]))
-            meant = nearest(str(loc[-1]), known)
+            known = fields(models)
+            meant = next(iter(difflib.get_close_matches(str(first["loc"][-1]), known, n=1)), None)
             hint = f"known are {', '.join(known)}" if meant is None else f"did you mean {meant}?"
             return f"unknown field; {hint}"
         case "union_tag_not_found":
-            return f"is missing: one of {', '.join(map(repr, kinds(models_at(of, loc))))}"
+            return f"is missing: one of {', '.join(map(repr, kinds(models)))}"
         case "union_tag_invalid":
             context = first.get("ctx", {})
             return f"{context['tag']!r} is not one of {context['expected_tags']}"
@@ -113,29 +104,23 @@ def _what(first: ErrorDetails, of: object) -> str:
             return f"{first['msg']} (given: {shown if len(shown) <= 80 else shown[:77] + '...'})"
 
 
-def _is_tag(part: str | int) -> bool:
-    """Whether this is the tag of a union within the file, not a field: only such tags have a hyphen."""
-    return isinstance(part, str) and "-" in part
-
-
 HOLDERS = (Annotated, Union, UnionType, list, tuple)
 
 
-def models_at(of: object, loc: Sequence[str | int]) -> list[type[BaseModel]]:
-    """The models of the table at `loc`, an error location of pydantic, which includes union tags and item numbers.
+def located(of: object, loc: Sequence[str | int]) -> tuple[list[type[BaseModel]], list[str | int]]:
+    """The models of the innermost known table at an error location of pydantic, and the location as the file has it.
 
-    `of` is a model, or a union of models.
+    `of` is a model, or a union of models. pydantic puts the tag of a union in front of the names of its fields.
     """
-    models = list(_models(of))
+    models, path = list(_models(of)), list[str | int]()
     for part in loc:
-        if isinstance(part, int):
+        if chosen := [model for model in models if part in kinds([model])]:
+            models = chosen
             continue
-        inside = [model.model_fields[part].annotation for model in models if part in model.model_fields]
-        if inside:
-            models = [model for annotation in inside for model in _models(annotation)]
-        else:
-            models = [model for model in models if part in kinds([model])]
-    return models
+        path.append(part)
+        inside = [model.model_fields[str(part)].annotation for model in models if part in model.model_fields]
+        models = [model for annotation in inside for model in _models(annotation)] or models
+    return models, path
 
 
 def fields(models: Sequence[type[BaseModel]]) -> list[str]:
@@ -147,11 +132,6 @@ def kinds(models: Sequence[type[BaseModel]]) -> list[str]:
     """Values that `kind` may have in these tables."""
     tags = (model.model_fields["kind"].annotation for model in models if "kind" in model.model_fields)
     return [str(kind) for tag in tags if get_origin(tag) is Literal for kind in get_args(tag)]
-
-
-def nearest(name: str, known: Sequence[str]) -> str | None:
-    """The known name that is most similar, if any is."""
-    return next(iter(difflib.get_close_matches(name, known, n=1)), None)
 
 
 def _models(annotation: object) -> Iterator[type[BaseModel]]:

@@ -357,11 +357,11 @@ def write_archive(path: Path, known: dict[str, Any], files: dict[str, str]) -> N
 
 def _versions() -> dict[str, str]:
     """Versions of brushloop and of its libraries."""
-    found: dict[str, str] = {}
+    versions: dict[str, str] = {}
     for requirement in ("brushloop", *(importlib.metadata.requires("brushloop") or ())):
         name = re.split(r"[^\w.-]", requirement, maxsplit=1)[0]
         try:
-            found[name] = importlib.metadata.version(name)
+            versions[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             continue  # an extra that is not installed
-    return found
+    return versions

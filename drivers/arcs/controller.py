@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import asyncio
 import statistics
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncGenerator, AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from typing import Any
@@ -374,3 +375,19 @@ async def _exchange(connection: RpcConnection, method: str, params: dict[str, An
     except DeviceError as error:
         answer = {"refused": error.what}
     return Exchange(method, params, answer, (loop.time() - began) * 1e3)
+
+
+@asynccontextmanager
+async def only_asking(host: str, port: int, framing: Framing) -> AsyncGenerator[Controller]:
+    """Connect to a controller, yield it, and disconnect; for asking, as nothing is set, powered or moved.
+
+    Raises `WrongGeneration` and other `DeviceError`s.
+    """
+    controller = Controller(RpcConnection(host, port, framing=framing))
+    try:
+        await open_arcs(controller.connection)
+        await controller.connection.login()
+        [controller.robot, *_] = await controller.robot_names()
+        yield controller
+    finally:
+        await controller.connection.close()

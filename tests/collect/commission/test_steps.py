@@ -15,7 +15,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from brushloop.collect.commission import places, proof
-from brushloop.collect.commission.arm import ArmReader, ArmStep, reading
+from brushloop.collect.commission.arm import ArmReader, ArmStep
 from brushloop.collect.commission.notebook import Notebook, taught, touch_of
 from brushloop.collect.commission.places import PlacesStep, check_pot, check_wipe
 from brushloop.collect.commission.proof import ProofStep, slowly
@@ -27,6 +27,7 @@ from brushloop.collect.operator import Prompt
 from brushloop.collect.photograph.frames import Thumbnail
 from brushloop.collect.rig.check import brush_square
 from brushloop.collect.rig.config import load_rig
+from brushloop.drivers.arcs.controller import only_asking
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.geometry import brush_pose
@@ -51,9 +52,9 @@ async def test_an_answer_that_is_no_number_is_refused_by_its_getter(
     server: ArcsServer, getter: str, answer: object
 ) -> None:
     server._methods[f"rob1.RobotConfig.{getter}"] = lambda _: answer
-    async with reading("127.0.0.1", server.port, "sof") as reader:
+    async with only_asking("127.0.0.1", server.port, "sof") as controller:
         with pytest.raises(ProtocolViolation, match=getter):
-            await reader.cabinet()
+            await ArmReader(controller).cabinet()
 
 
 def leaning(x_mm: float, y_mm: float, z_mm: float, toward_deg: float, tilt_deg: float, wrist_deg: float) -> Pose:
