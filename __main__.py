@@ -202,7 +202,6 @@ def fault(
     control: Annotated[Path, typer.Argument(help="Control socket of a rig: `brushloop sim --control PATH`.")],
     what: Annotated[str, typer.Argument(help="Device to break, or list, clear, state, release, fresh-sheet.")],
     kind: Annotated[str | None, typer.Argument(help="How it breaks: mute, late, black, bus-off, ...")] = None,
-    after_s: Annotated[float | None, typer.Option(help="Not before this simulated time.")] = None,
     on: Annotated[str | None, typer.Option(help="Only on this method of the robot, such as moveLine.")] = None,
     nth: Annotated[int | None, typer.Option(help="Begin at the n-th request, push or frame.")] = None,
     phase: Annotated[str | None, typer.Option(help="Begin while the arm does this, such as descending.")] = None,
@@ -217,7 +216,7 @@ def fault(
 
     from brushloop.drivers.loopback import ask, request_of
 
-    options = {"after_s": after_s, "on": on, "nth": nth, "phase": phase, "press": press, "count": count}
+    options = {"on": on, "nth": nth, "phase": phase, "press": press, "count": count}
     request = request_of(what, kind, options | {"for_s": for_s, "late_s": late_s, "id": ident})
     say(*dumps(ask(control, request), indent=2).split("\n"))
 

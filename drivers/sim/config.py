@@ -132,8 +132,6 @@ class SimConfig:
     """Where the tip rests when the rig starts, in the base frame."""
     ink_device: Literal["station", "pump", "none"] = "station"
     """The device at the well: an ink station, a Modbus pump, or none (a person with a bottle)."""
-    reservoir_ml: float = 100.0
-    """Ink that the device can still give."""
     force_sensor: bool = True
     """Whether a force sensor sits between flange and brush."""
     force_hz: float = 200.0
@@ -141,7 +139,6 @@ class SimConfig:
     force_noise_n: float = 0.002
     """Standard deviation of each round: that of a sensor for a few N, which a soft brush needs."""
     force_noise_nm: float = 2e-4
-    sensor_to_tip_mm: float = 180.0
     hanging_kg: float = 0.12
     """Mass of holder and brush below the sensor."""
     tool_mm: float = 180.0

@@ -122,8 +122,6 @@ class Fault(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
 
     device: Device
     kind: str
-    after_s: Annotated[float, Field(ge=0.0, le=1e6)] = 0.0
-    """Earliest beginning, in simulated seconds since the rig started."""
     on: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_.]{0,79}$")] | None = None
     """Only requests of this method: `moveLine`, or in full `rob1.MotionControl.moveLine`; `login` for the login."""
     nth: Annotated[int, Field(ge=1, le=ALWAYS)] = 1
@@ -178,8 +176,6 @@ def fault_of(values: dict[str, Any]) -> Fault:
 TICK_S, IDLE_TICK_S = 0.002, 0.02
 KEPT = 100
 """Finished faults that are still listed."""
-MOST = 1000
-"""Most faults on the board at once."""
 
 
 @dataclass(slots=True)
@@ -216,8 +212,6 @@ class FaultBoard:
         """Add a fault; return the number by which it can be removed. Raises ValueError where it can never strike."""
         if fault.device in self._missing:
             raise ValueError(f"device = {fault.device.value!r}: this rig has none")
-        if len(self._hanging) >= MOST:
-            raise ValueError(f"there are already {MOST} faults on the board")
         hung = Hung(next(self._idents), fault)
         self._hanging[hung.ident] = hung
         return hung.ident
@@ -286,11 +280,8 @@ class FaultBoard:
             self._end(hung)
 
     def _holds(self, fault: Fault) -> bool:
-        return (
-            self._world.clock.now_s() >= fault.after_s
-            and (fault.press is None or len(self._world.presses) == fault.press)
-            and (fault.phase is None or self.phase() is fault.phase)
-        )
+        on_paper = fault.press is None or len(self._world.presses) == fault.press
+        return on_paper and (fault.phase is None or self.phase() is fault.phase)
 
     def _end(self, hung: Hung) -> None:
         if self.take(hung.ident):

@@ -170,7 +170,6 @@ def _guess(rng: np.random.Generator, seed: int, rate: float, picture_px: tuple[i
         table=table,
         view=view,
     )
-    config = replace(config, sensor_to_tip_mm=config.tool_mm)
     typed = _typed_tcp(rng, config)
     payload_kg, sheet_camera = float(rng.choice([0.0, 0.5])), int(rng.integers(2))
     park = _park(rng, config)

@@ -24,6 +24,7 @@ TAUGHT_TOUCH_ERROR_MM = 0.03
 """Error of a taught touch height."""
 SEEN_S = 0.05
 """Real time within which a pose is seen by polling."""
+PUMP_RESERVOIR_ML = 100.0
 PUMP_ML = 0.1
 """Delivery of the loopback pump, ml per revolution."""
 
@@ -259,12 +260,11 @@ def _at_sensor(config: SimConfig, wrench: Wrench) -> Wrench:
 
 
 def _ink(world: World) -> PtyLine | None:
-    reservoir_ml = world.config.reservoir_ml
     match world.config.ink_device:
         case "station":
-            return PtyLine(StationFirmware(world.well, reservoir_ml))
+            return PtyLine(StationFirmware(world.well))
         case "pump":
             pumped = world.well.add
-            return PtyLine(PumpFirmware(ml_per_revolution=PUMP_ML, reservoir_ml=reservoir_ml, on_pumped=pumped))
+            return PtyLine(PumpFirmware(ml_per_revolution=PUMP_ML, reservoir_ml=PUMP_RESERVOIR_ML, on_pumped=pumped))
         case "none":
             return None

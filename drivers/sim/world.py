@@ -6,7 +6,7 @@ import functools
 import itertools
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,44 +26,6 @@ from brushloop.drivers.sim.motion import MotionQueue
 
 SIDEWAYS_MM = 0.5
 """A contact that travels less far sideways is a press."""
-
-
-@dataclass(frozen=True, slots=True)
-class Contact:
-    """The path of the tip at and below the paper plane; straight lines between poses."""
-
-    poses: tuple[Pose, ...]
-    deepest: Pose
-    """The pose farthest below the plane; the first if there are several."""
-
-    @property
-    def dragged(self) -> bool:
-        """False for a press. Withdrawing along the brush's own axis is not a drag, even if it is tilted."""
-        return sum(_sideways_mm(a, b) for a, b in itertools.pairwise(self.poses)) > SIDEWAYS_MM
-
-
-class ContactWatch:
-    """Collects finished stretches of the path until the brush lifts off the paper.
-
-    `above_mm` is the distance of a pose from the paper plane, negative below; it is linear in the position.
-    """
-
-    def __init__(self, above_mm: Callable[[Pose], float]) -> None:
-        self._above_mm = above_mm
-        self._poses: list[Pose] = []
-
-    def travelled(self, start: Pose, end: Pose) -> Contact | None:
-        """Add one straight stretch; return the contact that it ended, or None."""
-        high, low = self._above_mm(start), self._above_mm(end)
-        if high < 0.0 or low < 0.0:
-            if not self._poses:
-                self._poses.append(start if high < 0.0 else interpolate(start, end, high / (high - low)))
-            self._poses.append(end if low < 0.0 else interpolate(start, end, high / (high - low)))
-        if low < 0.0 or not self._poses:
-            return None
-        contact = Contact(tuple(self._poses), min(self._poses, key=self._above_mm))
-        self._poses = []
-        return contact
 
 
 def _sideways_mm(a: Pose, b: Pose) -> float:
@@ -227,10 +189,11 @@ class World:
         self.ink_load = 0.0
         table = config.table
         self.well = Well.round(table.well_radius_mm, table.ink_level_mm, table.well_depth_mm)
-        self.reaction = Reaction(self.brush, sensor_to_tip_mm=config.sensor_to_tip_mm, hanging_kg=config.hanging_kg)
+        self.reaction = Reaction(self.brush, sensor_to_tip_mm=config.tool_mm, hanging_kg=config.hanging_kg)
         self.version = 0
         """Number of visible changes to the sheet so far."""
-        self._watch = ContactWatch(self._above_mm)
+        self._contact: list[Pose] = []
+        """The path of the tip at and below the paper plane, as long as the brush touches; straight between poses."""
         self.hand_guided = False
         """While a person guides the arm, the brush is dry and held lightly: contacts leave nothing."""
         self.push_n = (0.0, 0.0, 0.0)
@@ -267,18 +230,24 @@ class World:
         return self.config.table.to_paper(x_mm, y_mm)
 
     def _travelled(self, start: Pose, end: Pose) -> None:
+        """Follow one finished straight stretch of the path: dips into the well, and a contact until the brush lifts."""
         if self.hand_guided:
             return
         # Along a straight line the tip's height is linear, so the lowest point is one of the ends.
         for pose in (start, end):
             self._dip(pose)
-        contact = self._watch.travelled(start, end)
-        if contact is None:
-            return
-        if contact.dragged:
-            self._leave_drag(contact)
-        else:
-            self._leave_mark(contact.deepest)
+        high, low = self._above_mm(start), self._above_mm(end)
+        if high < 0.0 or low < 0.0:
+            if not self._contact:
+                self._contact.append(start if high < 0.0 else interpolate(start, end, high / (high - low)))
+            self._contact.append(end if low < 0.0 else interpolate(start, end, high / (high - low)))
+        if low >= 0.0 and self._contact:
+            contact, self._contact = self._contact, []
+            # Withdrawing along the brush's own axis is not a drag, even if it is tilted.
+            if sum(_sideways_mm(a, b) for a, b in itertools.pairwise(contact)) > SIDEWAYS_MM:
+                self._leave_drag(contact)
+            else:
+                self._leave_mark(min(contact, key=self._above_mm))
 
     def _dip(self, pose: Pose) -> None:
         table = self.config.table
@@ -313,12 +282,12 @@ class World:
         self.ink_load = max(0.0, self.ink_load - INK_PER_PRESS)
         self.version += 1
 
-    def _leave_drag(self, contact: Contact) -> None:
-        path = tuple(Waypoint(*self._on_sheet(pose)) for pose in contact.poses)
+    def _leave_drag(self, contact: Sequence[Pose]) -> None:
+        path = tuple(Waypoint(*self._on_sheet(pose)) for pose in contact)
         if not any(self._is_on_sheet(w.x_mm, w.y_mm) for w in path):
             return
-        tilt_deg, _ = self._lean(contact.deepest)
-        _, heading_deg = self._lean(contact.poses[0])
+        tilt_deg, _ = self._lean(min(contact, key=self._above_mm))
+        _, heading_deg = self._lean(contact[0])
         index = len(self.drags)
         make = functools.partial(
             self.brush.drag,
