@@ -121,6 +121,7 @@ class Cabinet:
         self.tcp_offset = [0.0] * 6
         self.payload: list[Any] = [0.0, [0.0] * 3, [0.0] * 3, [0.0] * 6]
         self.collision_level = 6
+        self.speed_fraction = 1.0
         self.operational_mode = "Automatic"
         self.messages: list[dict[str, Any]] = []
         self._near = self.motion.near
@@ -322,13 +323,6 @@ class Cabinet:
             case _:
                 self.safety_stop(SafetyMode.PROTECTIVE_STOP)
 
-    def set_speed_fraction(self, fraction: float) -> int:
-        """Scale the speed of every move that is queued from now on."""
-        if not 0.0 < fraction <= 1.0:
-            return -ReturnCode.INVALID_ARGUMENT
-        self.motion.fraction = fraction
-        return ReturnCode.OK
-
     def configure(self, name: str, value: object, allowed: bool) -> int:
         """Set one of the cabinet's settings, if the value is allowed."""
         if not allowed:
@@ -378,8 +372,10 @@ def methods(cabinet: Cabinet) -> dict[str, Callable[[Params], Any]]:
         "MotionControl.stopJoint": lambda p: cabinet.stop(SOFT_STOP_M_S2, float(p["acc"])),
         "MotionControl.stopMove": lambda _: cabinet.hold(),
         "MotionControl.startMove": lambda _: cabinet.resume(),
-        "MotionControl.setSpeedFraction": lambda p: cabinet.set_speed_fraction(float(p["fraction"])),
-        "MotionControl.getSpeedFraction": lambda _: motion.fraction,
+        "MotionControl.setSpeedFraction": lambda p: cabinet.configure(
+            "speed_fraction", float(p["fraction"]), 0.0 < float(p["fraction"]) <= 1.0
+        ),
+        "MotionControl.getSpeedFraction": lambda _: cabinet.speed_fraction,
         "MotionControl.getExecId": lambda _: motion.exec_id(now_s()),
         "MotionControl.getQueueSize": lambda _: cabinet.queue_size(),
         "RobotConfig.getRobotType": lambda _: "aubo_i5",

@@ -100,15 +100,6 @@ ADDRESSES = 200
 _labs = itertools.count()
 
 
-class OlderSoftware(LoopbackServer):
-    """The port of the software before ARCS: it takes connections, and answers nothing that ARCS would."""
-
-    async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Read until the client disconnects."""
-        while await reader.read(4096):
-            pass
-
-
 class UnknownLab:
     """`async with UnknownLab(seed) as lab:` serves until the block ends; `obey` asks the person for something.
 
@@ -141,7 +132,8 @@ class UnknownLab:
         self.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
         self.cabinet.payload = [self.facts.payload_kg, [0.0] * 3, [0.0] * 3, [0.0] * 6]
         self._room = MjpegServer(Wall(self.world), View(fps=ROOM_FPS))
-        self._older = OlderSoftware()
+        self._older = LoopbackServer()
+        """The software before ARCS: its port takes connections, and answers nothing that ARCS would."""
         self._asked: Counter[str] = Counter()
         self._touches = 0
         self._pulled: list[int] = []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from typing import Any
@@ -16,7 +16,7 @@ from brushloop.drivers.geometry import DOWN, brush_pose, of_vector, product
 from brushloop.drivers.sim.brush.brush import BrushSpec
 from brushloop.drivers.sim.config import SimConfig, Table, View
 from brushloop.drivers.sim.kinematics import HOME, inverse, inverted, matrix_of
-from brushloop.drivers.sim.scene import Floats, homography, mapped
+from brushloop.drivers.sim.scene import homography, mapped
 from brushloop.drivers.sim.world import tool_of
 
 Place = tuple[float, float, float]
@@ -71,6 +71,8 @@ LIFT_MM = 60.0
 PIN_TILT_DEG = 38.0
 CLEAR_OF_PICTURE_MM = 75.0
 """More than the arm hides around the tip."""
+BOARD_MARGIN_PX = 12.0
+"""Least distance of the board from the edge of the picture: the lens distorts."""
 CLEAR_APART_MM = 160.0
 """Between two places out of the picture."""
 PRESS_SHARE = 0.45
@@ -145,7 +147,10 @@ def draw(seed: int, rate: float = 1.0, picture_px: tuple[int, int] = PICTURE_PX)
     """The lab of this seed: drawn again until the arm reaches everything and the camera sees the board."""
     for attempt in itertools.count():
         facts = _guess(np.random.default_rng([seed, 16, attempt]), seed, rate, picture_px)
-        if facts is not None and _board_in_picture(facts.config) and reaches(facts.config, poses(facts)):
+        if facts is None:
+            continue
+        board = [corner(facts.config.table, "board", name) for name in CORNERS]
+        if in_picture(facts.config, board, BOARD_MARGIN_PX) and reaches(facts.config, poses(facts)):
             return facts
     raise AssertionError("unreachable")
 
@@ -272,7 +277,7 @@ def _park(rng: np.random.Generator, config: SimConfig, away_from: Place | None =
         bearing = math.radians(azimuth_deg(middle) + rng.uniform(-80, 80))
         z_mm = config.table.paper_z_mm + float(rng.uniform(110, 180))
         place = (float(reach_mm * math.cos(bearing)), float(reach_mm * math.sin(bearing)), z_mm)
-        if in_picture(config, place) or _nearest_mm(middle, place) < BASE_CLEAR_MM:
+        if in_picture(config, [place]) or _nearest_mm(middle, place) < BASE_CLEAR_MM:
             continue
         if away_from is not None and math.dist(away_from, place) < CLEAR_APART_MM:
             continue
@@ -288,24 +293,15 @@ def _nearest_mm(start: Place, end: Place) -> float:
     return float(np.linalg.norm(a + along * (b - a)))
 
 
-def in_picture(config: SimConfig, place: Place) -> bool:
-    """Whether the arm with its tip there hides a part of the picture, lens distortion aside."""
-    at_mm = np.array([config.table.to_paper(*place[:2])])
-    return _within_picture(config.view, at_mm, -CLEAR_OF_PICTURE_MM * config.view.px_per_mm)
+def in_picture(config: SimConfig, places: Sequence[Place], margin_px: float | None = None) -> bool:
+    """Whether all places lie so far within the picture, lens distortion aside.
 
-
-def _board_in_picture(config: SimConfig) -> bool:
-    """Whether all of the board is seen, with a margin for the lens's distortion."""
-    (left, bottom), (width, height) = config.table.board_origin_mm, board_size_mm(config.table)
-    corners_mm = np.array([[left + i * width, bottom + j * height] for i in (0, 1) for j in (0, 1)])
-    return _within_picture(config.view, corners_mm, 12.0)
-
-
-def _within_picture(view: View, paper_mm: Floats, margin_px: float) -> bool:
-    """Whether all of the (n, 2) points of the paper plane lie so far within the picture."""
-    inside = mapped(homography(view), paper_mm)
-    most = np.array([view.width_px, view.height_px]) - margin_px
-    return bool(np.all((inside > margin_px) & (inside < most)))
+    By default, whether the arm with its tip at each of them hides a part of the picture.
+    """
+    view = config.view
+    at_px = mapped(homography(view), np.array([config.table.to_paper(*place[:2]) for place in places]))
+    least = -CLEAR_OF_PICTURE_MM * view.px_per_mm if margin_px is None else margin_px
+    return bool(np.all((at_px > least) & (at_px < np.array([view.width_px, view.height_px]) - least)))
 
 
 def poses(facts: Facts) -> Iterator[Pose]:
@@ -324,7 +320,7 @@ def poses(facts: Facts) -> Iterator[Pose]:
         yield held(facts.pin_mm, wrist_deg=azimuth_deg(facts.pin_mm), tilt_deg=PIN_TILT_DEG, toward_deg=toward_deg)
 
 
-def reaches(config: SimConfig, wanted: Iterator[Pose] | list[Pose]) -> bool:
+def reaches(config: SimConfig, wanted: Iterable[Pose]) -> bool:
     """Whether the arm reaches every pose of the tip with this tool."""
     tool, near = inverted(tool_of(config)), HOME
     for pose in wanted:

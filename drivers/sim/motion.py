@@ -145,8 +145,6 @@ class MotionQueue:
 
     def __init__(self, home: Pose, on_path: Callable[[Pose, Pose], None], tool: Matrix | None = None) -> None:
         self.tool: Matrix = np.eye(4) if tool is None else tool
-        self.fraction = 1.0
-        """Speed factor for every move that is added from now on."""
         self.near: Joints = HOME
         """The last known joints, from which inverse kinematics starts."""
         self.rests: deque[Rest] = deque(maxlen=RESTS_KEPT)
@@ -316,10 +314,10 @@ class MotionQueue:
         now_s: float,
         blend_mm: float = 0.0,
     ) -> None:
-        """Append a move at that share of its speed that `fraction` says, or slower so that it takes `least_s`."""
+        """Append a move at this speed, or slower so that it takes `least_s`."""
         here = self._knots[-1] if self.held else self._at(now_s)
         start = self._pieces[-1].stop if self._pieces else here.along
-        cap = min(speed * self.fraction, path.length / least_s) if least_s else speed * self.fraction
+        cap = min(speed, path.length / least_s) if least_s else speed
         piece = Piece(self._next_id, path, start, 0.0, path.length, cap, acc, blend_mm)
         self._next_id += 1
         rounded = self._rounded(piece, here.along)

@@ -40,21 +40,6 @@ def test_moves_queue_up_to_a_limit_and_the_same_pose_is_ignored(on: Any):
     assert on.ask("MotionControl.getQueueSize") == 0
 
 
-def test_the_speed_fraction_slows_down_what_is_queued_from_then_on(on: Any):
-    on.line(NEAR)
-    assert on.ask("MotionControl.setSpeedFraction", fraction=0.5) == 0
-    on.line(START)
-    on.clock.s += 1.2  # 100 mm at 100 mm/s and 1 m/s2
-    assert on.exec_id == 1
-    on.clock.s += 1.8
-    assert on.exec_id == 1
-    on.clock.s += 0.3
-    assert on.exec_id == -1
-    for wrong in (0.0, 1.1, math.nan):
-        assert on.ask("MotionControl.setSpeedFraction", fraction=wrong) == -5
-    assert on.ask("MotionControl.getSpeedFraction") == 0.5
-
-
 @pytest.mark.parametrize(
     ("hold", "resume"),
     [

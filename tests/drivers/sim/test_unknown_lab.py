@@ -59,7 +59,7 @@ def test_every_lab_is_one_that_could_be(seed: int):
     assert 120.0 <= tool.tool_mm <= 260.0
     assert math.hypot(*tool.tool_sideways_mm) <= 15.0
     assert math.degrees(math.acos(tool_of(tool)[2, 2])) <= 3.0
-    assert not in_picture(facts.config, facts.park_mm)
+    assert not in_picture(facts.config, [facts.park_mm])
     assert min(table.sheet_mm) > 150.0
     assert max(abs(v) for v in table.slope_deg) <= 1.0
 
