@@ -214,17 +214,21 @@ def fault(
     """Break a device of a running loopback rig, list its faults, or act as the person at its pendant."""
     from json import dumps
 
-    from brushloop.drivers.loopback import ask, request_of
+    from brushloop.drivers.loopback import ask
 
     options = {"on": on, "nth": nth, "phase": phase, "press": press, "count": count}
-    request = request_of(what, kind, options | {"for_s": for_s, "late_s": late_s, "id": ident})
+    options |= {"for_s": for_s, "late_s": late_s, "id": ident}
+    fields = {name: value for name, value in options.items() if value is not None}
+    request = {"do": what, **fields}
+    if kind is not None:
+        request = {"do": "add", "fault": {"device": what, "kind": kind, **fields}}
     say(*dumps(ask(control, request), indent=2).split("\n"))
 
 
 @app.command(rich_help_panel=SIMULATOR)
 def hand(
     control: Annotated[Path, typer.Argument(help="Control socket of a lab: `brushloop sim --unknown`.")],
-    act: Annotated[str, typer.Argument(help="bring, measure, mend or plug.")],
+    act: Annotated[str, typer.Argument(help="bring, measure or mend.")],
     to: Annotated[str | None, typer.Argument(help="What: pin, board-corner, well, park, hold-board, ...")] = None,
     index: Annotated[int, typer.Option(min=0, max=999, help="Which one, from 0, such as a direction at the pin.")] = 0,
     corner: Annotated[str | None, typer.Option(help="Such as 'lower left' or 'upper right'.")] = None,

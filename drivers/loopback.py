@@ -109,14 +109,6 @@ class FaultRefused(Exception):
     exit_code: ClassVar[int] = 2
 
 
-def request_of(what: str, kind: str | None, options: Mapping[str, object]) -> dict[str, Any]:
-    """The request that the words of a command line ask for; the rig refuses what it does not know."""
-    fields = {name: value for name, value in options.items() if value is not None}
-    if kind is None:
-        return {"do": what, **fields}
-    return {"do": "add", "fault": {"device": what, "kind": kind, **fields}}
-
-
 def ask(path: Path, request: Mapping[str, object]) -> dict[str, Any]:
     """Send a request; return the rig's answer. Raises `FaultRefused`, with one line, if it is missing or a refusal."""
     try:

@@ -8,7 +8,6 @@
 | `{"act": "bring", "to": "push-sensor", "index": 0}` | pushes the tip: 0 toward the flange, 1 and 2 aside |
 | `{"act": "measure", "to": "square"}` | measures with calipers or a ruler: `square`, `marker`, `tool` |
 | `{"act": "mend"}` | corrects what is wrong, once the person was asked to: the trap's mistake ends |
-| `{"act": "plug"}` | puts a cable back |
 
 Every answer has `says`, what the person would say; `bring` has `reached` too.
 """
@@ -189,10 +188,8 @@ class UnknownLab:
                     return {"says": self._measured(to)}
                 case "mend":
                     return {"says": await self.mend()}
-                case "plug":
-                    return {"says": self._plug()}
                 case _:
-                    raise ValueError(f"act = {act!r} is not one of bring, measure, mend, plug")
+                    raise ValueError(f"act = {act!r} is not one of bring, measure, mend")
 
     async def bring(self, to: str, index: int = 0, corner: str = "") -> dict[str, Any]:
         """Carry out `bring`, as in the table above. Raises ValueError for a thing that the lab does not have."""
@@ -221,7 +218,9 @@ class UnknownLab:
             case None:
                 return "Nothing is wrong that I know of."
             case Trap.CABLE_PULLED:
-                return self._plug()
+                pulled, self._pulled = self._pulled, []
+                for ident in pulled:
+                    self.rig.faults.take(ident)
             case Trap.OLD_SOFTWARE:
                 await self._older.stop()
                 await self.rig.arcs.start(self.host, ARCS_PORT)
@@ -370,13 +369,6 @@ class UnknownLab:
         if self._touches == self.facts.cable_after:
             lost = ((Device.ROBOT, "deaf"), (Device.TELEMETRY, "mute"))
             self._pulled = [self.rig.faults.hang(Fault(device=d, kind=kind, count=ALWAYS)) for d, kind in lost]
-
-    def _plug(self) -> str:
-        """Put the cable back."""
-        pulled, self._pulled = self._pulled, []
-        for ident in pulled:
-            self.rig.faults.take(ident)
-        return "The cable was out; it is in again." if pulled else "Every cable is in."
 
 
 def _error_mm(rng: np.random.Generator, spread_mm: float) -> list[float]:

@@ -6,7 +6,6 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from functools import cached_property
 
 import cv2
 import numpy as np
@@ -32,19 +31,6 @@ class Waypoint:
 
 
 @dataclass(frozen=True, slots=True)
-class Reach:
-    """How far behind the commanded tip the patch lies, by depth; (k,) each."""
-
-    depth_mm: Vector
-    pressed_mm: Vector
-    """Distance from the tip to the middle of the patch after a straight descent."""
-    pulled_mm: Vector
-    """The same while the brush is dragged: the length of the leash."""
-    half_mm: Vector
-    """Half the length of the patch."""
-
-
-@dataclass(frozen=True, slots=True)
 class Moment:
     """The patch at one moment of a drag."""
 
@@ -62,7 +48,7 @@ class Moment:
     """True once the leash has come taut."""
 
 
-def follow(path: Sequence[Waypoint], reach: Reach, heading_rad: float) -> list[Moment]:
+def follow(path: Sequence[Waypoint], stances: Stances, heading_rad: float) -> list[Moment]:
     """Draw the patch along the path on its leash.
 
     While the brush comes down, its tip slides away from the ferrule and takes the middle of the patch along. The patch
@@ -70,9 +56,7 @@ def follow(path: Sequence[Waypoint], reach: Reach, heading_rad: float) -> list[M
     that is pulled at its middle, over half its own length; pulled across, the hairs stand up and the patch is short.
     """
     x, y, depth = _samples(path)
-    pressed, pulled, half = (
-        np.interp(depth, reach.depth_mm, v) for v in (reach.pressed_mm, reach.pulled_mm, reach.half_mm)
-    )
+    pressed, pulled, half = stances.leash_mm(depth)
     travel = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
     px, py = float(x[0]), float(y[0])
     heading, taut = heading_rad, False
@@ -134,16 +118,18 @@ class Stances:
         below = min(int(place), len(shapes) - 2)
         return _between(shapes[below], shapes[below + 1], place - below)
 
-    @cached_property
-    def reach(self) -> Reach:
-        """The leash that belongs to these stances."""
-        depth = np.linspace(0.0, self.deepest_mm, len(self.pulled))
-        pressed, pulled = ([self.at(float(d), p) for d in depth] for p in (False, True))
-        return Reach(
-            depth_mm=depth,
-            pressed_mm=np.array([-middle_mm(s) for s in pressed]),
-            pulled_mm=np.array([-middle_mm(s) for s in pulled]),
-            half_mm=np.array([_half_mm(s) for s in pulled]),
+    def leash_mm(self, depth_mm: Vector) -> tuple[Vector, Vector, Vector]:
+        """How far behind the commanded tip the middle of the patch lies, (n,) each, at depths (n,).
+
+        Returns the distance after a straight descent, the distance while the brush is dragged, which is the length of
+        the leash, and half the length of the patch.
+        """
+        solved_mm = np.linspace(0.0, self.deepest_mm, len(self.pulled))
+        pressed, pulled = ([self.at(float(d), p) for d in solved_mm] for p in (False, True))
+        return (
+            np.interp(depth_mm, solved_mm, [-middle_mm(shape) for shape in pressed]),
+            np.interp(depth_mm, solved_mm, [-middle_mm(shape) for shape in pulled]),
+            np.interp(depth_mm, solved_mm, [_half_mm(shape) for shape in pulled]),
         )
 
 
@@ -182,7 +168,7 @@ def draw_drag(
     """Lay the patch along the path, in a frame parallel to the paper's with its origin at the first waypoint."""
     start = path[0]
     local = tuple(Waypoint(w.x_mm - start.x_mm, w.y_mm - start.y_mm, w.depth_mm) for w in path)
-    track = follow(local, stances.reach, heading_rad)
+    track = follow(local, stances, heading_rad)
     stamps: dict[tuple[float, float, bool], _Stamp] = {}
     laid: list[tuple[_Stamp, Moment]] = []
     for moment in track:

@@ -10,7 +10,7 @@ ACM TOG 39(4), 2020), by damped Newton.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -86,15 +86,7 @@ def press_spine(bundle: Bundle, depth_mm: float, tilt_rad: float) -> tuple[Spine
 
 def lower_spine(bundle: Bundle, lowered_mm: Iterable[float], tilt_rad: float) -> tuple[SpineShape, ...]:
     """The spine at each of the rising depths `lowered_mm`, which are the load steps of one descent."""
-    start = _unloaded(bundle, tilt_rad)
-    phi, last_x, last_normal = tilt_rad + np.cumsum(bundle.rest_bend_rad), start.last_x, start.last_normal
-    path: list[SpineShape] = []
-    for lowered in lowered_mm:
-        step = start.moved(0.0, float(lowered), last_x, last_normal)
-        phi = step.solve(phi)
-        path.append(step.shape(phi))
-        last_x, last_normal = path[-1].x_mm, path[-1].normal_n
-    return tuple(path)
+    return tuple(_loaded(bundle, tilt_rad, ((0.0, float(lowered)) for lowered in lowered_mm)))
 
 
 def rest_spine(bundle: Bundle, tilt_rad: float) -> SpineShape:
@@ -108,19 +100,23 @@ def pull_spine(bundle: Bundle, depth_mm: int, tilt_rad: float) -> tuple[SpineSha
     Positions are relative to the ferrule as in `press_spine`. The bundle slides all the time, so the result does
     not depend on how it came down; the ferrule advances half a mm with each load step, and once more at each depth.
     """
+    lowered_mm = [lowered for depth in range(1, depth_mm + 1) for lowered in (depth - 0.5, depth, depth)]
+    steps = [(LOAD_STEP_MM * count, lowered) for count, lowered in enumerate(lowered_mm, 1)]
+    path = zip(steps, _loaded(bundle, tilt_rad, steps), strict=True)
+    shapes = [replace(shape, x_mm=shape.x_mm - gone) for (gone, _), shape in path]
+    return tuple(shapes[2::3])
+
+
+def _loaded(bundle: Bundle, tilt_rad: float, steps: Iterable[tuple[float, float]]) -> Iterator[SpineShape]:
+    """The spine after each load step: mm that the ferrule is then moved along +x, and down, since zero touch."""
     start = _unloaded(bundle, tilt_rad)
     phi, last_x, last_normal = tilt_rad + np.cumsum(bundle.rest_bend_rad), start.last_x, start.last_normal
-    shapes: list[SpineShape] = []
-    gone = 0.0
-    for depth in range(1, depth_mm + 1):
-        for lowered in (depth - 0.5, depth, depth):
-            gone += LOAD_STEP_MM
-            step = start.moved(gone, lowered, last_x, last_normal)
-            phi = step.solve(phi)
-            shape = step.shape(phi)
-            last_x, last_normal = shape.x_mm, shape.normal_n
-        shapes.append(replace(shape, x_mm=shape.x_mm - gone))
-    return tuple(shapes)
+    for gone, lowered in steps:
+        step = start.moved(gone, lowered, last_x, last_normal)
+        phi = step.solve(phi)
+        shape = step.shape(phi)
+        last_x, last_normal = shape.x_mm, shape.normal_n
+        yield shape
 
 
 def _unloaded(bundle: Bundle, tilt_rad: float) -> _LoadStep:

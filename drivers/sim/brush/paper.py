@@ -125,7 +125,6 @@ class Paper:
         self._density: NDArray[np.float32] = np.zeros(shape, np.float32)
         self._coming: deque[tuple[Callable[[], Footprint], float, float, float]] = deque()
         self._lock = threading.Lock()
-        self.presses = 0
 
     @property
     def density(self) -> NDArray[np.float32]:
@@ -148,7 +147,6 @@ class Paper:
 
         A footprint takes a tenth of a second to compute, too long for the thread that moves the arm.
         """
-        self.presses += 1
         self._coming.append((make, x_mm, y_mm, heading_deg))
 
     def lay(self, footprint: Footprint, x_mm: float, y_mm: float, heading_deg: float) -> None:

@@ -6,14 +6,15 @@ import asyncio
 import json
 import re
 import stat
-import subprocess
-import sys
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from click.testing import Result
+from typer.testing import CliRunner
 
+import brushloop.__main__
 from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose
@@ -26,7 +27,6 @@ from brushloop.drivers.sim.rig import LoopbackRig
 from brushloop.drivers.sim.serve import ControlServer, live_control
 from brushloop.drivers.sim.world import World
 from tests.drivers.sim.conftest import StoppedClock
-from tests.waiting import PATIENCE_S, wait_until
 
 
 class Scripted(FaultBoard):
@@ -311,35 +311,16 @@ async def test_a_path_that_the_system_would_cut_is_refused(rig: LoopbackRig, tmp
         assert caught.value.exit_code == 2
 
 
-NOTHING: dict[str, object] = {"on": None, "count": None, "id": None}
+async def test_a_person_breaks_the_rig_and_mends_it(control: Path):
+    def fault(*words: str) -> Result:
+        return CliRunner().invoke(brushloop.__main__.app, ["fault", str(control), *words])
 
-
-def brushloop(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "brushloop", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
-
-
-@pytest.fixture
-def served(tmp_path: Path) -> Iterator[Path]:
-    path = tmp_path / "control"
-    command = [sys.executable, "-m", "brushloop", "sim", "--control", str(path)]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-    wait_until(path.exists, "the control socket", process=process)
-    yield path
-    process.terminate()
-    _, stderr = process.communicate(timeout=PATIENCE_S)
-    assert stderr == ""
-    assert not path.exists()
-
-
-def test_a_person_breaks_the_rig_and_mends_it(served: Path):
-    added = brushloop("fault", served, "robot", "mute", "--on", "moveLine", "--count", "3")
-    assert json.loads(added.stdout) == {"id": 1}, added.stderr
-    refused = brushloop("fault", served, "robot", "loud")
-    assert refused.returncode == 2
-    assert refused.stderr.startswith("brushloop: kind = 'loud' is not one of robot's")
-    assert refused.stderr.count("\n") == 1
-    assert json.loads(brushloop("fault", served, "clear").stdout) == {"taken": 1}
+    added = await asyncio.to_thread(fault, "robot", "mute", "--on", "moveLine", "--count", "3")
+    assert json.loads(added.stdout) == {"id": 1}
+    refused = await asyncio.to_thread(fault, "robot", "loud")
+    assert isinstance(refused.exception, FaultRefused)
+    assert str(refused.exception).startswith("kind = 'loud' is not one of robot's")
+    assert json.loads((await asyncio.to_thread(fault, "clear")).stdout) == {"taken": 1}
 
 
 def test_where_no_rig_answers_it_is_said_in_one_line(tmp_path: Path):

@@ -220,4 +220,3 @@ def test_ink_only_adds_up_and_never_beyond_full():
         assert paper.density.max() <= 1.0
         before = paper.density
     assert before.max() == pytest.approx(0.875)
-    assert paper.presses == 3
