@@ -106,6 +106,7 @@ JOINT_SPEED_RAD_S, JOINT_ACC_RAD_S2 = 2.5964, 20.7
 TCP_SPEED_M_S, TCP_ACC_M_S2 = 2.0, 10.0
 POSE_OUT_OF_REACH = 30047
 BLEND_M = (0.001, 1.0)
+PROTECTIVE_STOP_ACTION = 3
 OPERATIONAL_MODES = ("Disabled", "Automatic", "Manual")
 
 Params = dict[str, Any]
@@ -241,11 +242,10 @@ class Cabinet:
         if joints is None:
             return self._out_of_reach()
         self._near = joints
-        speed_m_s, acc_m_s2 = _pace(p, TCP_SPEED_M_S, TCP_ACC_M_S2)
         added = self.motion.add(
             target,
-            speed_m_s * 1e3,
-            acc_m_s2 * 1e3,
+            min(float(p["v"]), TCP_SPEED_M_S) * 1e3,
+            min(float(p["a"]), TCP_ACC_M_S2) * 1e3,
             self.now_s(),
             float(p.get("duration", 0.0)),
             blend_mm=float(p.get("blend_radius", 0.0)) * 1e3,
@@ -262,22 +262,18 @@ class Cabinet:
             return code
         if any(abs(v) > math.radians(limit) for v, limit in zip(q, LIMITS_DEG, strict=True)):
             return self._out_of_reach()
-        speed_rad_s, acc_rad_s2 = _pace(p, JOINT_SPEED_RAD_S, JOINT_ACC_RAD_S2)
         joints: Joints = (q[0], q[1], q[2], q[3], q[4], q[5])
-        least_s = float(p.get("duration", 0.0))
-        added = self.motion.add_joints(joints, speed_rad_s, acc_rad_s2, self.now_s(), least_s)
+        speed_rad_s, acc_rad_s2 = min(float(p["v"]), JOINT_SPEED_RAD_S), min(float(p["a"]), JOINT_ACC_RAD_S2)
+        added = self.motion.add_joints(joints, speed_rad_s, acc_rad_s2, self.now_s())
         return ReturnCode.OK if added else ReturnCode.REQUEST_IGNORED
 
     def _admit(self, p: Params) -> int:
         """Return code for queueing a move: OK if it may be queued."""
         if (code := self._may_move()) != ReturnCode.OK:
             return code
-        acc, speed, duration_s = float(p["a"]), float(p["v"]), float(p.get("duration", 0.0))
-        blend_m = float(p.get("blend_radius", 0.0))
-        timed = math.isfinite(duration_s) and duration_s > 0.0  # then a and v may be left at 0
-        if not (duration_s == 0.0 or timed) or math.isnan(acc) or math.isnan(speed):
-            return -ReturnCode.INVALID_ARGUMENT
-        if not (timed or (acc > 0.0 and speed > 0.0)) or not (blend_m == 0.0 or BLEND_M[0] <= blend_m <= BLEND_M[1]):
+        duration_s, blend_m = float(p.get("duration", 0.0)), float(p.get("blend_radius", 0.0))
+        paced = float(p["a"]) > 0.0 and float(p["v"]) > 0.0 and 0.0 <= duration_s < math.inf
+        if not paced or not (blend_m == 0.0 or BLEND_M[0] <= blend_m <= BLEND_M[1]):
             return -ReturnCode.INVALID_ARGUMENT
         return ReturnCode.QUEUE_FULL if self.motion.full else ReturnCode.OK
 
@@ -298,13 +294,16 @@ class Cabinet:
         return self.motion.size
 
     def set_watchdog(self, key: str, timeout_s: float, action: int) -> int:
-        """Restart the watchdog `key` from now; action 0 ends it. It counts real time, as its client does."""
-        if action not in (0, 1, 2, 3) or not timeout_s >= 0.1:
+        """Restart the watchdog `key` from now: action 3 is a protective stop, 0 ends it. Others are not simulated.
+
+        It counts real time, as its client does.
+        """
+        if action not in (0, PROTECTIVE_STOP_ACTION) or not timeout_s >= 0.1:
             return -ReturnCode.INVALID_ARGUMENT
         if (timer := self.watchdogs.pop(key, None)) is not None:
             timer.cancel()
         if action:
-            self.watchdogs[key] = asyncio.get_running_loop().call_later(timeout_s, self._fire, key, action)
+            self.watchdogs[key] = asyncio.get_running_loop().call_later(timeout_s, self._fire, key)
         return ReturnCode.OK
 
     def close(self) -> None:
@@ -313,15 +312,9 @@ class Cabinet:
             timer.cancel()
         self.watchdogs.clear()
 
-    def _fire(self, key: str, action: int) -> None:
+    def _fire(self, key: str) -> None:
         self.watchdogs.pop(key, None)
-        match action:
-            case 1:
-                self.hold()
-            case 2:
-                self.stop(SOFT_STOP_M_S2, SOFT_STOP_M_S2)
-            case _:
-                self.safety_stop(SafetyMode.PROTECTIVE_STOP)
+        self.safety_stop(SafetyMode.PROTECTIVE_STOP)
 
     def configure(self, name: str, value: object, allowed: bool) -> int:
         """Set one of the cabinet's settings, if the value is allowed."""
@@ -344,12 +337,6 @@ class Cabinet:
     def peek(self, count: int, after: int) -> list[dict[str, Any]]:
         """The newest `count` messages after a time stamp."""
         return [m for m in self.messages if m["timestamp"] > after][-count:] if count > 0 else []
-
-
-def _pace(p: Params, fastest: float, hardest: float) -> tuple[float, float]:
-    """Speed and acceleration, clipped to what the arm allows; the maxima if only a duration was given."""
-    speed, acc = float(p["v"]), float(p["a"])
-    return min(speed, fastest) if speed > 0.0 else fastest, min(acc, hardest) if acc > 0.0 else hardest
 
 
 def _floats(values: Any, count: int) -> list[float]:

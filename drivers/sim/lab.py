@@ -357,7 +357,7 @@ class UnknownLab:
         world.hand_guided = True
         try:
             for joints in way:
-                motion.add_joints(joints, SPEED_RAD_S, ACC_RAD_S2, world.clock.now_s(), 0.0)
+                motion.add_joints(joints, SPEED_RAD_S, ACC_RAD_S2, world.clock.now_s())
             while world.target() is not None:
                 await asyncio.sleep(LOOK_S)
         finally:

@@ -192,10 +192,10 @@ class MotionQueue:
             return False
         line = Line(start, target, fix)
         unit, blend_mm = (1e-3, 0.0) if line.angular else (1.0, blend_mm)
-        self._append(line, speed_mm_s * unit, acc_mm_s2 * unit, duration_s, now_s, blend_mm)
+        self._append(line, speed_mm_s * unit, acc_mm_s2 * unit, now_s, duration_s, blend_mm)
         return True
 
-    def add_joints(self, joints: Joints, speed_rad_s: float, acc_rad_s2: float, now_s: float, least_s: float) -> bool:
+    def add_joints(self, joints: Joints, speed_rad_s: float, acc_rad_s2: float, now_s: float) -> bool:
         """Append a straight move in joint space, from rest to rest; False if the queue already ends there."""
         self.advance(now_s)
         target = pose_of(forward(joints) @ self.tool)
@@ -206,7 +206,7 @@ class MotionQueue:
             return False
         last = self._pieces[-1] if self._pieces else None
         start = (last.joints(last.stop) if last else None) or self.near_joints(self._last())
-        self._append(JointLine(start, joints, self.tool), speed_rad_s, acc_rad_s2, least_s, now_s)
+        self._append(JointLine(start, joints, self.tool), speed_rad_s, acc_rad_s2, now_s)
         return True
 
     def advance(self, now_s: float) -> None:
@@ -310,8 +310,8 @@ class MotionQueue:
         path: Line | JointLine,
         speed: float,
         acc: float,
-        least_s: float,
         now_s: float,
+        least_s: float = 0.0,
         blend_mm: float = 0.0,
     ) -> None:
         """Append a move at this speed, or slower so that it takes `least_s`."""

@@ -272,8 +272,8 @@ def test_a_duration_is_the_least_that_a_move_takes_rounded_or_not(blend_mm: floa
 def test_a_move_in_joints_is_not_rounded():
     queue = MotionQueue(at(0.0), lambda *_: None)
     first, second = (0.4, *HOME[1:]), (0.8, *HOME[1:])
-    queue.add_joints(first, 0.5, 2.0, 0.0, 0.0)
-    queue.add_joints(second, 0.5, 2.0, 0.0, 0.0)
+    queue.add_joints(first, 0.5, 2.0, 0.0)
+    queue.add_joints(second, 0.5, 2.0, 0.0)
     for now_s in np.arange(0.0, 5.0, 0.1):
         queue.advance(now_s)
     between, end = queue.rests
