@@ -15,6 +15,7 @@ import numpy as np
 
 from brushloop.calibrate.board.pix2len import Plane
 from brushloop.calibrate.stroke import PX_PER_MM, Gray
+from brushloop.calibrate.stroke.rectify import rectify
 from brushloop.collect.photograph import measure
 from brushloop.collect.photograph.measure import (
     Ink,
@@ -250,7 +251,7 @@ def cut(ink: Ink, plane: Plane, shape: tuple[int, ...], anchor_mm: Point, limits
 
 def glare(image: Gray, plane: Plane, window: Rect, cell_mm: Rect, limits: QualityConfig) -> Check:
     """No reflection in the patch; `window` includes enough paper around it to measure the light."""
-    spots = measure.glare(measure.for_glare(image, plane, window), limits.glare_share)
+    spots = measure.glare(rectify(image, plane.homography, window, measure.COARSE_PX_PER_MM), limits.glare_share)
     scale = measure.BRIGHT_PX_PER_MM
     left, top = cell_mm[0] - window[0], window[1] + window[3] - cell_mm[1] - cell_mm[3]
     rows = slice(round(top * scale), round((top + cell_mm[3]) * scale))

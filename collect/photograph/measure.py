@@ -261,11 +261,6 @@ def edge_mm(points_mm: Floats, plane: Plane, shape: tuple[int, ...]) -> float:
     return float(min(pixels.min(), (most - pixels).min()) * plane.mm_per_px)
 
 
-def for_glare(image: Gray, plane: Plane, window_mm: Rect) -> Gray:
-    """Rectify a window of an (h, w) photograph to 10 px/mm."""
-    return rectify(image, plane.homography, window_mm, COARSE_PX_PER_MM)
-
-
 def glare(raster: Gray, share: float) -> Mask:
     """Where a rectified window at 10 px/mm glares, at 2.5 px/mm: saturated, or a spot brighter than its surroundings.
 

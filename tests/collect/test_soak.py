@@ -12,7 +12,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -49,8 +48,8 @@ class Toll:
     rng: random.Random = field(init=False)
     pace: float = 1.0
     """How much longer lives are than expected on this machine now."""
-    kills: Counter[str] = field(default_factory=Counter)
-    """Of living processes, by what they were about."""
+    kills: int = 0
+    """Of living processes."""
     sessions: int = 0
     strokes: int = 0
     presses: int = 0
@@ -60,9 +59,8 @@ class Toll:
         self.rng = random.Random(self.seed)
 
     def __str__(self) -> str:
-        phases = ", ".join(f"{count} {phase}" for phase, count in sorted(self.kills.items()))
         return (
-            f"seed {self.seed}: {self.kills.total()} kills ({phases}), {self.sessions} sessions, "
+            f"seed {self.seed}: {self.kills} kills, {self.sessions} sessions, "
             f"{self.strokes} strokes, {self.presses} presses on paper, {self.files} files read again, lost 0"
         )
 
@@ -74,8 +72,8 @@ def lab(wired_lab: Lab) -> Lab:
 
 def test_a_session_that_is_killed_three_times_ends_whole(lab: Lab) -> None:
     toll = Toll(seed=1)
-    while toll.kills.total() < 3:
-        session(lab, toll, kills=3 - toll.kills.total())
+    while toll.kills < 3:
+        session(lab, toll, kills=3 - toll.kills)
     sys.stdout.write(f"{toll}\n")
 
 
@@ -84,8 +82,8 @@ def test_a_session_that_is_killed_three_times_ends_whole(lab: Lab) -> None:
 def test_two_hundred_kills_over_forty_sessions_lose_nothing(lab: Lab) -> None:
     toll = Toll(seed=2)
     lab.write_protocol(heights="[11.0, 13.0, 15.0]")
-    while toll.kills.total() < 200 or toll.sessions < 40:
-        session(lab, toll, kills=max(1, -(-(200 - toll.kills.total()) // max(1, 40 - toll.sessions))))
+    while toll.kills < 200 or toll.sessions < 40:
+        session(lab, toll, kills=max(1, -(-(200 - toll.kills) // max(1, 40 - toll.sessions))))
         sys.stdout.write(f"{toll}\n")
 
 
@@ -109,7 +107,7 @@ def session(lab: Lab, toll: Toll, kills: int) -> None:
             _, stderr = process.communicate()
             if process.returncode == -signal.SIGKILL:
                 kills -= 1
-                toll.kills[phase(known, events(lab), lab)] += 1
+                toll.kills += 1
         else:
             _, stderr = process.communicate(timeout=LONGEST_LIFE_S)
             toll.pace = (time.monotonic() - began) / life_s
@@ -172,23 +170,6 @@ def strokes_left(lab: Lab) -> int:
 
 def captures_done(path: Path) -> list[str]:
     return sorted(capture.press.stroke_id for capture in replay(path).results(CaptureResult))
-
-
-def phase(before: list[str], after: list[str], lab: Lab) -> str:
-    """What the process was about when it died, by what it left in the journal."""
-    if "process" not in after[len(before) :]:
-        return "in start-up"
-    if "closed" in after:
-        return "after the close"
-    if strokes_left(lab) == 0:
-        return "in merge and close"
-    match after[-1]:
-        case "process":
-            return "in power-on and retreat"
-        case "begin":
-            return "in a step"
-        case _:
-            return "between steps"
 
 
 def check_nothing_was_taken_back(lab: Lab, finished: dict[str, str]) -> None:
