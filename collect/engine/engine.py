@@ -45,8 +45,8 @@ PARKED_MM = 2.0
 SILENT_S = 1.0
 """Time without a pose after which the snapshot says so: the arm or the connection to it has failed."""
 UNCHECKED = (
-    "no self-check: it is switched off in rig.toml, or left out there and in the command (--arm). Nothing checks whether "
-    "arm, camera and configuration agree"
+    "no self-check: it is switched off in rig.toml, or left out there and in the command (--arm). Nothing checks "
+    "whether arm, camera and configuration agree"
 )
 
 BEGUN_DRY = "dry run: nothing is pressed, dipped or kept"
