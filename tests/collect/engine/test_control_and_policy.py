@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
+from collections.abc import Callable
 
 import pytest
 
 from brushloop.collect.engine.control import FINAL, TRANSITIONS, IllegalTransition, RunControl, State, check_transition
 from brushloop.collect.engine.policy import MAX_FAILURES, Action, decide
-from brushloop.collect.errors import ForceTooHigh, SheetFull, StepVoid, arm_at_fault
+from brushloop.collect.errors import ForceTooHigh, NeedsOperator, SheetFull, StepVoid, arm_at_fault
+from brushloop.collect.operator import Asker, Choice, Prompt
 from brushloop.collect.protocols.steps import CaptureStep, PressStep, Step
 from brushloop.drivers.errors import DeviceError, DeviceTimeout, LimitExceeded, MotionFailed, RobotNotSafe, Stuck
 from brushloop.sessions.events import Condition, Press
+from tests.waiting import PATIENCE_S
 
 
 def test_stop_is_possible_from_every_state_that_is_not_over() -> None:
@@ -38,28 +42,35 @@ def test_a_way_that_the_table_does_not_have_is_a_defect() -> None:
         check_transition(State.DONE, State.RUNNING)
 
 
+class SlippedIn:
+    """A lock that another thread gets first, once, to do this."""
+
+    def __init__(self, do: Callable[[], object]) -> None:
+        self._lock, self._do = threading.Lock(), [do]
+
+    def __enter__(self) -> None:
+        if self._do:
+            self._do.pop()()
+        self._lock.acquire()
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
+
+
 def test_a_pause_that_comes_as_the_run_goes_on_is_not_lost() -> None:
     control = RunControl(lambda _: None)
     control.move_to(State.RECOVERING)
-
-    class PausedFirst:
-        """The lock of the run; the pause key gets it first, once."""
-
-        def __init__(self) -> None:
-            self._lock, self._late = threading.Lock(), True
-
-        def __enter__(self) -> None:
-            if self._late:
-                self._late = False
-                control.pause()
-            self._lock.acquire()
-
-        def __exit__(self, *_: object) -> None:
-            self._lock.release()
-
-    control._lock = PausedFirst()  # type: ignore[assignment]
+    control._lock = SlippedIn(control.pause)  # type: ignore[assignment]
     control.go_on()
     assert control.state is State.PAUSING
+
+
+async def test_a_question_that_is_asked_as_the_screen_goes_away_does_not_wait_for_an_answer() -> None:
+    asker = Asker(watched=True)
+    asker._lock = SlippedIn(asker.abandon)  # type: ignore[assignment]
+    async with asyncio.timeout(PATIENCE_S):
+        with pytest.raises(NeedsOperator):
+            await asker.ask(Prompt("Is the sheet in?", (Choice("g", "yes"),), "g"))
 
 
 MADE = Press(stroke_id="first", condition=Condition(depth_mm=13.0, tilt_deg=5.0))

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
-import threading
-
 import pytest
 
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.run import Run
 from brushloop.collect.engine.snapshot import Mark
 from brushloop.collect.errors import CollectAborted, ForceTooHigh, NeedsOperator, Parked
-from brushloop.collect.operator import Asker, Choice, OperatorRequest, OperatorRequests, Prompt
+from brushloop.collect.operator import OperatorRequest, OperatorRequests
 from brushloop.collect.protocols.steps import Step, ZeroTouchStep
 from brushloop.drivers.errors import DeviceTimeout
 from brushloop.sessions.events import StepResult
@@ -19,7 +16,6 @@ from brushloop.sessions.recording import Recording, mark_bad_or_good
 from tests.journal_lines import read_lines
 from tests.rigs import Lab
 from tests.runs import answer, until, wait_for_end
-from tests.waiting import PATIENCE_S
 
 
 def lines(lab: Lab, event: str) -> list[dict[str, object]]:
@@ -36,30 +32,6 @@ def test_a_request_made_twice_is_withdrawn_and_retake_and_skip_exclude_each_othe
     assert requests.toggle(OperatorRequest.JOG)
     assert requests.take(OperatorRequest.JOG)
     assert requests.open == ()
-
-
-async def test_a_question_that_is_asked_as_the_screen_goes_away_does_not_wait_for_an_answer() -> None:
-    asker = Asker(watched=True)
-
-    class GoneFirst:
-        """The lock of the asker; another thread gets it first, once."""
-
-        def __init__(self) -> None:
-            self._lock, self._late = threading.Lock(), True
-
-        def __enter__(self) -> None:
-            if self._late:
-                self._late = False
-                asker.abandon()
-            self._lock.acquire()
-
-        def __exit__(self, *_: object) -> None:
-            self._lock.release()
-
-    asker._lock = GoneFirst()  # type: ignore[assignment]
-    async with asyncio.timeout(PATIENCE_S):
-        with pytest.raises(NeedsOperator):
-            await asker.ask(Prompt("Is the sheet in?", (Choice("g", "yes"),), "g"))
 
 
 def test_a_stroke_is_pressed_again_on_a_new_cell_because_the_operator_asked(lab: Lab) -> None:
