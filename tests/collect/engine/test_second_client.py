@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -118,34 +119,41 @@ def test_an_arm_that_was_moved_at_a_question_first_goes_up_along_its_tool(lab: L
         wait_for_end(engine)
 
 
-def test_an_arm_that_somebody_still_moves_is_asked_about_and_left_alone(lab: Lab) -> None:
-    engine = lab.engine(on_screen=True)
-    start_and_pause(engine)
+SHORTER = {"RobotConfig_setTcpOffset": {"offset": [0.0, 0.0, 0.17, 0.0, 0.0, 0.0]}}
+"""10 mm short: every press would be 10 mm deeper than it says."""
+
+
+def up_slowly(lab: Lab) -> dict[str, Any]:
     here = lab.rig.world.tool()
     up = to_wire(dataclasses.replace(here, z_mm=here.z_mm + 30.0))
-    slowly = {"pose": up, "a": 1.0, "v": 0.00005, "blend_radius": 0.0, "duration": 0.0}
-    second_client(lab, engine, MotionControl_moveLine=slowly)
-    sent = lines_sent(lab)
-    engine.resume()
-    prompt = question(engine, "the arm is moving, and not from here")
-    assert not sent
-    assert lab.rig.world.tool().z_mm > here.z_mm, "it is not stopped either"
-    engine.answer(prompt.number, "g")
-    wait_for_end(engine)
-    assert engine.snapshot().strokes_done == 2
+    return {"MotionControl_moveLine": {"pose": up, "a": 1.0, "v": 0.00005, "blend_radius": 0.0, "duration": 0.0}}
 
 
-def test_an_arm_that_was_switched_off_in_a_pause_is_asked_about_and_powered_again(lab: Lab) -> None:
+@pytest.mark.parametrize(
+    ("calls", "asks"),
+    [
+        (up_slowly, "the arm is moving, and not from here"),
+        (lambda _: {"RobotManage_poweroff": {}}, "robot mode is not Running"),
+        (lambda _: SHORTER, "tool offset is (0, 0, 170) mm"),
+    ],
+    ids=["still moving", "switched off", "another tool"],
+)
+def test_what_a_second_client_did_in_a_pause_is_asked_about_before_anything_moves_and_then_set_right(
+    lab: Lab, calls: Callable[[Lab], dict[str, Any]], asks: str
+) -> None:
     engine = lab.engine(on_screen=True)
     start_and_pause(engine)
-    second_client(lab, engine, RobotManage_poweroff={})
+    second_client(lab, engine, **calls(lab))
     sent = lines_sent(lab)
     engine.resume()
-    prompt = question(engine, "robot mode is not Running")
+    prompt = question(engine, asks)
+    assert prompt.default == "x"
     assert not sent
     engine.answer(prompt.number, "g")
     wait_for_end(engine)
     assert engine.snapshot().strokes_done == 2
+    assert lab.rig.arcs.cabinet.tcp_offset[2] == 0.18
+    assert max(press.depth_mm for press in lab.rig.world.presses) < 11.1, "none went deeper than asked"
 
 
 def test_an_arm_that_was_left_outside_its_limits_is_not_moved_until_it_is_jogged_back(lab: Lab) -> None:
@@ -163,10 +171,6 @@ def test_an_arm_that_was_left_outside_its_limits_is_not_moved_until_it_is_jogged
     wait_for_end(engine)
     assert_up_along_the_tool_first(sent)
     assert engine.snapshot().strokes_done == 2
-
-
-SHORTER = {"RobotConfig_setTcpOffset": {"offset": [0.0, 0.0, 0.17, 0.0, 0.0, 0.0]}}
-"""10 mm short: every press would be 10 mm deeper than it says."""
 
 
 def test_with_another_tool_offset_nothing_is_pressed(lab: Lab) -> None:
@@ -203,20 +207,6 @@ def test_a_tool_offset_that_changes_after_the_last_look_leaves_a_void_and_no_str
     assert not [line for line in lines if line["event"] == "done" and line["key"] in pressed]
     assert [line for line in lines if line["event"] == "void" and line["key"] in pressed]
     assert lab.engines[-1].snapshot().strokes_done == 0
-
-
-def test_whoever_watches_has_the_tool_set_anew_and_goes_on(lab: Lab) -> None:
-    engine = lab.engine(on_screen=True)
-    start_and_pause(engine)
-    second_client(lab, engine, **SHORTER)
-    engine.resume()
-    prompt = question(engine, "tool offset is (0, 0, 170) mm")
-    assert prompt.default == "x"
-    engine.answer(prompt.number, "g")
-    wait_for_end(engine)
-    assert engine.snapshot().strokes_done == 2
-    assert lab.rig.arcs.cabinet.tcp_offset[2] == 0.18
-    assert max(press.depth_mm for press in lab.rig.world.presses) < 11.1, "none went deeper than asked"
 
 
 @pytest.mark.parametrize("moment", ["moveLine", "startMove"], ids=["between our lines", "as the path is released"])
