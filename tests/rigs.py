@@ -35,6 +35,7 @@ from brushloop.drivers.sim.config import SimConfig, Table, View
 from brushloop.drivers.sim.faults import Device
 from brushloop.drivers.sim.rig import Addresses, LoopbackRig, rig_toml
 from brushloop.drivers.sim.world import SimClock
+from brushloop.sessions.journal import JOURNAL_NAME, RunState, replay
 from tests.command import brushloop
 from tests.runs import SteppedEngine, end, wait_for_end
 from tests.simulated_time import MemoryLoop, SimulatedTime
@@ -104,6 +105,11 @@ class Lab:
         """The folder of the only session."""
         [folder] = self.sessions.iterdir()
         return folder
+
+    @property
+    def state(self) -> RunState:
+        """What the journal of the only session says."""
+        return replay(self.session / JOURNAL_NAME)
 
     @property
     def at_rest(self) -> bool:

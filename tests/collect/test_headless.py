@@ -26,7 +26,6 @@ from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.faults import Phase
 from brushloop.drivers.sim.rig import Addresses, rig_toml
-from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.store import SessionStore
 from tests.collect.tui.fake import TOUCHED, FakeEngine, look, picture
@@ -76,7 +75,7 @@ def test_a_signal_ends_the_run(lab: Lab, number: signal.Signals, says: str) -> N
     assert ran.stderr.splitlines()[-1].startswith(f"brushloop: {says}")
     if number == signal.SIGHUP:
         assert lab.rig.faults.phase() is Phase.PARKED
-        assert not replay(lab.session / JOURNAL_NAME).cut
+        assert not lab.state.cut
 
 
 def test_a_session_that_is_open_elsewhere_is_refused_before_anything_moves(lab: Lab) -> None:

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 
 def used(lab: Lab) -> int:
-    return len(replay(lab.session / JOURNAL_NAME).used_patches)
+    return len(lab.state.used_patches)
 
 
 def test_a_split_stroke_is_pressed_again_on_a_new_cell_and_only_the_sound_one_counts(sharp_lab: Lab) -> None:

@@ -17,7 +17,7 @@ from brushloop.drivers.devices import Identity
 from brushloop.drivers.errors import DeviceError
 from brushloop.drivers.sim.config import View
 from brushloop.sessions.events import CaptureResult
-from brushloop.sessions.journal import JOURNAL_NAME, replay
+from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.store import SessionStore
 from tests.collect.conftest import Collected
@@ -91,7 +91,7 @@ def test_stop_in_mid_press_voids_the_cell_and_the_same_command_goes_on(lab: Lab,
     assert lab.at_rest
 
     lab.run()
-    state = replay(lab.session / JOURNAL_NAME)
+    state = lab.state
     assert state.cut
     ids = [c.stroke.stroke_id for c in Recording(lab.session).captures()]
     assert len(ids) == len(set(ids)) == 2
@@ -176,7 +176,7 @@ def test_an_armed_run_without_its_self_check_says_so(lab: Lab) -> None:
     lab.edit_rig("", "\n[self_check]\nenabled = false\n")
     engine = lab.run(armed=True)
     assert any(UNCHECKED in line for line in engine.snapshot().messages)
-    assert "self_check" not in {step.kind for step in replay(lab.session / JOURNAL_NAME).files.values()}
+    assert "self_check" not in {step.kind for step in lab.state.files.values()}
 
 
 # How a session goes on

@@ -22,16 +22,11 @@ from brushloop.drivers.host import HostClock
 from brushloop.drivers.ink.port import DoseLost, InkRefused
 from brushloop.drivers.sim.faults import Device, Fault
 from brushloop.sessions.events import DipResult, PressResult
-from brushloop.sessions.journal import JOURNAL_NAME, RunState, replay
 from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.records import Topic
 from tests.collect.conftest import Collected
 from tests.rigs import Lab
 from tests.runs import question, until, wait_for_end
-
-
-def state_of(lab: Lab) -> RunState:
-    return replay(lab.session / JOURNAL_NAME)
 
 
 def slowly(lab: Lab) -> None:
@@ -64,7 +59,7 @@ def test_force_and_ink_are_recorded_beside_the_poses(collected: Collected) -> No
         seen = Counter(channel.topic for _, channel, _ in make_reader(file, validate_crcs=True).iter_messages())
     assert min(seen[topic] for topic in (Topic.TCP, Topic.JOINTS, Topic.WRENCH)) > 10
     assert seen[Topic.INK] == 4
-    peaks_n = [press.peak_force_n or 0.0 for press in state_of(collected.lab).results(PressResult)]
+    peaks_n = [press.peak_force_n or 0.0 for press in collected.lab.state.results(PressResult)]
     assert len(peaks_n) == 4
     assert all(0.02 < peak_n < 0.5 for peak_n in peaks_n)
 
@@ -80,7 +75,7 @@ def test_something_hard_under_the_brush_stops_the_arm_at_once_and_burns_the_cell
     assert lab.at_rest
     # It was stopped on its way down, and not moved away from what it met: a person must look first.
     assert 120.0 - 11.0 <= lab.rig.world.tool().z_mm < 116.0
-    assert (len(state_of(lab).cut), len(state_of(lab).used_patches)) == (1, 1)
+    assert (len(lab.state.cut), len(lab.state.used_patches)) == (1, 1)
 
 
 def test_a_sensor_that_goes_silent_in_mid_press_stops_the_arm_and_the_press_is_done_again_elsewhere(
@@ -113,7 +108,7 @@ def test_a_sensor_that_fails_in_mid_press_ends_the_run_with_the_brush_lifted(
     slowly(lab)
     with pytest.raises(error, match=says):
         lab.run()
-    assert (len(state_of(lab).cut), len(state_of(lab).used_patches)) == (1, 1)
+    assert (len(lab.state.cut), len(lab.state.used_patches)) == (1, 1)
     assert lab.at_rest
     assert lab.rig.world.tool().z_mm > 170.0, "a sensor is at fault, the arm is in order"
 
@@ -123,7 +118,7 @@ def test_a_low_well_is_filled_before_the_brush_dips(lab: Lab) -> None:
     well.ml = 0.4 * well.capacity_ml
     lab.run()
     assert well.share > 0.45
-    dips = state_of(lab).results(DipResult)
+    dips = lab.state.results(DipResult)
     assert all(dip.ink_level is not None and dip.ink_level >= 0.5 for dip in dips)
     assert max(dip.dosed_ml or 0.0 for dip in dips) >= 1.0
 
@@ -163,8 +158,8 @@ def test_poses_that_come_late_end_the_run_before_a_press_counts(lab: Lab, monkey
     with pytest.raises(PosesLate, match="max_pose_lag_ms = 100") as caught:
         lab.run()
     assert caught.value.lag_ms == 412.0
-    assert len(state_of(lab).cut) == 1
-    assert not state_of(lab).results(PressResult)
+    assert len(lab.state.cut) == 1
+    assert not lab.state.results(PressResult)
 
 
 # The force ceiling: what is under way ends with the stop, and nothing is sent after it

@@ -11,15 +11,11 @@ from brushloop.collect.errors import CollectAborted, ForceTooHigh, NeedsOperator
 from brushloop.collect.operator import OperatorRequest, OperatorRequests
 from brushloop.collect.protocols.steps import Step, ZeroTouchStep
 from brushloop.drivers.errors import DeviceTimeout
-from brushloop.sessions.events import StepResult
+from brushloop.sessions.events import BoardResult, StepResult, ZeroTouchResult
 from brushloop.sessions.recording import Recording, mark_bad_or_good
 from tests.journal_lines import read_lines
 from tests.rigs import Lab
 from tests.runs import answer, until, wait_for_end
-
-
-def lines(lab: Lab, event: str) -> list[dict[str, object]]:
-    return [line for line in read_lines(lab.session / "journal.jsonl") if line["event"] == event]
 
 
 def test_a_request_made_twice_is_withdrawn_and_retake_and_skip_exclude_each_other() -> None:
@@ -118,7 +114,7 @@ def test_the_paper_is_found_again_by_jog_between_two_strokes(lab: Lab) -> None:
     wait_for_end(engine)
     assert engine.snapshot().strokes_done == 1
     assert any("the paper lies +1." in line for line in engine.snapshot().messages)
-    methods = [line["result"]["method"] for line in lines(lab, "done") if line["result"]["kind"] == "zero_touch"]  # type: ignore[index]
+    methods = [result.method for result in lab.state.results(ZeroTouchResult)]
     assert methods == ["taught", "jog"]
 
 
@@ -168,9 +164,10 @@ def test_a_height_that_is_not_taken_and_a_jog_that_is_given_up_leave_the_paper_w
     wait_for_end(engine)
     now = engine.snapshot()
     assert now.strokes_done == 2
-    methods = [line["result"]["method"] for line in lines(lab, "done") if line["result"]["kind"] == "zero_touch"]  # type: ignore[index]
+    methods = [result.method for result in lab.state.results(ZeroTouchResult)]
     assert methods == ["taught"]
-    assert [str(line["why"]) for line in lines(lab, "void") if "void" in line["event"]][-2:] == [
+    voids = [line["why"] for line in read_lines(lab.session / "journal.jsonl") if line["event"] == "void"]
+    assert voids[-2:] == [
         "the new height was not accepted.",
         "the operator gave up at touch 1 of 3",
     ]
@@ -196,8 +193,8 @@ def test_who_gives_the_jog_of_the_set_up_up_keeps_the_taught_height_and_the_run_
     wait_for_end(engine)
     assert engine.snapshot().strokes_done == 1
     assert any("given up: the taught height, 120.03 mm, is kept" in line for line in engine.snapshot().messages)
-    [result] = [line["result"] for line in lines(lab, "done") if line["result"]["kind"] == "zero_touch"]
-    assert (result["method"], result["touch_z_mm"], result["moved_mm"]) == ("kept", pytest.approx(120.03), 0.0)  # type: ignore[index]
+    [result] = lab.state.results(ZeroTouchResult)
+    assert (result.method, result.touch_z_mm, result.moved_mm) == ("kept", pytest.approx(120.03), 0.0)
 
 
 @pytest.mark.parametrize("state", [State.PAUSED, State.ASKING])
@@ -224,7 +221,7 @@ def test_who_accepted_the_set_up_is_not_asked_at_later_views_of_the_board(lab: L
     answer(engine, "Zero touch and plane", "g")
     wait_for_end(engine)
     assert engine.snapshot().strokes_done == 2
-    assert sum(line["result"]["kind"] == "board" for line in lines(lab, "done")) == 2
+    assert len(lab.state.results(BoardResult)) == 2
 
 
 def test_a_guided_set_up_measures_again_when_it_is_asked_to_and_shows_the_camera(lab: Lab) -> None:
@@ -244,7 +241,7 @@ def test_a_guided_set_up_measures_again_when_it_is_asked_to_and_shows_the_camera
     wait_for_end(engine)
     now = engine.snapshot()
     assert (now.state, now.strokes_done) == (State.DONE, 1)
-    assert sum(line["result"]["kind"] == "board" for line in lines(lab, "done")) == 2
+    assert len(lab.state.results(BoardResult)) == 2
     assert now.last is not None
     assert now.last.binary is not None
     assert now.last.binary.shape == (128, 128)

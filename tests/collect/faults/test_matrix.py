@@ -332,7 +332,7 @@ def test_once_the_cause_is_mended_the_same_command_goes_on(lab: Lab, name: str, 
     again = lab.engine()
     again.start()
     assert end_of(again) is None
-    state = replay(lab.session / "journal.jsonl")
+    state = lab.state
     assert len(state.used_patches) == 2, "the press that was cut lies on one, its repetition on another"
 
 
