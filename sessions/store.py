@@ -131,7 +131,11 @@ class SessionStore:
         step = begin.model_dump(exclude={"event", "press", "t_ns"})
         counts = {**writer.counts, Topic.STEP: 2}
         done = Done(**step, t_ns=self._now_ns(), sha256="", counts=counts, result=result)
-        writer.write(step_message(done))
+        try:
+            writer.write(step_message(done))
+        except SessionError:
+            writer.abandon()
+            raise
         self._log(done.model_copy(update={"sha256": writer.finish()}))
 
     def void(self, attempt: Attempt, why: str) -> None:

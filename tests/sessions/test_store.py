@@ -190,6 +190,16 @@ def test_a_clock_that_is_set_back_reorders_nothing(make, tmp_path):
     assert verify_session(store.folder).sound
 
 
+def test_where_the_end_of_a_step_does_not_fit_the_step_stays_open_and_its_writer_ends(make, store, monkeypatch):
+    attempt = store.begin("a", StepKind.PRESS, patches=(0,), press=make.press())
+    with monkeypatch.context() as patch:
+        patch.setattr("brushloop.sessions.mcap_writer.QUEUE_LIMIT", 0)
+        with pytest.raises(SessionError, match="the disk does not keep up"):
+            store.done(attempt, PressResult(press=make.press()))
+    assert not attempt.writer._thread.is_alive()
+    assert store.state.running
+
+
 def test_while_one_process_has_a_session_no_other_collects_closes_or_repairs_it(make, store, repair):
     make.collect(store)
     before = make.tree(store.folder)
