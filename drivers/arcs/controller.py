@@ -82,7 +82,7 @@ class SafetyMode(StrEnum):
 MOVING_ALLOWED = frozenset({SafetyMode.NORMAL, SafetyMode.REDUCED})
 
 # No software here clears any of them: a person looks first.
-CONDITION_AND_REMEDY: dict[SafetyMode, tuple[str, str]] = {
+CONDITION_AND_REMEDY: dict[str, tuple[str, str]] = {
     SafetyMode.PROTECTIVE_STOP: (
         "The arm is powered, brakes open, and still holds its path.",
         "Find the cause, lift the brush clear, release the protective stop on the pendant.",
@@ -196,11 +196,7 @@ class Controller:
         """Raise `RobotNotSafe`, with condition and remedy, unless the mode allows motion; reduced is reported."""
         mode = str(await self.ask("RobotState.getSafetyModeType"))
         if mode not in MOVING_ALLOWED:
-            known = mode in set(SafetyMode)
-            condition, remedy = (
-                CONDITION_AND_REMEDY.get(SafetyMode(mode), UNKNOWN_CONDITION) if known else UNKNOWN_CONDITION
-            )
-            raise RobotNotSafe(DEVICE, op, mode, condition, remedy)
+            raise RobotNotSafe(DEVICE, op, mode, *CONDITION_AND_REMEDY.get(mode, UNKNOWN_CONDITION))
         reduced, self._reduced = self._reduced, mode == SafetyMode.REDUCED
         if self._reduced and not reduced and self.on_notice is not None:
             self.on_notice("safety mode is ReducedMode: the arm may be slower than asked")
