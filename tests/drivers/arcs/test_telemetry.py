@@ -115,14 +115,18 @@ async def test_what_is_no_telemetry_is_distinguished(served: Any, script: Serve,
         await outcome(await served(script))
 
 
-@pytest.mark.parametrize("frame", [encode_sample(0, [[1, 2]]), encode(b"[0,[1,2]]"), PING + encode_sample(0, [[1, 2]])])
-async def test_either_frame_is_taken(served: Any, frame: bytes):
-    assert await outcome(await served(says(GREETING, frame))) == [[1, 2]]
-
-
-async def test_of_a_backlog_only_the_newest_is_handed_over(served: Any):
-    backlog = b"".join(encode_sample(0, [k]) for k in range(100))
-    assert await outcome(await served(says(GREETING, backlog))) == [99]
+@pytest.mark.parametrize(
+    ("frames", "newest"),
+    [
+        (encode_sample(0, [[1, 2]]), [1, 2]),
+        (encode(b"[0,[1,2]]"), [1, 2]),
+        (PING + encode_sample(0, [[1, 2]]), [1, 2]),
+        (b"".join(encode_sample(0, [k]) for k in range(100)), 99),
+    ],
+    ids=["CBOR", "JSON", "after a ping", "a backlog"],
+)
+async def test_the_newest_sample_is_handed_over(served: Any, frames: bytes, newest: object):
+    assert await outcome(await served(says(GREETING, frames))) == [newest]
 
 
 @pytest.fixture
