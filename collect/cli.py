@@ -31,7 +31,7 @@ rig_app = typer.Typer(
 )
 
 RigFile = Annotated[Path, typer.Argument(help="The rig: addresses, frames, limits.")]
-TeachArm = Annotated[
+StepArm = Annotated[
     bool, typer.Option("--arm", help="Let the arm move where a step needs it; a key confirms each time.")
 ]
 
@@ -201,23 +201,23 @@ def new(
     rig: Annotated[Path, typer.Argument(help="The rig.toml to make; what is taught is kept beside it.")] = Path(
         "rig.toml"
     ),
-    arm: TeachArm = False,
+    arm: StepArm = False,
 ) -> None:
     """Guide you through the first day, from an unboxed arm to a rig.toml. Run it again to resume."""
-    _teach(rig, None, arm=arm)
+    _commission(rig, None, arm=arm)
 
 
 @rig_app.command()
 def teach(
     step: Annotated[str, typer.Argument(help="arm, camera, tip, sheet, places, brush, force, limits or proof.")],
     rig: Annotated[Path, typer.Option(help="The rig.toml; what was taught is kept beside it.")] = Path("rig.toml"),
-    arm: TeachArm = False,
+    arm: StepArm = False,
 ) -> None:
     """Teach one step again. Only its values change, and those that depend on them; the changes are listed."""
-    _teach(rig, step, arm=arm)
+    _commission(rig, step, arm=arm)
 
 
-def _teach(rig: Path, step: str | None, *, arm: bool) -> None:
+def _commission(rig: Path, step: str | None, *, arm: bool) -> None:
     import sys
 
     from brushloop.collect.errors import ConfigError

@@ -15,6 +15,7 @@ from brushloop.collect.commission.step import Asked, Step, Visit
 from brushloop.collect.errors import NotAccepted
 from brushloop.collect.operator import Choice
 from brushloop.collect.rig.check import Check, brush_shorter_than_tool, deepest_press
+from brushloop.collect.rig.paper import PaperPlane
 from brushloop.drivers.devices import ForceSample
 from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL, ForceTable, SriM8123
 from brushloop.drivers.ink.port import InkTable
@@ -242,8 +243,7 @@ class ForceStep(Step):
         size_x_mm, size_y_mm = notebook.numbers("paper.size_mm")
         method, why = ("force", "a sensor was found") if notebook.get("aside.bus") else ("jog", "no sensor")
         points = inside_corners((size_x_mm, size_y_mm), INSET_MM)
-        _, slope_x, slope_y = notebook.numbers("aside.plane")
-        lean_deg = math.degrees(math.atan(math.hypot(slope_x, slope_y)))
+        lean_deg = PaperPlane(*notebook.numbers("aside.plane")).slope_deg
         widest_deg = min(max(math.ceil(10.0 * (lean_deg + LEAN_ROOM_DEG)) / 10.0, 1.0), 3.0)
         leans = f"the sheet leans by {lean_deg:.2f} deg, and {LEAN_ROOM_DEG:g} deg more"
         return {

@@ -99,7 +99,7 @@ class CameraStep(Step):
             await self._source(visit)
         async with taught_camera(visit.notebook, visit.clock) as camera:
             visit.guide.working("looking for the board")
-            await self._first_look(visit, await still(camera, visit.clock))
+            await _board_in(visit, await still(camera, visit.clock), "camera")
             await self._lens(visit, camera)
 
     async def _print(self, visit: Visit) -> None:
@@ -166,18 +166,6 @@ class CameraStep(Step):
         visit.say(f"{source}: {width} x {height} px; {what}", picture=picture)
         return corners, picture
 
-    async def _first_look(self, visit: Visit, picture: Gray) -> None:
-        """The board where it lies: a mirrored camera and a wrong print show at once."""
-        try:
-            await asyncio.to_thread(find_board, picture, board_of(visit.notebook), "camera")
-        except CalibrationError as error:
-            if "mirrored" in error.what:
-                raise NotAccepted(f"{error.what}.", MIRRORED) from None
-            if "another board" in error.what or "arranged" in error.what:
-                visit.save(visit.notebook.without(*PRINTED))
-                raise NotAccepted(f"{error.what}.", OTHER_PRINT) from None
-            visit.say(f"The board is not seen yet: {error.what}", picture=picture, tone="warning")
-
     async def _lens(self, visit: Visit, camera: OpenCvCamera) -> None:
         """Fit the lens to photographs of the held board; nothing where the person skips the first ones."""
         spec, folder = board_of(visit.notebook), visit.rig_path.with_name(f"{visit.rig_path.stem}.lens")
@@ -220,17 +208,29 @@ class CameraStep(Step):
         coded = cv2.imencode(".png", picture)[1].tobytes()
         # Named after its content: a photograph that is taken once more does not replace one that going back restores.
         name = f"{hashlib.sha256(coded).hexdigest()[:16]}.png"
-        try:
-            view = await asyncio.to_thread(find_board, picture, board_of(visit.notebook), name)
-        except CalibrationError as error:
-            if "mirrored" in error.what:
-                raise NotAccepted(f"{error.what}.", MIRRORED) from None
-            visit.say(f"not used: {error.what}", picture=picture, tone="warning")
+        if (view := await _board_in(visit, picture, name)) is None:
             return True
         (folder / name).write_bytes(coded)
         visit.keep("camera", f"{VIEW}{index:02d}", name, "photograph of the board held in hand")
         views.append(view)
         return True
+
+
+async def _board_in(visit: Visit, picture: Gray, name: str) -> BoardView | None:
+    """The board in a picture; None, with a warning, where it is not seen.
+
+    Raises `NotAccepted` where the camera is mirrored or the print is another one than was described: both show at once.
+    """
+    try:
+        return await asyncio.to_thread(find_board, picture, board_of(visit.notebook), name)
+    except CalibrationError as error:
+        if "mirrored" in error.what:
+            raise NotAccepted(f"{error.what}.", MIRRORED) from None
+        if "another board" in error.what or "arranged" in error.what:
+            visit.save(visit.notebook.without(*PRINTED))
+            raise NotAccepted(f"{error.what}.", OTHER_PRINT) from None
+        visit.say(f"The board is not seen: {error.what}", picture=picture, tone="warning")
+        return None
 
 
 def still_missing(views: Sequence[BoardView]) -> tuple[str, ...]:

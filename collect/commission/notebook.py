@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import textwrap
+import tomllib
 from collections import defaultdict
 from collections.abc import Iterator
 from datetime import UTC, datetime
@@ -201,15 +202,8 @@ def gaps(notebook: Notebook) -> Iterator[Check]:
 
 def rig_of(notebook: Notebook, rig_path: Path) -> RigConfig:
     """The configuration that the notebook gives, without overrides from the environment. Raises `ConfigError`."""
-    tables: dict[str, Any] = {}
-    for field, value in _fields(notebook, rig_path).items():
-        *above, name = field.split(".")
-        table = tables
-        for part in above:
-            table = table.setdefault(part, {})
-        table[name] = _rounded(value)
     try:
-        rig = RigConfig.model_validate(tables)
+        rig = RigConfig.model_validate(tomllib.loads(rig_text(notebook, rig_path)))
     except ValidationError as error:
         raise refusal(rig_path, error, RigConfig) from None
     return rig.model_copy(update={"camera": with_optics(rig_path, rig.camera)})

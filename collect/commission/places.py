@@ -18,7 +18,7 @@ from brushloop.collect.errors import ConfigError, NotAccepted
 from brushloop.collect.photograph.frames import ARM_SHARE, Thumbnail, changed_share, thumbnail
 from brushloop.collect.rig.check import draw_rig
 from brushloop.collect.rig.config import TRAVEL_CLEARANCE_MM, PaperConfig, RigConfig
-from brushloop.collect.rig.paper import to_base, to_paper
+from brushloop.collect.rig.paper import PaperPlane, to_base, to_paper
 from brushloop.collect.walk import ask_reach
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose
@@ -185,9 +185,8 @@ def paper_of(notebook: Notebook) -> PaperConfig:
 
 def sheet_heights(notebook: Notebook) -> list[float]:
     """Touch height at the four corners of the sheet, in the base frame."""
-    z0_mm, slope_x, slope_y = notebook.numbers("aside.plane")
-    size_x_mm, size_y_mm = notebook.numbers("paper.size_mm")
-    return [z0_mm + slope_x * x + slope_y * y for x, y in corners_of(size_x_mm, size_y_mm).tolist()]
+    plane, (size_x_mm, size_y_mm) = PaperPlane(*notebook.numbers("aside.plane")), notebook.numbers("paper.size_mm")
+    return [plane.touch_z_mm(x, y) for x, y in corners_of(size_x_mm, size_y_mm).tolist()]
 
 
 def sheet_corners(notebook: Notebook) -> list[Point]:
