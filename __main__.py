@@ -99,9 +99,10 @@ def options(
 EVERY_DAY, SET_UP, RESEARCH, SIMULATOR = "Every day", "Set-up", "Research", "Simulator"
 GROUPS = {
     "validate": (RESEARCH, "Compare every stroke model with every captured stroke (`brushloop validate SESSION...`)."),
-    "loop": (RESEARCH, "Recover the presses of a SESSION, press them again, and compare; or only compare."),
+    "repress": (RESEARCH, "Recover the presses of a SESSION, press them again, and compare; or only compare."),
     "write": (RESEARCH, "Write characters on the rig and compare them; or only plan, compare or learn."),
     "train": (RESEARCH, "Train the neural stroke generator, or tune it on captures."),
+    "sim": (SIMULATOR, "Serve the loopback rig; break it, or act as the person in an unknown lab."),
 }
 """Groups whose first command runs where no other is named: where the help lists them, and its words."""
 COMMANDS: tuple[tuple[str, str, type[Any], str], ...] = (
@@ -110,8 +111,8 @@ COMMANDS: tuple[tuple[str, str, type[Any], str], ...] = (
     ("camera board", "", commands.PrintRequest, "calibrate.board.spec:print_board"),
     ("camera intrinsics", "", commands.LensRequest, "calibrate.calibrated:calibrate_lens"),
     ("fit", RESEARCH, commands.FitRequest, "calibrate.fit.fit:fit"),
-    ("invert", RESEARCH, commands.RecoverRequest, "calibrate.invert:recover"),
-    ("loop compare", "", commands.CompareLoopRequest, "calibrate.loop:compare"),
+    ("recover", RESEARCH, commands.RecoverRequest, "calibrate.recover:recover"),
+    ("repress compare", "", commands.CompareLoopRequest, "calibrate.loop:compare"),
     ("sessions export", "", commands.ExportRequest, "calibrate.export:export"),
     ("train generator", "", commands.TrainRequest, "calibrate.training:train"),
     ("train tune", "", commands.TuneRequest, "calibrate.training:tune"),
@@ -137,7 +138,7 @@ app.add_typer(camera, name="camera", rich_help_panel=SET_UP)
 for name, (panel, words) in GROUPS.items():
     groups[name] = typer.Typer(cls=PathOrCommand, help=words)
     app.add_typer(groups[name], name=name, rich_help_panel=panel)
-groups["loop"].command("session")(command(chains.LoopRequest, "collect.chains.loop:run_loop", run_chain))
+groups["repress"].command("session")(command(chains.LoopRequest, "collect.chains.loop:run_loop", run_chain))
 groups["write"].command("characters")(command(chains.WritingRequest, "collect.chains.writing:write", run_chain))
 demo = command(chains.DemoRequest, "collect.chains.demo:demo", run_chain)
 app.command("demo", rich_help_panel=EVERY_DAY)(demo)
@@ -147,7 +148,7 @@ for name, panel, request, work in COMMANDS:
     parent.command(last, rich_help_panel=panel or None)(command(request, work))
 
 
-@app.command(rich_help_panel=SIMULATOR)
+@groups["sim"].command("serve")
 def sim(
     write_rig: Annotated[Path | None, typer.Option(help="Write a rig.toml for this rig, then serve it.")] = None,
     rate: Annotated[float, typer.Option(min=0.01, max=1000, help="Simulated seconds per real second.")] = 1.0,
@@ -161,7 +162,9 @@ def sim(
     brush: Annotated[
         Path, typer.Option(help="A shipped brush, `loopback` or `paper`, or one described in a brush.toml.")
     ] = Path("loopback"),
-    control: Annotated[Path | None, typer.Option(help="Make a control socket here, for `fault` and `hand`.")] = None,
+    control: Annotated[
+        Path | None, typer.Option(help="Make a control socket here, for `sim fault` and `sim hand`.")
+    ] = None,
     unknown: Annotated[
         int | None, typer.Option(min=0, help="Serve a lab that nobody has measured, drawn from this seed.")
     ] = None,
@@ -197,7 +200,7 @@ def sim(
     serve(config, write_rig, idle_exit, say, control=control)
 
 
-@app.command(rich_help_panel=SIMULATOR)
+@groups["sim"].command()
 def fault(
     control: Annotated[Path, typer.Argument(help="Control socket of a rig: `brushloop sim --control PATH`.")],
     what: Annotated[str, typer.Argument(help="Device to break, or list, clear, state, release, fresh-sheet.")],
@@ -222,10 +225,11 @@ def fault(
     request = {"do": what, **fields}
     if kind is not None:
         request = {"do": "add", "fault": {"device": what, "kind": kind, **fields}}
-    say(*dumps(ask(control, request), indent=2).split("\n"))
+    answer = ask(control, request)
+    say(*(dumps(answer, indent=2).split("\n") if answer else ["done"]))
 
 
-@app.command(rich_help_panel=SIMULATOR)
+@groups["sim"].command()
 def hand(
     control: Annotated[Path, typer.Argument(help="Control socket of a lab: `brushloop sim --unknown`.")],
     act: Annotated[str, typer.Argument(help="bring, measure or mend.")],

@@ -119,7 +119,7 @@ def _pressed(n: int | None, seed: int) -> Iterator[tuple[str, Captures, Prior]]:
 
 
 def intervals(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
-    """Share of the 95 % intervals of `brushloop invert` that hold the command: `n` frozen brushes (five), each fitted
+    """Share of the 95 % intervals of `brushloop recover` that hold the command: `n` frozen brushes (five), each fitted
     to nine conditions of the fixed design, on presses of the other six. 90 to 99 % is asked."""
     rows: dict[str, list[dict[str, str]]] = {}
     fitted = {f"{depth:g} {tilt:g}" for depth, tilt in DESIGN[:FITTED_CELLS]}
@@ -130,7 +130,7 @@ def intervals(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
             every = press_session(folder / "every", spec, REPEATS * CELLS, seed)
             brushloop("fit", known)
             [fit_file] = (known / "brushfit").glob("*.json")
-            brushloop("invert", every, "--fit", fit_file, "--out", folder / "recovered.csv")
+            brushloop("recover", every, "--fit", fit_file, "--out", folder / "recovered.csv")
             found = _table(folder / "recovered.csv")
         where = "{commanded_depth_mm} {commanded_tilt_deg}"
         rows[name] = [row for row in found if where.format(**row) not in fitted]
@@ -168,7 +168,7 @@ def loop(*, n: int | None = None, seed: int = 1) -> Sequence[Result]:
             brush = brush_toml(folder / "brush.toml", spec, name)
             with simulated_rig(folder, brush, RATE, seed) as rig:
                 session = collect_grid(folder, rig, LOOP_DEPTHS_MM, LOOP_TILTS_DEG, LOOP_REPEATS, seed)
-                rig.run("loop", session, "--seed", str(seed))
+                rig.run("repress", session, "--seed", str(seed))
             outcome: dict[str, Any] = json.loads((session / "loop" / "loop.json").read_text(encoding="utf-8"))
         lost = [-verdict["difference"] for verdict in outcome["verdicts"]]
         where = f"{outcome['source']}, {outcome['pairs']} pairs, {len(outcome['refused'])} not compared; {machine()}"

@@ -157,7 +157,7 @@ class SimulatedRig:
             asked = re.search(r"--sheet\s+(\d+)", ran.stderr)
             if asked is None:
                 raise BenchError(f"`brushloop {words[0]}` ended with {ran.returncode}: {ran.stderr.strip()[-400:]}")
-            brushloop("fault", self.control, "fresh-sheet")
+            brushloop("sim", "fault", self.control, "fresh-sheet")
             sheet = ["--sheet", asked[1]]
         raise BenchError(f"`brushloop {words[0]}` has asked for {MOST_SHEETS} sheets")
 

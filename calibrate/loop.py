@@ -1,4 +1,4 @@
-"""`brushloop loop compare`: a session compared with the one that pressed its strokes again, pair by pair.
+"""`brushloop repress compare`: a session compared with the one that pressed its strokes again, pair by pair.
 
 A repetition is compared with its original as two presses of one condition are: the third row of Table 1.
 """
@@ -104,7 +104,7 @@ class LoopRecord(Sealed):
     """A closed loop as stored in `loop.json`: everything but the images and the individual scores."""
 
     FORMAT: ClassVar[str] = FORMAT
-    MADE_BY: ClassVar[str] = "brushloop loop compare"
+    MADE_BY: ClassVar[str] = "brushloop repress compare"
 
     format: str = FORMAT
     source: Source

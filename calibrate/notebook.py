@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     # What only some of the functions need is imported when they are called.
     from brushloop.calibrate.calibrated import Calibrated
     from brushloop.calibrate.fit.fit import BrushFit, FitResult
-    from brushloop.calibrate.invert import Recovered
+    from brushloop.calibrate.recover import Recovered
     from brushloop.calibrate.validate.command import ValidationOutput
     from brushloop.model.strokes import StrokeModel
 
@@ -325,15 +325,15 @@ def fit(session: Place, **options: Any) -> FitResult:
 
 
 def recover(session: Place, out: Path | None = None, **options: Any) -> Recovered:
-    """Recover depth and tilt of every press from its image, as `brushloop invert` does.
+    """Recover depth and tilt of every press from its image, as `brushloop recover` does.
 
     Writes `recovered.csv` and the protocol that repeats the presses, beside the recording unless `out` says where.
     `options` are fields of `RecoverRequest`.
     """
-    from brushloop.calibrate import invert
+    from brushloop.calibrate.recover import recover as run
 
     path = _path(session)
-    return invert.recover(RecoverRequest(path, out or path.parent / "recovered.csv", **options))
+    return run(RecoverRequest(path, out or path.parent / "recovered.csv", **options))
 
 
 def validate(*sessions: Place, **options: Any) -> ValidationOutput:

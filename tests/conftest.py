@@ -67,7 +67,7 @@ RUNS = (
 TOGETHER = {
     "tests/calibrate/validate/": "comparing",
     "tests/calibrate/test_scores.py": "comparing",
-    "tests/calibrate/test_invert.py": "comparing",
+    "tests/calibrate/test_recover.py": "comparing",
     "tests/calibrate/fit/": "comparing",
     "tests/calibrate/test_loop.py": "comparing",
     "tests/calibrate/writing/": "comparing",

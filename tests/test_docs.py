@@ -130,7 +130,7 @@ class Reader:
             if block.kind != "sh" or block.remark:
                 continue
             for line in block.commands:
-                if line.startswith("brushloop sim"):
+                if line.startswith("brushloop sim --"):
                     self.serve(line)
                     continue
                 for _ in range(4):  # on a busy machine the camera may be late; the same command continues

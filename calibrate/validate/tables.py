@@ -66,7 +66,7 @@ MAX_CELLS = 60
 """Most conditions that have statistics of their own."""
 MISSING = {
     "ccd-bsmg": "not in this run: give a trained one with --generator",
-    ROBOT_WRITING: "not in this run: “brushloop loop SESSION --config RIG” presses recovered strokes again; then "
+    ROBOT_WRITING: "not in this run: “brushloop repress SESSION --config RIG” presses recovered strokes again; then "
     "validate again",
 }
 WRITTEN_ROWS = {
@@ -354,7 +354,7 @@ def table_3(record: WrittenRecord, character: str, alignment: Alignment) -> list
 
 
 def summary_csv(report: Report) -> str:
-    """Return every statistic, per cell and overall; “robot writing” is what `brushloop loop` pressed again."""
+    """Return every statistic, per cell and overall; “robot writing” is what `brushloop repress` pressed again."""
     stats = [(stat.model, report.label, stat) for stat in report.stats]
     for loop in report.loops:
         again = (stat for stat in loop.stats if stat.model == AGAIN)

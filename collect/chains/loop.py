@@ -1,4 +1,4 @@
-"""`brushloop loop SESSION`, stage by stage: calibrate and fit, recover, press again, calibrate, compare.
+"""`brushloop repress SESSION`, stage by stage: calibrate and fit, recover, press again, calibrate, compare.
 
 The finished work of a stage is kept on disk, so that the same command resumes after kill -9. The session that presses
 again is an ordinary one of `brushloop collect`, with the same safety checks, questions and resume.
@@ -70,14 +70,14 @@ def run_loop(request: LoopRequest) -> Path:
 
     from brushloop.calibrate.loop import compare  # slow to import
 
-    command = f"brushloop loop compare {folder} {again} --fit {fit} --out {out}"
+    command = f"brushloop repress compare {folder} {again} --fit {fit} --out {out}"
     say(f"$ {command}")
     return show_work(compare, CompareLoopRequest(folder, again, fit, out=out, command=command)).path
 
 
 def _recover(folder: Path, out: Path, fit: Path, settings: Settings) -> None:
     """Recover depth and tilt of each press into a file, and write the protocol that presses them again beside it."""
-    from brushloop.calibrate.invert import recover  # slow to import
+    from brushloop.calibrate.recover import recover  # slow to import
 
     wanted = RecoverRequest(
         folder,
@@ -89,7 +89,7 @@ def _recover(folder: Path, out: Path, fit: Path, settings: Settings) -> None:
         repeats=settings.repeats,
         seed=settings.seed,
     )
-    say(f"invert {folder}")
+    say(f"recover {folder}")
     show_work(recover, wanted)
 
 

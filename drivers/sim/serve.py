@@ -181,7 +181,7 @@ def serve_unknown(
     lab = UnknownLab(seed, None if trap is None else Trap(trap), rate=rate)
 
     def announce() -> None:
-        hand = [] if control is None else [f"hand      brushloop hand {control} bring pin"]
+        hand = [] if control is None else [f"hand      brushloop sim hand {control} bring pin"]
         tell(*lab.labels(), *hand, "Ctrl-C ends")
 
     asyncio.run(_until_over(lab, lab.rig, live_control(lab.rig, control, lab.obey), idle_exit_s, announce))

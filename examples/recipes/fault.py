@@ -1,7 +1,7 @@
 """A fault of the loopback rig: the camera's pictures are upside down, as after somebody has turned its mount.
 
 The kind goes into `KINDS` in `drivers/sim/faults.py`, what it does into the simulator of its device; for a fault
-of single pictures that is `SPOILED` in `drivers/sim/scene.py`. `brushloop fault` knows it at once.
+of single pictures that is `SPOILED` in `drivers/sim/scene.py`. `brushloop sim fault` knows it at once.
 `docs/faults.md` says what a run makes of it; `tests/collect/faults/test_matrix.py` holds that.
 """
 

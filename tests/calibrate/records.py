@@ -1,4 +1,4 @@
-"""What `brushloop loop` and `brushloop write` leave behind, without a rig: small records of a few scores."""
+"""What `brushloop repress` and `brushloop write` leave behind, without a rig: small records of a few scores."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def loop_record(original: str, original_sha256: str, source: Source = Source.LOO
         verdicts=tuple(verdicts(scores)),
         refused=(),
         software="brushloop test",
-        command="brushloop loop compare",
+        command="brushloop repress compare",
     )
     return record.model_copy(update=changes).sealed()
 

@@ -30,10 +30,10 @@ def test_a_target_has_the_ending_of_what_is_written_and_is_not_what_is_read(tmp_
         (("write", "plan", "字", "--out", "taken/plan"), "taken: is a file"),
         (("write", "compare", "s.mcap", "--plan", "p", "--out", "taken"), "taken: is a file"),
         (("write", "learn", "s.mcap", "--plan", "p", "--out", "taken"), "taken: is a file"),
-        (("loop", "compare", "s.mcap", "s.mcap", "--out", "taken/loop"), "taken: is a file"),
-        (("invert", "s.mcap", "--out", "taken/recovered.csv"), "taken: is a file"),
+        (("repress", "compare", "s.mcap", "s.mcap", "--out", "taken/loop"), "taken: is a file"),
+        (("recover", "s.mcap", "--out", "taken/recovered.csv"), "taken: is a file"),
         (("validate", "s.mcap", "--out", "taken/report"), "taken: is a file"),
-        (("invert", "s.mcap", "--out", "s.mcap"), "must end in"),
+        (("recover", "s.mcap", "--out", "s.mcap"), "must end in"),
         (("validate", "captures", "s.mcap", "--generator", "g.safetensors", "--out", "s.mcap"), "must end in"),
     ],
 )

@@ -115,7 +115,7 @@ def test_an_edited_file_hostile_ink_and_presses_are_refused_with_one_line(
         edited.write_text(fitted[0].read_text().replace(old, new))
         with pytest.raises(CalibrationError, match=words):
             load_artefact(edited, DragArtefact)
-    ran = CliRunner().invoke(app, ["invert", str(session)])
+    ran = CliRunner().invoke(app, ["recover", str(session)])
     assert ran.exit_code != 0
     assert "drags" in str(ran.exception)
 

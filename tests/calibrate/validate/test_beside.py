@@ -93,7 +93,7 @@ def test_a_loop_in_the_session_is_the_third_row_of_table_1(place: Path) -> None:
     ("edit", "words"),
     [
         (("imported photographs", "real capture"), "was edited: its digest does not match its contents"),
-        (('"digest"', '"digested"'), "is not a report with a digest: write it with `brushloop loop compare`"),
+        (('"digest"', '"digested"'), "is not a report with a digest: write it with `brushloop repress compare`"),
         (("brushloop-loop-3", "brushloop-loop-9"), "format is 'brushloop-loop-9', expected 'brushloop-loop-3'"),
     ],
 )

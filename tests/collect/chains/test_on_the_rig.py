@@ -1,4 +1,4 @@
-"""`brushloop loop`, also after kill -9, and `brushloop write` on the loopback rig."""
+"""`brushloop repress`, also after kill -9, and `brushloop write` on the loopback rig."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ GRID = 'kind = "grid"\ndepths_mm = [11.0, 15.0, 20.0]\ntilts_deg = [0.0, 8.0]\nr
 
 
 def words(bench: Bench, session: Path, *more: str) -> list[str]:
-    return ["loop", str(session), "--config", str(bench.rig), "--no-tui", *more]
+    return ["repress", str(session), "--config", str(bench.rig), "--no-tui", *more]
 
 
 def replay_journal(bench: Bench) -> bytes:

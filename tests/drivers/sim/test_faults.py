@@ -313,7 +313,7 @@ async def test_a_path_that_the_system_would_cut_is_refused(rig: LoopbackRig, tmp
 
 async def test_a_person_breaks_the_rig_and_mends_it(control: Path):
     def fault(*words: str) -> Result:
-        return CliRunner().invoke(brushloop.__main__.app, ["fault", str(control), *words])
+        return CliRunner().invoke(brushloop.__main__.app, ["sim", "fault", str(control), *words])
 
     added = await asyncio.to_thread(fault, "robot", "mute", "--on", "moveLine", "--count", "3")
     assert json.loads(added.stdout) == {"id": 1}

@@ -1,4 +1,4 @@
-"""`brushloop invert SESSION`: depth and tilt of every captured press, and the protocol that presses them again.
+"""`brushloop recover SESSION`: depth and tilt of every captured press, and the protocol that presses them again.
 
 Each press is recovered from its coverage of the millimetre field, with its interval. The recovered (H, alpha) is the
 press for which this brush makes this mark. It measures the actual press only as well as the model describes the brush:

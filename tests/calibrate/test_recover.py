@@ -15,7 +15,8 @@ import pytest
 from brushloop.calibrate.commands import RecoverRequest
 from brushloop.calibrate.compare import Field
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.invert import (
+from brushloop.calibrate.presses import PrepareJob, prepare_job
+from brushloop.calibrate.recover import (
     NO_MODEL_ERROR,
     NOT_INFORMATIVE,
     PROTOCOL,
@@ -27,7 +28,6 @@ from brushloop.calibrate.invert import (
     recover,
     with_model_error,
 )
-from brushloop.calibrate.presses import PrepareJob, prepare_job
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.kinds import ReplayConfig
 from brushloop.model.ccdbsm import Brush, ccdbsm
@@ -110,7 +110,7 @@ def test_a_capture_without_any_scale_is_refused() -> None:
 
 def test_the_command_compares_with_what_was_commanded(tmp_path: Path) -> None:
     session(tmp_path)
-    ran = brushloop("invert", "sessions/shots", "--out", "again/recovered.csv", cwd=tmp_path)
+    ran = brushloop("recover", "sessions/shots", "--out", "again/recovered.csv", cwd=tmp_path)
     assert ran.returncode == 0, ran.stderr
     words = " ".join(ran.stdout.split())
     assert "3 presses recovered by ccd-bsm (imported photographs)" in words
