@@ -262,18 +262,8 @@ def check_protocol(rig_path: Path, protocol_path: Path, rig: RigConfig, protocol
     check_poses(rig_path, rig, protocol, PaperPlane(rig.paper.touch_z_mm))
 
 
-def distinct_steps(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Step]:
-    """The steps, without those that make the same moves as an earlier one."""
-    seen: set[tuple[object, ...]] = set()
-    for placed in placed_steps(config, protocol):
-        kind_and_moves = placed.step.kind, _moved(placed.step)
-        if kind_and_moves not in seen:
-            seen.add(kind_and_moves)
-            yield placed.step
-
-
 def _moved(step: Step) -> object:
-    """What the moves of a step depend on."""
+    """What the moves of a step depend on, beside its kind: steps alike in this are checked once."""
     match step:
         case PressStep(press=press):
             return press.condition
@@ -375,7 +365,10 @@ def all_poses(
     patches = [sheet.patch(i) for i in range(sheet.capacity)] if every_patch else sheet.corners
     # Assume that a wash is due in every step: when one is due depends on the step at which the process starts.
     dips = 0 if rig.ink.wash is None else rig.ink.wash.every_dips - 1
-    for step in distinct_steps(rig, protocol):
+    distinct: dict[object, Step] = {}
+    for placed in placed_steps(rig, protocol):
+        distinct.setdefault((placed.step.kind, _moved(placed.step)), placed.step)
+    for step in distinct.values():
         for marked in _places(step, patches):
             name = str(step.kind) if (press := press_of(step)) is None else press.stroke_id
             where = f"{name} on patch {marked[0].index}" if marked else name

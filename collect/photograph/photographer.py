@@ -285,7 +285,8 @@ class Photographer:
                 elif attempt == 0:
                     looks.clear()  # these pictures may all show what the arm did before
                     break
-                if len(looks) >= FEWEST_LOOKS and self._enough(CameraDelay(tuple(looks))):
+                so_far = CameraDelay(tuple(looks))
+                if len(looks) >= FEWEST_LOOKS and (so_far.exact if exact else so_far.known):
                     break
             if len(looks) >= FEWEST_LOOKS:
                 delay = CameraDelay(tuple(looks))
@@ -295,9 +296,6 @@ class Photographer:
                 if len(unsure) == MOST_UNSURE:
                     raise self._uneven(f"{delay}, and these do not agree")
         raise self._uneven() if shown else self._not_shown()
-
-    def _enough(self, delay: CameraDelay) -> bool:
-        return delay.exact if self._config.exact_delay else delay.known
 
     def _accepted(self, delay: CameraDelay) -> CameraDelay:
         if 1e3 * delay.delay_s > self._config.max_delay_ms:

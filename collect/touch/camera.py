@@ -253,11 +253,8 @@ class FirstInkTouch:
 
     async def _ink(self, before: Frame, spots: list[Spot]) -> NDArray[np.float64]:
         after = await self._photograph()
-        return await asyncio.to_thread(self._measure_ink, before, after, spots)
-
-    def _measure_ink(self, before: Frame, after: Frame, spots: list[Spot]) -> NDArray[np.float64]:
-        first, second, image_to_paper = before_and_after(self._rig.config, before, after)
-        return ink_at(first, second, image_to_paper, [(x, y) for x, y, _ in spots], WINDOW_MM)
+        frames = await asyncio.to_thread(before_and_after, self._rig.config, before, after)
+        return await asyncio.to_thread(ink_at, *frames, [(x, y) for x, y, _ in spots], WINDOW_MM)
 
 
 def _plane(touches: list[Touch]) -> PaperPlane:

@@ -22,7 +22,7 @@ from brushloop.collect.engine.open_or_resume import (
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.protocols.steps import StepKind
 from brushloop.collect.tui.start_screen import SessionBrowser
-from brushloop.collect.walk import distinct_steps
+from brushloop.collect.walk import walk
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import Addresses, rig_toml
@@ -60,8 +60,8 @@ def opening(config: Path = Path("rig.toml"), **options: Any) -> Opening:
     return Opening.load(CollectRequest(config, Path("protocol.toml"), **options))
 
 
-def kinds(opened: Opening) -> list[StepKind]:
-    return [step.kind for step in distinct_steps(opened.rig, opened.protocol)]
+def kinds(opened: Opening) -> set[StepKind]:
+    return {walked.step.kind for walked in walk(opened.rig, opened.protocol)}
 
 
 def edit(name: str, old: str, new: str) -> None:
