@@ -78,7 +78,9 @@ def collect_session(
 def dry_run(request: CollectRequest) -> None:
     """Move through the protocol in the air; the recording is thrown away, so that no cell counts as used."""
     with tempfile.TemporaryDirectory(prefix="brushloop-dry-") as folder:
-        engine = engine_for(Opening.load(replace(request, out=Path(folder), new=False, sheet=None, live=None)))
+        engine = engine_for(
+            Opening.load(replace(request, out=Path(folder), new=False, sheet=None, guided=False, live=None))
+        )
         _run(engine, None, on_screen=request.on_screen)
     say("dry run done; nothing was kept")
 

@@ -308,11 +308,6 @@ def load(folder: Path, protocol: str, csv: str | bytes | None = None):
     return load_protocol(folder / "protocol.toml")
 
 
-@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda path: path.stem)
-def test_the_examples_are_valid(path: Path) -> None:
-    assert load_protocol(path).kind in path.stem or isinstance(load_protocol(path), GridConfig)
-
-
 @pytest.mark.parametrize(
     ("protocol", "csv", "message"),
     [
