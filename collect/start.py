@@ -78,10 +78,8 @@ def collect_session(
 def dry_run(request: CollectRequest) -> None:
     """Move through the protocol in the air; the recording is thrown away, so that no cell counts as used."""
     with tempfile.TemporaryDirectory(prefix="brushloop-dry-") as folder:
-        engine = engine_for(
-            Opening.load(replace(request, out=Path(folder), new=False, sheet=None, guided=False, live=None))
-        )
-        _run(engine, None, on_screen=request.on_screen)
+        in_the_air = replace(request, out=Path(folder), new=False, sheet=None, guided=False, live=None)
+        _run(engine_for(Opening.load(in_the_air)), None, on_screen=request.on_screen)
     say("dry run done; nothing was kept")
 
 
