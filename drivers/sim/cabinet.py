@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -107,6 +107,7 @@ TCP_SPEED_M_S, TCP_ACC_M_S2 = 2.0, 10.0
 POSE_OUT_OF_REACH = 30047
 BLEND_M = (0.001, 1.0)
 PROTECTIVE_STOP_ACTION = 3
+MOST_MOVES = 64
 OPERATIONAL_MODES = ("Disabled", "Automatic", "Manual")
 
 Params = dict[str, Any]
@@ -125,8 +126,6 @@ class Cabinet:
         self.speed_fraction = 1.0
         self.operational_mode = "Automatic"
         self.messages: list[dict[str, Any]] = []
-        self._near = self.motion.near
-        """Joints of the last pose that was asked for: the next one is likely to be near."""
         self.watchdogs: dict[str, asyncio.TimerHandle] = {}
         """The watchdogs that wait, by key."""
 
@@ -204,10 +203,9 @@ class Cabinet:
         joints = self._flange(from_wire([float(v) for v in pose]), _floats(near, 6))
         return [list(near), IK_NO_CONVERGE] if joints is None else [list(joints), 0]
 
-    def _flange(self, target: Pose, *near: list[float] | Joints) -> Joints | None:
-        """Joints for a pose of the configured tool centre point, searched from each of `near` in turn."""
-        flange = matrix_of(target) @ inverted(self._tool)
-        return next((joints for start in near if (joints := inverse(flange, start)) is not None), None)
+    def _flange(self, target: Pose, near: Sequence[float]) -> Joints | None:
+        """Joints for a pose of the configured tool centre point, searched from `near`."""
+        return inverse(matrix_of(target) @ inverted(self._tool), near)
 
     def stop(self, acc_m_s2: float, acc_rad_s2: float) -> int:
         """Decelerate and forget the path."""
@@ -238,10 +236,8 @@ class Cabinet:
         target = from_wire([float(v) for v in p["pose"]])
         if (code := self._admit(p)) != ReturnCode.OK:
             return code
-        joints = self._flange(target, self._near, self.motion.near)
-        if joints is None:
+        if self._flange(target, self.motion.near) is None:
             return self._out_of_reach()
-        self._near = joints
         added = self.motion.add(
             target,
             min(float(p["v"]), TCP_SPEED_M_S) * 1e3,
@@ -275,7 +271,7 @@ class Cabinet:
         paced = float(p["a"]) > 0.0 and float(p["v"]) > 0.0 and 0.0 <= duration_s < math.inf
         if not paced or not (blend_m == 0.0 or BLEND_M[0] <= blend_m <= BLEND_M[1]):
             return -ReturnCode.INVALID_ARGUMENT
-        return ReturnCode.QUEUE_FULL if self.motion.full else ReturnCode.OK
+        return ReturnCode.QUEUE_FULL if self.motion.size >= MOST_MOVES else ReturnCode.OK
 
     def _out_of_reach(self) -> int:
         """Accept a move that then proves to be out of reach: the arm stops and a message says why."""

@@ -39,7 +39,6 @@ SAME_POSE_DEG = 1e-4
 SAME_JOINT_RAD = 1e-6
 RESTS_KEPT = 64
 SHORTEST_CUT = 1e-6
-MOST_MOVES = 64
 CORNER_SHARE = 0.5
 """Share of the acceleration that the bend of a corner may need; the rest is left for the speed along it."""
 SLACK = 1e-9
@@ -159,11 +158,6 @@ class MotionQueue:
         self._rest = home
         self._on_path = on_path
         self._next_id = 0
-
-    @property
-    def full(self) -> bool:
-        """True when another move would be refused."""
-        return self.size >= MOST_MOVES
 
     @property
     def size(self) -> int:
