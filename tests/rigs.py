@@ -210,7 +210,7 @@ class WorldClock(SimClock):
     """The world's time, which passes `rate` times as fast as that of the loop."""
 
     def __init__(self, time: SimulatedTime, rate: float) -> None:
-        super().__init__(rate)
+        super().__init__(rate, time.seconds)
         self._time = time
         self._since = time.now_s, 0.0
 
@@ -233,7 +233,6 @@ class WirelessRig(LoopbackRig):
         self.time = SimulatedTime()
         self.clock = WorldClock(self.time, config.rate)
         self.world.clock = self.clock
-        self.faults._real_s = self.time.seconds
 
     def toml(self) -> str:
         ink_path = None if self.ink is None else "in memory"
