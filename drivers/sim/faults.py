@@ -251,6 +251,11 @@ class FaultBoard:
                 return fault
         return None
 
+    def kind_met(self, device: Device) -> str | None:
+        """The kind of the fault that strikes this request, frame or round of a device; None if none does."""
+        fault = self.meet(device)
+        return None if fault is None else fault.kind
+
     async def watch(self, stop: Callable[[SafetyMode], None]) -> None:
         """Begin faults that no request triggers, until cancelled; `stop` gets the mode of each safety stop."""
         while True:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -151,15 +152,10 @@ class LoopbackRig:
         """What the camera looks at."""
         self.camera = MjpegServer(self.scene, config.view, self.faults)
         if self.ink is not None:
-            self.ink.next_fault = lambda: self._fault_of(Device.INK)
+            self.ink.next_fault = functools.partial(self.faults.kind_met, Device.INK)
         if self.force is not None:
-            self.force.board.next_fault = lambda: self._fault_of(Device.FORCE)
+            self.force.board.next_fault = functools.partial(self.faults.kind_met, Device.FORCE)
         self._open = contextlib.AsyncExitStack()
-
-    def _fault_of(self, device: Device) -> str | None:
-        """The kind of the fault that strikes a request to a device, or its round."""
-        fault = self.faults.meet(device)
-        return None if fault is None else fault.kind
 
     async def __aenter__(self) -> LoopbackRig:
         async with contextlib.AsyncExitStack() as opening:

@@ -417,8 +417,7 @@ class MjpegServer(LoopbackServer):
         held: deque[bytes] = deque(maxlen=BACKLOG)
         shown = b""
         while True:
-            fault = None if self._faults is None else self._faults.meet(Device.CAMERA)
-            kind = "" if fault is None else fault.kind
+            kind = None if self._faults is None else self._faults.kind_met(Device.CAMERA)
             exposed_s, image = await self._exposed()
             if kind == "frozen":
                 image = renumbered(shown or image, time.time_ns())

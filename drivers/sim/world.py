@@ -143,7 +143,6 @@ INK_PER_PRESS = 0.12
 class Press:
     """One contact of brush and paper as it really happened: ground truth for tests."""
 
-    index: int
     x_mm: float
     y_mm: float
     depth_mm: float
@@ -159,7 +158,6 @@ class Press:
 class Drag:
     """One contact that travelled along the paper, as it really happened."""
 
-    index: int
     path: tuple[Waypoint, ...]
     """The commanded tip in the paper frame, from touching to lifting off."""
     tilt_deg: float
@@ -278,7 +276,7 @@ class World:
         if want is Flaw.BLANK or (flaw is None and want is not None):
             # no ink on the hairs, or too little for the mark
             flaw, severity = want, 1.0 - self.ink_load
-        self.presses.append(Press(index, x_mm, y_mm, depth_mm, tilt_deg, heading_deg, self.ink_load, flaw, severity))
+        self.presses.append(Press(x_mm, y_mm, depth_mm, tilt_deg, heading_deg, self.ink_load, flaw, severity))
         self.ink_load = max(0.0, self.ink_load - INK_PER_PRESS)
         self.version += 1
 
@@ -288,7 +286,6 @@ class World:
             return
         tilt_deg, _ = self._lean(min(contact, key=self._above_mm))
         _, heading_deg = self._lean(contact[0])
-        index = len(self.drags)
         make = functools.partial(
             self.brush.drag,
             tuple(replace(w, depth_mm=min(w.depth_mm, self.brush.deepest_mm(tilt_deg))) for w in path),
@@ -296,10 +293,10 @@ class World:
             heading_deg,
             ink_load=self.ink_load,
             # an offset keeps it apart from the seeds of presses
-            press_seed=2**40 + self.config.seed * 100_003 + index,
+            press_seed=2**40 + self.config.seed * 100_003 + len(self.drags),
         )
         self.paper.lay_later(make, path[0].x_mm, path[0].y_mm, 0.0)
-        self.drags.append(Drag(index, path, tilt_deg, heading_deg, self.ink_load))
+        self.drags.append(Drag(path, tilt_deg, heading_deg, self.ink_load))
         travel_mm = sum(math.dist((a.x_mm, a.y_mm), (b.x_mm, b.y_mm)) for a, b in itertools.pairwise(path))
         self.ink_load = max(0.0, ink_left(self.ink_load, travel_mm) - INK_PER_PRESS)
         self.version += 1
