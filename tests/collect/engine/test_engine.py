@@ -148,17 +148,6 @@ def test_a_full_sheet_asks_for_a_fresh_one_and_goes_on_with_it(lab: Lab) -> None
     assert {sheet for sheet, _ in pressed} == {0, 1}
 
 
-def test_what_the_environment_changes_is_recorded_and_held_against_a_resume(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("BRUSHLOOP_PAPER__TOUCH_Z_MM", "121.0")
-    run_and_stop(lab.engine(), lambda now: now.step == "retreat")
-    assert '"touch_z_mm": 121.0' in (lab.session / "rig.effective.json").read_text()
-    monkeypatch.delenv("BRUSHLOOP_PAPER__TOUCH_Z_MM")
-    with pytest.raises(ConfigError, match=r"rig.toml: paper.touch_z_mm: 121.0 -> 120.03\n.*in the same environment;"):
-        lab.engine()
-
-
 def test_real_hardware_is_not_moved_unless_armed_or_allowed_on_the_screen(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -116,6 +116,7 @@ def test_both_files_and_the_environment_are_distinguished(lab: Path, monkeypatch
     edit("rig.toml", "radius_mm = 6.0", "radius_mm = 5.0")
     edit("protocol.toml", "repeats = 2", "repeats = 3")
     monkeypatch.setenv("BRUSHLOOP_PAPER__TOUCH_Z_MM", "121.0")
+    assert '"touch_z_mm": 121.0' in opening().snapshots["rig.effective.json"]
     *lines, way_out = refused()
     assert lines[1:] == [
         "rig.toml: brush.radius_mm: 6.0 -> 5.0",
