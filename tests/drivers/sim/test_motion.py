@@ -132,10 +132,9 @@ def cornered(blend_mm: float = 20.0, second_s: float = 0.0, travelled: Stretches
     return queue
 
 
-def walked(queue: MotionQueue, until_s: float, dt_s: float = DT_S) -> np.ndarray:
-    """(times, positions) from 0 on."""
-    times = np.arange(0.0, until_s, dt_s)
-    return np.array([[t, *queue.pose(t).position_mm] for t in times])
+def walked(queue: MotionQueue, until_s: float, dt_s: float = DT_S, begin_s: float = 0.0) -> np.ndarray:
+    """(times, positions)."""
+    return np.array([[t, *queue.pose(t).position_mm] for t in np.arange(begin_s, until_s, dt_s)])
 
 
 def speeds(walk: np.ndarray, dt_s: float = DT_S) -> np.ndarray:
@@ -220,17 +219,13 @@ def test_a_stop_follows_the_path_through_the_corner(stop_s: float, acc: float):
     free, stopped = walked(cornered(), 4.0), cornered()
     stopped.pose(stop_s)
     stopped.stop(acc, 10.0, stop_s)
-    walk = walked_from(stopped, stop_s, 6.0)
+    walk = walked(stopped, 6.0, begin_s=stop_s)
     moving = speeds(walk)
     assert np.all(np.diff(moving) <= 0.03 * V)
     assert moving[-1] == 0.0
     for point in walk[::30, 1:]:
         assert np.linalg.norm(free[:, 1:] - point, axis=1).min() < 0.4
     assert stopped.exec_id(6.0) == -1
-
-
-def walked_from(queue: MotionQueue, begin_s: float, until_s: float) -> np.ndarray:
-    return np.array([[t, *queue.pose(t).position_mm] for t in np.arange(begin_s, until_s, DT_S)])
 
 
 @pytest.mark.parametrize("hold_s", [0.05, 0.5, 0.86, 1.1])
@@ -245,7 +240,7 @@ def test_a_path_held_anywhere_goes_on_along_itself(hold_s: float, acc: float):
     assert queue.exec_id(8.0) >= before
     assert queue.steady(8.0)
     queue.resume(8.0)
-    walk = walked_from(queue, 8.0, 14.0)
+    walk = walked(queue, 14.0, begin_s=8.0)
     assert np.linalg.norm(walk[-1, 1:] - BEYOND.position_mm) < 1e-6
     assert speeds(walk).max() <= V * (1 + 1e-6)
     for point in walk[::30, 1:]:

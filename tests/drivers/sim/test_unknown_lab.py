@@ -134,7 +134,7 @@ def test_options_that_do_not_go_together_are_refused(arguments: tuple[str, ...],
 
 
 async def test_a_person_at_the_command_line_guides_the_arm(tmp_path: Path):
-    lab, socket = UnknownLab(4, rate=500.0, picture_px=(640, 480)), tmp_path / "lab.sock"
+    lab, socket = lab_of(4), tmp_path / "lab.sock"
     async with live_control(lab.rig, socket, lab.obey):
         said = await asyncio.to_thread(
             run, "sim", "hand", str(socket), "bring", "board-corner", "--corner", "lower left"
@@ -142,10 +142,3 @@ async def test_a_person_at_the_command_line_guides_the_arm(tmp_path: Path):
         assert said == "The tip is at the board-corner, lower left.\n"
         with pytest.raises(FaultRefused, match="to = 'moon' is not one of pin"):
             await asyncio.to_thread(run, "sim", "hand", str(socket), "bring", "moon")
-
-
-async def test_nobody_is_in_a_known_rig(tmp_path: Path):
-    lab, socket = UnknownLab(4, rate=500.0, picture_px=(640, 480)), tmp_path / "rig.sock"
-    async with live_control(lab.rig, socket):
-        with pytest.raises(FaultRefused, match="there is no person here"):
-            await asyncio.to_thread(run, "sim", "hand", str(socket), "bring", "pin")
