@@ -263,7 +263,7 @@ class WirelessRig(LoopbackRig):
 
 
 class SceneCamera:
-    """A camera that sees the scene itself: a picture is drawn only when somebody asks for it."""
+    """`Camera` that sees the scene itself: a picture is drawn only when somebody asks for it."""
 
     def __init__(self, rig: WirelessRig, table: CameraTable, clock: Clock) -> None:
         self._rig, self._table, self._clock = rig, table, clock

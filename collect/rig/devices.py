@@ -12,10 +12,9 @@ from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.config import RigConfig
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.camera import OpenCvCamera
-from brushloop.drivers.devices import Identity
+from brushloop.drivers.devices import Camera, ForceSensor, Identity, Ink, Robot
 from brushloop.drivers.force.sri_m8123 import SriM8123
 from brushloop.drivers.host import Claimed, Clock, claimed
-from brushloop.drivers.ink.port import InkDevice
 from brushloop.drivers.limits import Limits
 
 
@@ -25,12 +24,12 @@ class Rig:
 
     config: RigConfig
     clock: Clock
-    robot: AuboArcs
-    camera: OpenCvCamera
+    robot: Robot
+    camera: Camera
     robot_identity: Identity
     camera_identity: Identity
-    force: SriM8123 | None = None
-    ink: InkDevice | None = None
+    force: ForceSensor | None = None
+    ink: Ink | None = None
     force_identity: Identity | None = None
     ink_identity: Identity | None = None
 

@@ -1,4 +1,4 @@
-"""The Aubo-i5 behind ARCS: three sockets, so that neither stop nor telemetry waits for anything."""
+"""The Aubo-i5 behind ARCS as a `Robot`: three sockets, so that neither stop nor telemetry waits for anything."""
 
 from __future__ import annotations
 
@@ -33,10 +33,7 @@ _R = TypeVar("_R")
 
 
 class AuboArcs:
-    """An Aubo arm with a brush, under ARCS. All poses are of the brush tip, in the base frame.
-
-    FK and IK are the controller's; units on the wire are m, rad, s.
-    """
+    """`Robot` for an Aubo arm under ARCS. FK and IK are the controller's; units on the wire are m, rad, s."""
 
     def __init__(
         self,

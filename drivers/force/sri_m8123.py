@@ -304,7 +304,7 @@ def command(data: bytes) -> can.Message:
 
 
 class SriM8123:
-    """The driver of the sensor, over a `RoundStream`; samples reach listeners in the event loop that connected."""
+    """`ForceSensor` over a `RoundStream`; samples reach listeners in the event loop that connected."""
 
     def __init__(self, table: ForceTable, clock: Clock) -> None:
         self._table = table

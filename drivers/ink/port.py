@@ -19,7 +19,7 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, Field
 
-from brushloop.drivers.devices import Identity, Well
+from brushloop.drivers.devices import Ink
 from brushloop.drivers.errors import (
     ConnectionLost,
     DeviceError,
@@ -57,7 +57,7 @@ class InkTable(BaseModel, ABC, frozen=True, extra="forbid"):
     max_per_minute_ml: Annotated[float, Field(gt=0.0, le=100.0)] = 5.0
 
     @abstractmethod
-    def device(self, clock: Clock) -> InkDevice:
+    def device(self, clock: Clock) -> Ink:
         """The driver, not yet connected."""
 
     def doses_ml(self, dips: int) -> float | None:
@@ -69,7 +69,7 @@ MINUTE_NS = 60 * 10**9
 
 
 class InkDevice(ABC):
-    """Keeps the well filled as its table says, within the limits of a dose and of a minute; adds up what it has given.
+    """An `Ink` by its table: keeps to the limit of a dose and of a minute, and adds up what it has given.
 
     A dose that failed counts against the limits: ink may have flowed before the reply was lost.
     """
@@ -79,21 +79,6 @@ class InkDevice(ABC):
         self._smallest_ml = smallest_ml
         self._taken: deque[tuple[int, float]] = deque()
         self._dosed_ml = 0.0
-
-    @abstractmethod
-    async def connect(self) -> Identity:
-        """Open the line and make sure that the right device answers; gives no ink."""
-
-    @abstractmethod
-    async def replenish(self, dips: int) -> Well:
-        """Before a dip, after so many of this run: add ink if the table asks for it.
-
-        Raises `InkRefused` or `DoseLost` where only a person can help, else `DeviceError`.
-        """
-
-    @abstractmethod
-    async def close(self) -> None:
-        """Leave the device at rest and release the line."""
 
     @abstractmethod
     async def _give(self, volume_ml: float) -> None:
@@ -114,11 +99,11 @@ class InkDevice(ABC):
         self._dosed_ml += volume_ml
 
     async def light(self) -> float | None:
-        """Set the light over the sheet as the table says and return it, 0 to 1; None where the device has none."""
+        """None: most ink devices have no light."""
         return None
 
     async def level(self) -> float | None:
-        """Fill level of the well, 0 to 1; None where the device has no gauge."""
+        """None: most ink devices have no gauge."""
         return None
 
 

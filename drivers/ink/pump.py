@@ -111,7 +111,7 @@ class ModbusPumpConfig(InkTable, frozen=True):
 
 
 class ModbusPump(InkDevice):
-    """The driver of a pump: doses by time at a fixed speed; a running pump is always stopped."""
+    """`Ink` that doses by time at a fixed speed; a running pump is always stopped."""
 
     def __init__(self, table: ModbusPumpConfig, clock: Clock) -> None:
         self._ml_per_s = table.ml_per_revolution * table.rpm / 60.0

@@ -107,7 +107,7 @@ class InkStationConfig(InkTable, frozen=True):
 
 
 class InkStation(InkDevice):
-    """The driver of a station, over its line protocol."""
+    """`Ink` over the station's line protocol."""
 
     def __init__(self, table: InkStationConfig, clock: Clock) -> None:
         super().__init__(DEVICE, table, clock, smallest_ml=SMALLEST_ML)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from brushloop.drivers.devices import Ink
 from brushloop.drivers.errors import (
     ConnectionLost,
     DeviceError,
@@ -284,6 +285,7 @@ async def pump(pump_line: PtyLine, rotor: PumpFirmware) -> AsyncIterator[ModbusP
 async def test_a_dose_sets_the_speed_starts_and_stops(clock: PatientClock):
     with scripted([*CONNECTED, (SPEED, SPEED), (START, START), (STOP, STOP), *BYE], clock) as path:
         pump = pump_at(path)
+        assert isinstance(pump, Ink)
         identity = await pump.connect()
         assert (identity.model, identity.simulated) == ("Modbus RTU pump, unit 1", False)
         began = time.monotonic()
