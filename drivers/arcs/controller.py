@@ -1,6 +1,11 @@
 """Typed calls to the controller: what is sent over one connection, and what codes, modes and errors mean at the arm.
 
 `survey` is a transcript of untyped ones, which change nothing: what a cabinet answered, for a report of a defect.
+
+MotionError
+ +-- WrongOperationalMode   the pendant's mode switch is not on Automatic
+ +-- MotionFailed
+      +-- OutOfReach        accepted, then failed in planning: messages 30047 and 30048
 """
 
 from __future__ import annotations
@@ -20,6 +25,7 @@ from brushloop.drivers.errors import (
     DeviceError,
     DeviceTimeout,
     MotionError,
+    MotionFailed,
     MotionRefused,
     NotPowered,
     ProtocolViolation,
@@ -123,6 +129,16 @@ class WrongOperationalMode(MotionError):
     def __init__(self, device: str, op: str, mode: str) -> None:
         self.mode = mode
         super().__init__(device, op, f"operational mode is {mode}")
+
+
+class OutOfReach(MotionFailed):
+    """The controller accepted a target and could not plan a path to it; `code` is the number of its message."""
+
+    remedy = "Bring the target within reach: move the sheet or turn the brush, then teach again."
+
+    def __init__(self, device: str, op: str, code: int, name: str) -> None:
+        self.code = code
+        super().__init__(device, op, f"the controller reports {code} ({name})")
 
 
 NOT_RUNNING = -1

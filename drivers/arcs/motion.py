@@ -17,8 +17,9 @@ import itertools
 import math
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from brushloop.drivers.arcs.controller import Controller, ReturnCode
+from brushloop.drivers.arcs.controller import Controller, OutOfReach, ReturnCode
 from brushloop.drivers.arcs.wire import DEVICE
 from brushloop.drivers.devices import Pose, QueuedLine
 from brushloop.drivers.errors import (
@@ -106,6 +107,47 @@ def _not_arrived(what: str) -> MotionFailed:
         remedy="Look at the pendant for a message, and for another client that stops the arm. "
         "`brushloop collect plan --ask` tells whether a pose is out of reach.",
     )
+
+
+PLANNING_FAILED = {30047: "pose out of reach", 30048: "planning failed"}
+NEWEST = 20
+
+
+class Messages:
+    """The controller's messages since `begin`."""
+
+    def __init__(self, controller: Controller) -> None:
+        self._controller = controller
+        self._seen = 0
+        """Newest timestamp of the controller seen so far; its unit is unknown, but it increases."""
+
+    async def begin(self) -> None:
+        """Skip the messages that are already there; they concern earlier motion."""
+        await self._new()
+
+    async def explain(self, error: MotionFailed) -> MotionFailed:
+        """`OutOfReach` if a new message reports it, else the error itself."""
+        for code in await self._new():
+            if code in PLANNING_FAILED:
+                return OutOfReach(DEVICE, error.op, code, PLANNING_FAILED[code])
+        return error
+
+    async def _new(self) -> list[int]:
+        """Codes of the messages not seen before; empty if the controller does not answer."""
+        messages: Any = []
+        with contextlib.suppress(DeviceError):
+            messages = await self._controller.ask("Trace.peek", num=NEWEST, last_time=self._seen)
+        codes: list[int] = []
+        newest = self._seen
+        for message in messages if isinstance(messages, list) else []:  # pyright: ignore[reportUnknownVariableType]
+            match message:
+                case {"code": int(code), "timestamp": int(stamp)} if stamp > self._seen:
+                    codes.append(code)
+                    newest = max(newest, stamp)
+                case _:  # pyright: ignore[reportUnknownVariableType]
+                    pass
+        self._seen = newest
+        return codes
 
 
 MOST_QUEUED = 16

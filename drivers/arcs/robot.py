@@ -10,6 +10,7 @@ from brushloop.drivers.arcs.controller import LOOPBACK_CONTROL_BOX, ArmState, Co
 from brushloop.drivers.arcs.motion import (
     Leg,
     Look,
+    Messages,
     OwnPath,
     arrived,
     feed,
@@ -60,6 +61,7 @@ class AuboArcs:
         self._enabled = False
         self._telemetry = Telemetry(self._state, table, clock, on_notice)
         self._watchdog = Watchdog(self._state.connection, table.watchdog_s, on_notice)
+        self._messages = Messages(self._motion)
         self._departure = Departure(self._motion)
         self._motion.on_notice = on_notice
         self._motion.on_pose = self._telemetry.lag.asked
@@ -111,6 +113,7 @@ class AuboArcs:
         self._held = True  # a process that was killed may have left it so
         await self._ready()
         await self._departure.enabled(settings)
+        await self._messages.begin()
         await self._watchdog.arm()
         await self._telemetry.read()
 
@@ -182,10 +185,16 @@ class AuboArcs:
             self._unsettled, self._departure.left = False, target
             return result
         except BaseException as error:
+            note = ""
             try:
                 await finished(self.stop())
             except DeviceError as failure:
-                error.add_note(str(failure))
+                note = str(failure)
+                error.add_note(note)
+            if isinstance(error, MotionFailed) and (cause := await self._messages.explain(error)) is not error:
+                if note:
+                    cause.add_note(note)
+                raise cause from error
             raise
 
     async def _depart(self, op: str, lines: Sequence[QueuedLine], acc_mm_s2: float) -> Pose:

@@ -11,6 +11,7 @@ import pytest
 from brushloop.drivers.arcs import stopping
 from brushloop.drivers.arcs.controller import (
     Controller,
+    OutOfReach,
     RobotMode,
     SafetyMode,
     WrongOperationalMode,
@@ -109,11 +110,22 @@ async def test_reduced_mode_is_allowed_and_reported_once(make_arm: MakeArm, cabi
     assert len(notices) == 1
 
 
-async def test_a_target_out_of_reach_is_a_failed_motion(make_arm: MakeArm):
+async def test_a_target_out_of_reach_names_the_controllers_message(make_arm: MakeArm, cabinet: ArcsServer):
+    cabinet.cabinet.tell(30048)  # somebody else's, from before
     arm = await enabled(make_arm)
-    with pytest.raises(MotionFailed, match=r"from the target.*plan --ask"):
+    with pytest.raises(OutOfReach, match="30047") as caught:
         await arm.move(BEYOND, **QUICK)
+    assert caught.value.code == 30047
+    assert isinstance(caught.value.__cause__, MotionFailed)
     await arm.move(NEAR, **QUICK)
+
+
+async def test_without_a_message_it_is_just_a_failed_motion(make_arm: MakeArm, cabinet: ArcsServer):
+    arm = await enabled(make_arm)
+    cabinet._methods["rob1.Trace.peek"] = lambda _: [5, {}, {"code": "x", "timestamp": 1}, {"code": 30047}]
+    with pytest.raises(MotionFailed) as caught:
+        await arm.move(BEYOND, **QUICK)
+    assert type(caught.value) is MotionFailed
 
 
 # ---------------------------------------------------------------- the watchdog
