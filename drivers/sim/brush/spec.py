@@ -138,6 +138,7 @@ def _plain(text: str) -> str:
     return "".join(char if char.isprintable() else "?" for char in text)[:300]
 
 
+MAX_BYTES = 256 * 1024
 MAX_NOISE_GRAY = 30.0
 LOOPBACK = "loopback"
 """Name of the brush whose constants are the defaults of `BrushSpec`."""
@@ -183,7 +184,11 @@ def load_brush(path: Path, seed: int = BrushSpec().seed) -> NamedBrush:
 
 def _read(path: Path) -> _File:
     try:
-        return _File.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+        if len(data) > MAX_BYTES:
+            raise SimFileError(path, "", f"is larger than {MAX_BYTES} bytes")
+        return _File.model_validate(tomllib.loads(data.decode("utf-8")))
     except FileNotFoundError:
         raise SimFileError(path, "", "no such file") from None
     except OSError as error:

@@ -125,6 +125,7 @@ def written(folder: Path, text: str) -> Path:
         ("bristles = 400.5", r"brush\.bristles: .*integer"),
         ("radius_mm = 19.0\nlength_mm = 40.0", r"brush: length_mm = 40 is outside 57 \.\. 120"),
         ("friction = ", "is not TOML"),
+        ("# " + 300_000 * "x", "is larger than 262144 bytes"),
     ],
 )
 def test_a_brush_out_of_range_is_refused_with_file_field_and_range(tmp_path: Path, text: str, message: str) -> None:
