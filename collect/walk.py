@@ -284,7 +284,7 @@ def _check_sheet(rig_path: Path, path: Path, rig: RigConfig, protocol: ProtocolC
         try:
             triangle_in(sheet.patch(0), rig.self_check)
         except StepError as error:
-            what = f"{error}; --arm switches the self-check on, `enabled = false` switches it off"
+            what = f"{error}; --arm switches the self-check on, `enabled = false` switches it off for a new session"
             raise ConfigError(rig_path, "self_check.legs_mm", what) from None
 
 

@@ -74,9 +74,15 @@ class DemoRig:
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             port = int(probe.getsockname()[1])
-        self.config.unlink(missing_ok=True)  # that of an earlier rig
+        earlier = self.config.read_bytes() if self.config.exists() else None
+        self.config.unlink(missing_ok=True)  # the new rig writes its own
         options = ["--idle-exit", str(IDLE_EXIT_S), "--arcs-port", str(port), "--control", str(self._control(port))]
-        self._started = start(self.config, self._folder / "rig.log", *self._options, *options, detached=True)
+        try:
+            self._started = start(self.config, self._folder / "rig.log", *self._options, *options, detached=True)
+        except BaseException:
+            if earlier is not None and not self.config.exists():
+                self.config.write_bytes(earlier)  # sessions are compared with it when the demo is continued
+            raise
 
     def ready(self) -> None:
         """Go on with the rig that `rig.toml` names; start one with a blank sheet if it has ended.
@@ -117,7 +123,7 @@ class Demo:
         self._rig = DemoRig(request)
         self._session: Path
         """What the first step collects, for every later step."""
-        self._validated: ValidationOutput
+        self._validated: ValidationOutput | None = None
         self._left_out = 0
 
     def run(self) -> None:
@@ -149,7 +155,7 @@ class Demo:
         """Print how much of the ink is predicted, and what follows."""
         from brushloop.calibrate.validate.findings import headline, verdict  # slow to import
 
-        report = self._validated.report
+        report = None if self._validated is None else self._validated.report
         if report is None:
             return
         say("", f"How much of the ink is predicted (average CSIM; {report.label}):")
@@ -185,9 +191,9 @@ class Demo:
         ]
 
     @property
-    def report(self) -> Path:
-        """The report's page."""
-        return _report(self._session)
+    def report(self) -> Path | None:
+        """The report's page, once it is written."""
+        return None if self._validated is None else _report(self._session)
 
     def _write_protocol(self) -> None:
         size = self._size
@@ -199,6 +205,8 @@ class Demo:
             self._protocol.write_text(protocol, encoding="utf-8")
 
     def _collect(self) -> None:
+        if self._sessions.is_dir() and not self._rig.config.exists():
+            self._rig.start()  # a demo was killed while its rig started
         session = finished_session(self._sessions, self._rig.config, self._protocol)
         if session is not None and not _report(session).is_file():
             say(f"continuing with {session}: its collection is finished")
@@ -256,6 +264,8 @@ def _report(session: Path) -> Path:
 def demo(request: DemoRequest) -> None:
     """Run the demo, as `Demo.run` does, and open its report if that is asked."""
     run = Demo(request, FULL if request.full else QUICK)
-    run.run()
-    if request.show:
-        webbrowser.open(run.report.resolve().as_uri())
+    try:
+        run.run()
+    finally:
+        if request.show and run.report is not None:
+            webbrowser.open(run.report.resolve().as_uri())

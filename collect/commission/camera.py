@@ -99,7 +99,7 @@ class CameraStep(Step):
             await self._source(visit)
         async with taught_camera(visit.notebook, visit.clock) as camera:
             visit.guide.working("looking for the board")
-            await _board_in(visit, await still(camera, visit.clock), "camera")
+            await _board_in(visit, await still(camera, visit.clock), "camera", lying=True)
             await self._lens(visit, camera)
 
     async def _print(self, visit: Visit) -> None:
@@ -208,7 +208,7 @@ class CameraStep(Step):
         coded = cv2.imencode(".png", picture)[1].tobytes()
         # Named after its content: a photograph that is taken once more does not replace one that going back restores.
         name = f"{hashlib.sha256(coded).hexdigest()[:16]}.png"
-        if (view := await _board_in(visit, picture, name)) is None:
+        if (view := await _board_in(visit, picture, name, lying=False)) is None:
             return True
         (folder / name).write_bytes(coded)
         visit.keep("camera", f"{VIEW}{index:02d}", name, "photograph of the board held in hand")
@@ -216,17 +216,18 @@ class CameraStep(Step):
         return True
 
 
-async def _board_in(visit: Visit, picture: Gray, name: str) -> BoardView | None:
+async def _board_in(visit: Visit, picture: Gray, name: str, *, lying: bool) -> BoardView | None:
     """The board in a picture; None, with a warning, where it is not seen.
 
-    Raises `NotAccepted` where the camera is mirrored or the print is another one than was described: both show at once.
+    Raises `NotAccepted` where the camera is mirrored or, by a board that is `lying` flat, the print is another one than
+    was described. A board in the hand may only look so.
     """
     try:
         return await asyncio.to_thread(find_board, picture, board_of(visit.notebook), name)
     except CalibrationError as error:
         if "mirrored" in error.what:
             raise NotAccepted(f"{error.what}.", MIRRORED) from None
-        if "another board" in error.what or "arranged" in error.what:
+        if lying and ("another board" in error.what or "arranged" in error.what):
             visit.save(visit.notebook.without(*PRINTED))
             raise NotAccepted(f"{error.what}.", OTHER_PRINT) from None
         visit.say(f"The board is not seen: {error.what}", picture=picture, tone="warning")

@@ -177,10 +177,13 @@ class TaughtFile:
             raise refusal(self.path, error, Notebook) from None
 
     def save(self, notebook: Notebook) -> None:
-        """Replace the whole file, safe against a loss of power. Raises `ConfigError`."""
+        """Replace the whole file, safe against a loss of power. Raises `ConfigError`, also if it is too large."""
+        text = notebook.model_dump_json(indent=1)
+        if len(text.encode()) > MAX_BYTES:
+            raise ConfigError(self.path, "", f"would be larger than {MAX_BYTES} bytes: an answer is too long")
         try:
             with replacing(self.path) as part, part.open("w", encoding="utf-8") as file:
-                file.write(notebook.model_dump_json(indent=1))
+                file.write(text)
                 sync(file)
             fsync_folder(self.path.absolute().parent)
         except OSError as error:
@@ -218,8 +221,9 @@ def rig_text(notebook: Notebook, rig_path: Path) -> str:
         table, _, name = field.rpartition(".")
         if (known := notebook.values.get(field)) is not None:
             tables[table] += [f"# {line}" for line in textwrap.wrap(known.comment().replace("\n", " "), 116)]
-        # TOML writes numbers, strings, lists and booleans as JSON does.
-        tables[table].append(f"{name} = {json.dumps(_rounded(value), ensure_ascii=False)}")
+        # TOML writes numbers, strings, lists and booleans as JSON does, but for one character.
+        text = json.dumps(_rounded(value), ensure_ascii=False).replace("\x7f", "\\u007f")
+        tables[table].append(f"{name} = {text}")
     for table in sorted(tables, key=lambda name: (name != "", name.split(".")[0] != "robot", name)):
         lines += ["", *([f"[{table}]"] if table else []), *tables[table]]
     return "\n".join(lines) + "\n"

@@ -272,6 +272,9 @@ def _camera_and_sheet(config: RigConfig) -> Iterator[Check]:
         yield unmeasured("camera settings", value, remedy)
     if camera.optics is None:
         yield unmeasured("lens", "not calibrated", "brushloop camera intrinsics makes camera.lens_file.")
+    elif (set_to := (camera.locked.width, camera.locked.height)) not in ((None, None), camera.optics.size_px):
+        value = "calibrated at {} x {} px".format(*camera.optics.size_px)
+        yield Check("lens", "contradicts", value, "{} x {} px".format(*set_to), "Calibrate it at camera.locked's size.")
     measure = _metres(board.square_mm) or "Measure ten squares of the print with calipers and divide by ten."
     yield within("square of the board", board.square_mm, 3.0, 60.0, "mm", measure)
     # Corners must be seen on all sides of the sheet.
@@ -304,9 +307,10 @@ def _places(config: RigConfig) -> Iterator[Check]:
         name: min(min(v - low, high - v) for end in both for v, (low, high) in zip(end, box_mm, strict=True))
         for name, both in ends.items()
     }
-    outermost = min(margins_mm, key=lambda name: margins_mm[name])
+    outside = [name for name, margin_mm in margins_mm.items() if margin_mm < 0.0]
     remedy = "Outside the box of limits: brushloop rig teach limits, or correct the place."
-    yield within(f"inside the box, {outermost}", margins_mm[outermost], 0.0, math.inf, "mm", remedy)
+    for name in outside or [min(margins_mm, key=lambda name: margins_mm[name])]:
+        yield within(f"inside the box, {name}", margins_mm[name], 0.0, math.inf, "mm", remedy)
     along = zip(*(end for both in ends.values() for end in both), strict=True)
     room_mm = max(max(min(v) - low, high - max(v)) for v, (low, high) in zip(along, box_mm, strict=True))
     remedy = "The box should enclose what was taught and little more: brushloop rig teach limits."

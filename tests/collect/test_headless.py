@@ -59,6 +59,18 @@ def test_a_signal_stops_the_process_and_the_same_command_goes_on(wired_lab: Lab)
     assert len({c.stroke.stroke_id for c in Recording(lab.session).captures()}) == 2
 
 
+def test_where_the_output_goes_away_the_step_ends_and_the_arm_parks(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    def closed(_engine: Engine) -> None:
+        wait_until(lambda: lab.rig.world.presses, "a press")
+        raise BrokenPipeError
+
+    monkeypatch.setattr(start, "show_progress", closed)
+    lab.write_protocol(repeats=10)
+    ran = lab.command()
+    assert (ran.returncode, ran.stdout) == (4, "")
+    assert ran.stderr.splitlines()[-1].startswith("brushloop: parked on request; the same command resumes from here")
+
+
 @pytest.mark.parametrize(
     ("number", "says"),
     [
