@@ -9,8 +9,8 @@ them, positional params, integer ids, no login.
 | 0x01 | uint32 | the maker's RPC client, always; this driver too |
 | 0x00 | uint16 | the maker's RTDE client |
 
-The end of a bare document is found by its brackets: parsing alone could not tell a reply that is cut off from one that
-is wrong.
+The end of a bare document is found by its brackets: parsing again and again until it succeeds would take quadratic time
+on a reply that comes in small pieces, and could not tell a reply that is cut off from one that is wrong.
 """
 
 from __future__ import annotations
@@ -131,9 +131,9 @@ MAX_DOCUMENT_BYTES = 1024 * 1024
 MAX_DEPTH = 64
 """No reply nests deeper than five; the parser must not run out of stack."""
 
-_TOKEN = re.compile(rb'"[^"\\]*(?:\\.[^"\\]*)*(?:"|\\?\Z)|[{}\[\]]', re.DOTALL)
-"""A string, which may not have arrived to its end, or a bracket."""
-_DEEPER = {b"{": 1, b"[": 1, b"}": -1, b"]": -1}
+_STRUCTURE = re.compile(rb'["{}\[\]]')
+_STRING_END = re.compile(rb'["\\]')
+_CLOSES = {ord("}"): ord("{"), ord("]"): ord("[")}
 
 
 class BareDecoder(_Decoder):
@@ -144,33 +144,54 @@ class BareDecoder(_Decoder):
 
     def __init__(self, device: str = "arcs", *, max_bytes: int = MAX_DOCUMENT_BYTES) -> None:
         super().__init__(device, max_bytes)
+        self._at = 0
+        self._open: list[int] = []
+        self._in_string = False
 
     def _next(self) -> bytes | None:
-        buffer = bytes(self._buffer).lstrip(b" \t\r\n")
-        if buffer and buffer[0] not in b"{[":
-            raise self._violation(f"expected JSON, got {buffer[:8]!r}")
-        end = self._end(buffer)
-        if (end or len(buffer)) > self._max_bytes:
+        if not self._open:
+            del self._buffer[: len(self._buffer) - len(self._buffer.lstrip(b" \t\r\n"))]
+            if self._buffer and self._buffer[0] not in b"{[":
+                raise self._violation(f"expected JSON, got {bytes(self._buffer[:8])!r}")
+        end = self._scan()
+        if (end or len(self._buffer)) > self._max_bytes:
             raise self._violation(f"document exceeds {self._max_bytes} bytes")
-        self._buffer[:] = buffer[end or 0 :]
         if end is None:
             return None
+        document = bytes(self._buffer[:end])
+        del self._buffer[:end]
+        self._at = 0
         try:
-            json.loads(buffer[:end])
+            json.loads(document)
         except (ValueError, RecursionError):
-            raise self._violation(f"not JSON: {buffer[:40]!r}") from None
-        return buffer[:end]
+            raise self._violation(f"not JSON: {document[:40]!r}") from None
+        return document
 
-    def _end(self, buffer: bytes) -> int | None:
-        """Where the first document ends; None if its end has not arrived."""
-        depth = 0
-        for token in _TOKEN.finditer(buffer):
-            depth += _DEEPER.get(token[0], 0)
-            if depth > MAX_DEPTH:
-                raise self._violation(f"nested deeper than {MAX_DEPTH}")
-            if depth == 0:
-                return token.end()
-        return None
+    def _scan(self) -> int | None:
+        """Continue where the last piece ended; return the end of the document, or None if it has not arrived."""
+        buffer = self._buffer
+        while True:
+            match = (_STRING_END if self._in_string else _STRUCTURE).search(buffer, self._at)
+            if match is None:
+                self._at = len(buffer)
+                return None
+            byte, self._at = buffer[match.start()], match.end()
+            if byte == ord("\\"):
+                if self._at == len(buffer):  # the escaped character has not arrived: scan again from here
+                    self._at -= 1
+                    return None
+                self._at += 1
+            elif byte == ord('"'):
+                self._in_string = not self._in_string
+            elif byte in _CLOSES:
+                if self._open.pop() != _CLOSES[byte]:
+                    raise self._violation("brackets do not match")
+                if not self._open:
+                    return self._at
+            else:
+                self._open.append(byte)
+                if len(self._open) > MAX_DEPTH:
+                    raise self._violation(f"nested deeper than {MAX_DEPTH}")
 
 
 def numbers(op: str, values: object, count: int = 6) -> list[float]:

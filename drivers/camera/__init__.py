@@ -29,6 +29,7 @@ from brushloop.drivers.camera.source import (
     Picture,
     found_settings,
     gray_levels,
+    is_patched,
     is_repeated,
     open_source,
 )
@@ -298,7 +299,7 @@ class _Grabber:
             raise
 
     def _read_all(self, source: JpegStream | Capture, opening_ns: int) -> None:
-        """Read until the source ends; late and repeated frames are skipped."""
+        """Read until the source ends; late, repeated and patched frames are skipped."""
         self.settings, self.simulated = source.settings, source.simulated
         latency_ns = round(self._table.latency_ms * 1e6)
         backlog, before = Backlog(latency_ns), None
@@ -310,9 +311,13 @@ class _Grabber:
             # The first frame was read to learn the format, and waited until the capture was open.
             exposed_ns = (opening_ns if before is None else arrival_ns) - latency_ns
             late, repeated = backlog.is_late(arrival_ns), is_repeated(picture, before)
+            torn = source.patches and not repeated and is_patched(picture, before)
             before = picture
             if source.live and (late or repeated):
                 self._skip(FrameFault.LATE if late else FrameFault.FROZEN)
+                continue
+            if torn:
+                self._skip(FrameFault.TORN)
                 continue
             with self._condition:
                 seq = self._newest.stamp.seq + 1 if self._newest is not None else 0

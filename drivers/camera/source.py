@@ -93,10 +93,12 @@ class JpegStream:
     """
 
     live = True
+    patches = False
 
     def __init__(self, table: CameraTable) -> None:
         """Raises `OSError` where nothing answers, and ValueError for an answer of another kind."""
         self.settings: dict[str, float] = {}
+        self._timeout_s = table.timeout_s
         opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
         try:
             self._response = opener.open(table.source, timeout=table.timeout_s)
@@ -136,16 +138,22 @@ class JpegStream:
         length = int(http.client.parse_headers(self._response)["Content-Length"] or 0)
         if not 0 < length <= MAX_JPEG_BYTES:
             raise ValueError(f"a part of {length} bytes")
-        jpeg = self._response.read(length)
-        if len(jpeg) < length:
-            raise ConnectionError("the stream ended")
-        return jpeg
+        jpeg, until_s = bytearray(), time.monotonic() + self._timeout_s
+        while len(jpeg) < length:
+            piece = self._response.read1(length - len(jpeg))
+            if not piece:
+                raise ConnectionError("the stream ended")
+            if time.monotonic() > until_s:
+                raise TimeoutError("a picture takes longer than the timeout")
+            jpeg += piece
+        return bytes(jpeg)
 
 
 class Capture:
     """A `cv2.VideoCapture` on a device, a stream or a file, its settings locked and read back.
 
-    `live` is False for a file; `settings` are those read back, by name; `simulated` is True for recordings.
+    `live` is False for a file; `settings` are those read back, by name; `simulated` is True for recordings; `patches`
+    where what is missing of a JPEG is filled from the picture before.
     """
 
     def __init__(self, table: CameraTable) -> None:
@@ -170,6 +178,8 @@ class Capture:
         try:
             if not self._capture.isOpened():
                 raise ConnectionLost(DEVICE, "open", f"cannot open {source}")
+            fourcc = int(self._capture.get(cv2.CAP_PROP_FOURCC))
+            self.patches = not is_device and fourcc == cv2.VideoWriter.fourcc(*"MJPG")
             self.settings = self._lock(table.locked) if is_device else {}
         except BaseException:
             self.release()
@@ -236,13 +246,14 @@ def open_source(table: CameraTable) -> JpegStream | Capture:
             f"{', '.join(locked)} cannot be set through {table.source}",
             remedy="Lock them in the camera's own set-up and leave them out of the configuration.",
         )
-    if table.source.startswith(("http://", "https://")):
+    host = table.source.partition("://")[2].partition("/")[0]
+    if table.source.startswith(("http://", "https://")) and "@" not in host:  # FFmpeg logs in
         try:
             return JpegStream(table)
         except OSError as error:
             raise ConnectionLost(DEVICE, "open", f"cannot open {table.source}: {error}") from None
         except (ValueError, http.client.HTTPException):
-            pass  # not pushed JPEGs, or a password in the address: FFmpeg knows more kinds of streams
+            pass  # not pushed JPEGs: FFmpeg knows more kinds of streams
     return Capture(table)
 
 
@@ -250,6 +261,8 @@ def open_source(table: CameraTable) -> JpegStream | Capture:
 
 Picture: TypeAlias = "bytes | NDArray[np.uint8]"
 """A JPEG, or an (h, w) or (h, w, 3) BGR image."""
+PATCH_PX, WHITE = 16, 254
+"""Rows at the end of a picture that are compared, and the level from which all of them count as glare."""
 SCAN = b"\xff\xda"
 """Begins the picture in a JPEG, after the headers."""
 
@@ -269,8 +282,21 @@ def gray_levels(picture: Picture) -> NDArray[np.uint8] | None:
         with Image.open(io.BytesIO(picture), formats=("JPEG",)) as image:
             image.draft("L", image.size)
             return np.asarray(image.convert("L"))
-    except (OSError, SyntaxError, ValueError):
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
         return None
+
+
+def is_patched(picture: Picture, before: Picture | None) -> bool:
+    """Whether a decoded picture ends, to the bit, as the one before it does: FFmpeg fills a cut JPEG so.
+
+    A white end is not compared: glare has no noise.
+    """
+    import numpy as np
+
+    if isinstance(picture, bytes) or before is None or isinstance(before, bytes) or picture.shape != before.shape:
+        return False
+    end = picture[-PATCH_PX:]
+    return int(end.min()) < WHITE and np.array_equal(end, before[-PATCH_PX:])
 
 
 def is_repeated(picture: Picture, before: Picture | None) -> bool:

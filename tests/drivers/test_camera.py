@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from brushloop.drivers import camera as camera_module
 from brushloop.drivers.camera import Backlog, CameraTable, FrameFault, Locked, OpenCvCamera, looked_at
-from brushloop.drivers.camera.source import JpegStream, is_repeated, open_source
+from brushloop.drivers.camera.source import Capture, JpegStream, gray_levels, is_patched, is_repeated, open_source
 from brushloop.drivers.devices import Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout
 from brushloop.drivers.host import HostClock
@@ -40,7 +40,7 @@ def jpeg_of(image: np.ndarray) -> bytes:
 class Feed:
     """A source whose pictures a test hands over, and its clock: a picture comes a tenth of a second after the other."""
 
-    live, simulated = True, False
+    live, simulated, patches = True, False, False
     settings: ClassVar[dict[str, float]] = {}
 
     def __init__(self) -> None:
@@ -415,3 +415,36 @@ async def test_settings_are_locked_read_back_and_reported(monkeypatch: pytest.Mo
     await camera.close()
     with pytest.raises(DeviceError, match="exposure = 156 was asked for, but 160 is read back"):
         await camera_at("0", locked=Locked(exposure=156.0)).connect()
+
+
+async def test_a_picture_whose_end_is_to_the_bit_that_of_the_one_before_is_torn(camera: OpenCvCamera, feed: Feed):
+    """FFmpeg fills what is missing of a JPEG with the last whole picture, so that it looks sound."""
+    first, second, third = page(), page(), page()
+    patched, again = second.copy(), third.copy()
+    patched[300:], again[400:] = first[300:], first[400:]
+    assert [is_patched(image, before) for image, before in ((patched, first), (again, patched), (third, again))] == [
+        True,
+        True,
+        False,
+    ]
+    feed.patches = True
+    waiting = await asked(camera, feed)
+    feed.show(first, patched)
+    assert np.array_equal((await waiting).image, first)
+    waiting = await asked(camera, feed)
+    feed.show(patched, again, third)
+    assert np.array_equal((await waiting).image, third)
+
+
+def test_a_jpeg_that_says_that_it_is_huge_is_torn() -> None:
+    jpeg = bytearray(jpeg_of(page()))
+    at = jpeg.index(b"\xff\xc0") + 5  # height and width in the frame's header
+    jpeg[at : at + 4] = (20_000).to_bytes(2, "big") * 2
+    assert gray_levels(bytes(jpeg)) is None
+
+
+def test_an_address_with_a_password_is_left_to_ffmpeg(monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr(Capture, "__init__", lambda _self, table: opened.append(table.source))
+    open_source(CameraTable(kind="opencv", source="http://user:secret@camera:8080/stream"))
+    assert opened == ["http://user:secret@camera:8080/stream"]

@@ -343,7 +343,7 @@ def test_declared_lengths_and_endless_messages_take_bounded_memory(new: Callable
     tracemalloc.start()
     try:
         assert decoded(feed, [head, *[more] * 2000])[1]
-        assert tracemalloc.get_traced_memory()[1] < 10_000_000
+        assert tracemalloc.get_traced_memory()[1] < 4_000_000
     finally:
         tracemalloc.stop()
     whole = b"[" * MAX_DEPTH + b"]" * MAX_DEPTH

@@ -230,6 +230,8 @@ async def test_where_both_ways_are_silent_the_pose_goes_stale(rtde: RtdeServer, 
     with pytest.raises(Stale):
         arm.latest()
     cabinet.faults.clear()
+    await asyncio.sleep(1.5)
+    arm.latest()  # fresh again by itself
 
 
 async def test_a_pose_that_is_none_ends_the_stream_not_the_arm(
