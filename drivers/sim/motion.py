@@ -107,6 +107,8 @@ class Rest:
 
     at_s: float
     pose: Pose
+    left_s: float
+    """When the arm had left the rest before."""
 
 
 def timetable(pieces: Sequence[Piece], start: Knot) -> list[Knot] | None:
@@ -156,6 +158,8 @@ class MotionQueue:
         self._solved: tuple[Pose, Joints] | None = None
         """The last pose whose joints were found, and the joints."""
         self._rest = home
+        self._left_s = -1.0
+        """When the arm left the last rest, or came to it."""
         self._on_path = on_path
         self._next_id = 0
 
@@ -210,7 +214,8 @@ class MotionQueue:
             knot = self._knots[0]
             self._retire(knot.along)
             if knot.speed == 0.0:
-                self.rests.append(Rest(knot.at_s, self._tip(knot)))
+                self.rests.append(Rest(knot.at_s, self._tip(knot), self._left_s))
+                self._left_s = knot.at_s
         self._retire(self._at(now_s).along)
 
     def stop(self, acc_mm_s2: float, acc_rad_s2: float, now_s: float) -> None:
@@ -328,6 +333,8 @@ class MotionQueue:
         """Travel the pieces from the rest in which the timetable ends."""
         rest = self._knots[-1]
         start = Knot(max(rest.at_s, now_s), rest.along, 0.0)
+        if len(self._knots) == 1:
+            self._left_s = start.at_s
         self._knots[-1:] = timetable(pieces, start) or [rest]
 
     def _rounded(self, piece: Piece, along: float) -> list[Piece] | None:
