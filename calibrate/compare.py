@@ -22,7 +22,7 @@ from brushloop.calibrate import MM_PER_PX
 from brushloop.calibrate.stroke.preprocess import Prepared
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.outline import Outline
-from brushloop.model.similarity import csim, inked_window, ssim
+from brushloop.model.similarity import csim_and_ssim, inked_window
 from brushloop.model.strokes import StrokeModel
 from brushloop.sessions.records import Header
 
@@ -35,6 +35,8 @@ FINE = 4
 """Oversampling: strokes are moved on a raster finer by this factor, near their own 20 px/mm, then area-averaged."""
 BEST_SHIFT_PX = 6
 """Most that a size-normalised image is shifted each way."""
+AT_ONCE = 3
+"""Images that are compared at once; for the arrays of more, the system would give the memory anew each time."""
 _REACH = range(-BEST_SHIFT_PX, BEST_SHIFT_PX + 1)
 SHIFTS = np.array(sorted(itertools.product(_REACH, _REACH), key=lambda shift: shift[0] ** 2 + shift[1] ** 2))
 """(n, 2) rows and columns of every shift, the smallest first."""
@@ -193,34 +195,45 @@ def to_pixels(image: Image) -> Pixels:
 
 
 def similarity(
-    captured: NDArray[Any], other: NDArray[Any], alignment: Alignment, polarity: Polarity = Polarity.INK
-) -> tuple[float, float]:
-    """(CSIM, SSIM) of two (h, w) images of one alignment; if size-normalised, the other is shifted to best overlap.
+    captured: NDArray[Any], others: NDArray[Any], alignment: Alignment, polarity: Polarity = Polarity.INK
+) -> NDArray[np.float64]:
+    """(n, 2) CSIM and SSIM of an image (h, w) and each of n >= 1 others (n, h, w) of one alignment.
 
-    Raises ValueError for a blank image.
+    NaN where one is blank. If size-normalised, the others are shifted to best overlap.
     """
-    if not captured.any() or not other.any():
-        raise ValueError("a blank image")
+    few = (others[k : k + AT_ONCE] for k in range(0, len(others), AT_ONCE))
+    return np.concatenate([_similarity(captured, images, alignment, polarity) for images in few])
+
+
+def _similarity(
+    captured: NDArray[Any], others: NDArray[Any], alignment: Alignment, polarity: Polarity
+) -> NDArray[np.float64]:
     if alignment is Alignment.SIZE_NORMALISED:
-        other = best_shift(other, captured)
+        others = best_shift(others, captured)
+    blank = ~(others.any(axis=(1, 2)) & captured.any())
     if polarity is Polarity.PAPER:
-        captured, other = 1.0 - captured, 1.0 - other
-    return csim(captured, other), ssim(captured, other)
+        captured, others = 1.0 - captured, 1.0 - others
+    scores = csim_and_ssim(captured, others)
+    scores[blank] = np.nan
+    return scores
 
 
 def best_shift(moving: NDArray[Any], fixed: NDArray[Any]) -> NDArray[Any]:
-    """Shift `moving` by at most 6 px each way so that its overlap with `fixed` is largest, and of equals the least.
+    """Shift each of (n, h, w) by at most 6 px each way so that its overlap with (h, w) is largest.
 
-    Overlaps are those of 256 levels, in whole numbers, so that ties are always broken in the same way.
+    Of equally good shifts the least is taken. Overlaps are those of 256 levels, in whole numbers, so that ties are
+    always broken in the same way.
     """
     import scipy.fft  # slow to import, and a collecting rig compares nothing by shift
 
-    reach, window = BEST_SHIFT_PX, inked_window(moving, fixed, BEST_SHIFT_PX)
-    a, b = (np.rint(255.0 * image[window]) for image in (fixed, moving))
+    reach, window = BEST_SHIFT_PX, inked_window(fixed, moving, BEST_SHIFT_PX)
+    a, b = (np.rint(255.0 * image[..., *window]) for image in (fixed, moving))
     size = [scipy.fft.next_fast_len(side + reach, real=True) for side in a.shape]
     overlap = scipy.fft.irfft2(np.conj(scipy.fft.rfft2(a, size)) * scipy.fft.rfft2(b, size), size)
-    row, column = SHIFTS[np.rint(overlap[tuple(SHIFTS.T)]).argmax()]
-    return np.pad(moving, reach)[reach + row :, reach + column :][: moving.shape[0], : moving.shape[1]]
+    shifts = SHIFTS[np.rint(overlap[:, *SHIFTS.T]).argmax(axis=1)]
+    padded, (height, width) = np.pad(moving, ((0, 0), (reach, reach), (reach, reach))), fixed.shape
+    corners = zip(padded, (shifts + reach).tolist(), strict=True)
+    return np.stack([image[row : row + height, column : column + width] for image, (row, column) in corners])
 
 
 Triple = tuple[float, float, float]

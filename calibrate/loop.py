@@ -238,8 +238,7 @@ def score_pairs(pairs: Sequence[Pair], originals: Iterable[Press]) -> Scores:
     scores = Scores(labelled, (AGAIN, ANOTHER, SIMULATED))
     for pair, values in zip(pairs, scores.values, strict=True):
         others = [press.images for press in alike[pair.original.condition] if press is not pair.original]
-        compared = [pair.again.images], others, [pair.simulated]
-        values[:] = [similarities(pair.original.images, images) for images in compared]
+        values[:] = similarities(pair.original.images, ([pair.again.images], others, [pair.simulated]))
     return scores
 
 

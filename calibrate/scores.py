@@ -19,7 +19,7 @@ from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.compare import KEYS, Alignment, Key, Pixels, Tone, similarity
 from brushloop.calibrate.files import replacing
 from brushloop.calibrate.presses import Press
-from brushloop.calibrate.stats import CEILING, Cell, Floats, Integers, Summary, average, summarise
+from brushloop.calibrate.stats import CEILING, Cell, Floats, Integers, Summary, summarise
 from brushloop.sessions.disk import csv_text
 from brushloop.sessions.records import Condition
 
@@ -135,8 +135,10 @@ def statistics(
     """
 
     def summary(values: Floats, top: Floats | None) -> Summary | None:
-        summary = average(values, cells) if model == CEILING else summarise(values, cells)
-        below = None if top is None else average(top - values, cells)
+        summary = summarise(values, cells)
+        if summary is not None and model == CEILING:
+            return replace(summary, max=None, min=None, median=None)
+        below = None if top is None else summarise(top - values, cells)
         if summary is None or below is None:
             return summary
         return replace(summary, below_ceiling=below.avg, below_interval=below.avg_interval)
@@ -147,16 +149,17 @@ def statistics(
             yield Stat(model=model, alignment=alignment, tone=tone, cell=cell, csim=csim, ssim=ssim)
 
 
-def similarities(press: Pixels, others: Sequence[Pixels]) -> Floats:
-    """(KEYS, 2) mean CSIM and SSIM of a press, (KEYS, 128, 128), and others of the same shape.
+def similarities(press: Pixels, compared: Sequence[Sequence[Pixels]]) -> Floats:
+    """(comparisons, KEYS, 2) mean CSIM and SSIM of a press, (KEYS, 128, 128), and the images of each comparison.
 
-    NaN where there is no other, or it is blank.
+    NaN where a comparison has no image, or a blank one.
     """
-    ink = press / 255.0
-
-    def of_key(k: int, other: Pixels) -> tuple[float, float]:
-        return similarity(ink[k], other[k] / 255.0, KEYS[k][0]) if other[k].any() else (math.nan, math.nan)
-
-    if not len(others):
-        return np.full((len(KEYS), 2), np.nan)
-    return np.mean([[of_key(k, other) for k in range(len(KEYS))] for other in others], axis=0)
+    means = np.full((len(compared), len(KEYS), 2), np.nan)
+    images = [image for of_one in compared for image in of_one]
+    ends = np.cumsum([len(of_one) for of_one in compared])
+    for k, (alignment, _) in enumerate(KEYS) if images else ():
+        others = np.stack([image[k] for image in images]) / 255.0
+        each = np.split(similarity(press[k] / 255.0, others, alignment), ends[:-1])
+        for mean, scores in zip(means, each, strict=True):
+            mean[k] = scores.mean(axis=0) if len(scores) else np.nan
+    return means

@@ -13,7 +13,6 @@ has strays of its own.
 
 from __future__ import annotations
 
-import functools
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -31,9 +30,8 @@ Integers = NDArray[np.int64]
 Interval = tuple[float, float]
 """Ends of a 95 % interval."""
 SEED = 0
-MAX_DRAWS, MIN_DRAWS, MAX_VALUES_DRAWN = 2000, 200, 4_000_000
-"""Limits on the draws of a bootstrap: the most and the fewest, and the most values in all draws together."""
-MIN_CELLS, MIN_PRESSES, MANY_PRESSES = 3, 3, 5
+MIN_GROUPS = 3
+"""Fewest groups whose differences tell an interval."""
 FLIPS = 10_000
 """Number of random sign flips; where no more than that exist (up to 13 pairs), each is tried once."""
 CEILING = "ceiling"
@@ -92,7 +90,6 @@ class Summary:
     max: float | None = None
     min: float | None = None
     median: float | None = None
-    median_interval: Interval | None = None
     below_ceiling: float | None = None
     """Points below the ceiling; None where no cell was pressed twice."""
     below_interval: Interval | None = None
@@ -103,27 +100,21 @@ class Summary:
         return self.max, self.min, self.avg
 
 
-def summarise(values: Floats, strata: Integers | None = None) -> Summary | None:
-    """Summarise (n,) scores without NaN; None if none is left. Intervals need strata, (n,) numbers.
+def summarise(values: Floats, cells: Integers | None = None) -> Summary | None:
+    """Summarise (n,) scores without NaN; None if none is left. An interval needs the numbers of their cells, (n,).
 
-    Strokes are resampled with replacement within their stratum (a cell of a session), so that the share of each cell
-    is preserved. With fewer than five presses in a typical cell such an interval would be too narrow, so whole cells
-    are resampled. A single cell with fewer than three presses gets no interval.
+    The interval is that of whole cells drawn anew, since the error of a model is common to the presses of a cell. For
+    fewer than three cells it holds for these cells only: then single presses are drawn.
     """
     known = np.isfinite(values)
     values = values[known]
     if not len(values):
         return None
-    avg_interval, median_interval = None, None
-    if strata is not None:
-        strata = strata[known]
-        _, counts = np.unique(strata, return_counts=True)
-        by_cell = len(counts) >= MIN_CELLS and float(np.median(counts)) < MANY_PRESSES
-        if by_cell or len(values) >= MIN_PRESSES * len(counts):
-            draws = _cell_draws(values, strata) if by_cell else _draws(values, strata)
-            avg_interval, median_interval = map(_interval, draws)
+    interval = None
+    if cells is not None:
+        interval = interval_over_groups(values, cells[known]) or interval_over_groups(values, np.arange(len(values)))
     avg, high, low, median = (_round(value) for value in (values.mean(), values.max(), values.min(), np.median(values)))
-    return Summary(len(values), avg, avg_interval, high, low, median, median_interval)
+    return Summary(len(values), avg, interval, high, low, median)
 
 
 def interval_over_groups(values: Floats, groups: Integers) -> Interval | None:
@@ -133,49 +124,11 @@ def interval_over_groups(values: Floats, groups: Integers) -> Interval | None:
     """
     _, group = np.unique(groups, return_inverse=True)
     mean, many = float(values.mean()), int(group.max()) + 1
-    if many < MIN_CELLS:
+    if many < MIN_GROUPS:
         return None
     off = np.bincount(group, values - mean)
     half = float(student_95(many - 1) * np.sqrt(many / (many - 1) * (off**2).sum()) / len(values))
-    return mean - half, mean + half
-
-
-def _draws(values: Floats, strata: Integers) -> tuple[Floats, Floats]:
-    """Means and medians of bootstrap samples."""
-    order = np.argsort(strata, kind="stable")
-    ordered = values[order]
-    _, first, inverse, counts = np.unique(strata[order], return_index=True, return_inverse=True, return_counts=True)
-    drawn = (np.random.default_rng(SEED).random((_draw_count(values), len(values))) * counts[inverse]).astype(np.int64)
-    sampled = ordered[first[inverse] + drawn]
-    return sampled.mean(axis=1), np.median(sampled, axis=1)
-
-
-def _cell_draws(values: Floats, strata: Integers) -> tuple[Floats, Floats]:
-    """The same, resampling whole strata: each value counts as often as its stratum was drawn."""
-    order = np.argsort(values, kind="stable")
-    ordered = values[order]
-    _, inverse = np.unique(strata[order], return_inverse=True)
-    many = int(inverse.max()) + 1
-    times = _cells_drawn(many, _draw_count(values))[:, inverse]
-    total = times.cumsum(axis=1)
-    half = 0.5 * total[:, -1:]
-    middle = 0.5 * (ordered[(total >= half).argmax(axis=1)] + ordered[(total > half).argmax(axis=1)])
-    return (times @ ordered) / total[:, -1], middle
-
-
-@functools.lru_cache(maxsize=8)
-def _cells_drawn(many: int, count: int) -> Integers:
-    """(count, many) how often each of so many strata is in each sample; the same for every model of a report."""
-    return np.random.default_rng(SEED).multinomial(many, np.full(many, 1.0 / many), count)
-
-
-def _draw_count(values: Floats) -> int:
-    return min(MAX_DRAWS, max(MIN_DRAWS, MAX_VALUES_DRAWN // len(values)))
-
-
-def _interval(draws: Floats) -> Interval:
-    low, high = np.quantile(draws, [0.025, 0.975])
-    return _round(low), _round(high)
+    return _round(mean - half), _round(mean + half)
 
 
 def _round(value: float) -> float:
@@ -214,22 +167,6 @@ def ceiling_values(pairs: Floats, cells: Integers) -> Floats:
         share = 2.0 * (len(at) - 1) / (len(at) - 2) if len(at) > 2 else 0.0
         values[at] = 100.0 - (100.0 - mean - share * (pairs[at] - mean)) / np.sqrt(2.0)
     return values
-
-
-def average(values: Floats, cells: Integers) -> Summary | None:
-    """The average of `ceiling_values`, or of how much more they are than a model's scores; None without a value.
-
-    The interval resamples whole cells: the error of a model is common to the presses of a cell. For fewer than three
-    cells it holds for these cells only, and resamples their presses.
-    """
-    known = np.isfinite(values)
-    values, cells = values[known], cells[known]
-    if not len(values):
-        return None
-    if (interval := interval_over_groups(values, cells)) is not None:
-        return Summary(len(values), _round(values.mean()), (_round(interval[0]), _round(interval[1])))
-    summary = summarise(values, cells)
-    return summary and Summary(summary.n, summary.avg, summary.avg_interval)
 
 
 def is_near(below: float, interval: Interval | None, points: float = NEAR_POINTS) -> bool | None:

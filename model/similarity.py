@@ -33,6 +33,36 @@ def csim(a: Image, b: Image) -> float:
     return float((x * y).sum()) / norm
 
 
+def ssim(a: Image, b: Image) -> float:
+    """Mean structural similarity of two (h, w) images with values in [0, 1], as scikit-image's with `SSIM_SETTINGS`."""
+    _check(a, b)
+    return float(csim_and_ssim(a, b[None])[0, 1])
+
+
+def csim_and_ssim(image: Image, others: Image) -> Floats:
+    """(n, 2) CSIM and SSIM of an image (h, w) and each of n >= 1 others (n, h, w); CSIM is NaN where one is blank.
+
+    SSIM is computed around the ink only: where both windows are blank it is 1.
+    """
+    margin, (height, width) = SSIM_RADIUS, image.shape
+    window = inked_window(image, others, 2 * margin)
+    x, y = (np.asarray(part, np.float64) for part in (image[window], others[:, *window]))
+    xx, yy, xy = x * x, y * y, x * y
+    norm = np.sqrt(xx.sum() * yy.sum(axis=(1, 2)))
+    cosine = np.divide(xy.sum(axis=(1, 2)), norm, out=np.full(len(others), np.nan), where=norm > 0.0)
+
+    def blurred(stack: Floats) -> Floats:
+        # Rows of all images below each other: what one image's blur takes from the next is in the margin.
+        tall = cv2.GaussianBlur(stack.reshape(-1, stack.shape[-1]), (2 * margin + 1, 2 * margin + 1), SSIM_SIGMA)
+        return np.asarray(tall, np.float64).reshape(stack.shape)[..., margin:-margin, margin:-margin]
+
+    ux, uy, uxx, uyy, uxy = map(blurred, (x, y, xx, yy, xy))
+    means, squares = ux * uy, ux * ux + uy * uy
+    values = (2.0 * means + C1) * (2.0 * (uxy - means) + C2) / ((squares + C1) * (uxx + uyy - squares + C2))
+    places = (height - 2 * margin) * (width - 2 * margin)
+    return np.column_stack([cosine, 1.0 - (1.0 - values).sum(axis=(1, 2)) / places])
+
+
 def binary_scores(seen: NDArray[np.bool_], truth: NDArray[np.bool_]) -> Floats:
     """(n, 2) CSIM and IoU of n pairs of (h, w) images of ink or paper; 0 where either is blank."""
     seen, truth = seen.reshape(len(seen), -1), truth.reshape(len(truth), -1)
@@ -42,27 +72,12 @@ def binary_scores(seen: NDArray[np.bool_], truth: NDArray[np.bool_]) -> Floats:
     return np.column_stack([both / np.maximum(norm, 1.0), both / np.maximum(union, 1.0)])
 
 
-def ssim(a: Image, b: Image) -> float:
-    """Mean structural similarity of two (h, w) images with values in [0, 1], as scikit-image's with `SSIM_SETTINGS`.
+def inked_window(image: Image, others: Image, margin: int) -> tuple[slice, slice]:
+    """The rows and columns where (h, w) or any of (..., h, w) has ink, and `margin` px more on each side.
 
-    It is computed around the ink only: where both windows are blank it is 1.
+    All rows and columns of blank images.
     """
-    _check(a, b)
-    margin, places = SSIM_RADIUS, (a.shape[0] - 2 * SSIM_RADIUS) * (a.shape[1] - 2 * SSIM_RADIUS)
-    window = inked_window(a, b, 2 * margin)
-    x, y = a[window].astype(np.float64), b[window].astype(np.float64)
-    ux, uy, uxx, uyy, uxy = (
-        cv2.GaussianBlur(image, (2 * margin + 1, 2 * margin + 1), SSIM_SIGMA)[margin:-margin, margin:-margin]
-        for image in (x, y, x * x, y * y, x * y)
-    )
-    means, squares = ux * uy, ux * ux + uy * uy
-    values = (2.0 * means + C1) * (2.0 * (uxy - means) + C2) / ((squares + C1) * (uxx + uyy - squares + C2))
-    return float(1.0 - (values.size - values.sum()) / places)
-
-
-def inked_window(a: Image, b: Image, margin: int) -> tuple[slice, slice]:
-    """The rows and columns where either image has ink, and `margin` px more on each side; all of blank images."""
-    ink = (a != 0) | (b != 0)
+    ink = np.logical_or(image != 0, others != 0).reshape(-1, *image.shape).any(axis=0)
     if not ink.any():
         return slice(None), slice(None)
     inked = (np.flatnonzero(ink.any(axis=axis)) for axis in (1, 0))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from brushloop.calibrate.compare import Alignment, similarity
 from brushloop.calibrate.fit.captures import Cell, Floats, Grid, Pressed, by_cell
 from brushloop.calibrate.fit.descent import Prior, fit_presses
-from brushloop.calibrate.stats import CEILING, Summary, average, ceiling_values, pair_means
+from brushloop.calibrate.stats import CEILING, Summary, ceiling_values, pair_means, summarise
 from brushloop.calibrate.work import Arrays, Scheduler, Store, key_of, threads
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.fitted import FittedPress
@@ -142,12 +142,15 @@ def held_out_scores(predicted: Sequence[Predicted], models: Sequence[str]) -> li
     """The ceiling, then these models in this order; one without a score is left out."""
     values: dict[str, list[Floats]] = {name: [] for name in (CEILING, *models)}
     for presses, images in predicted:
-        inks = [_binary(press.ink) for press in presses]
-        pairs = pair_means(len(inks), lambda k, others, inks=inks: np.array([_score(inks[k], inks[j]) for j in others]))
-        values[CEILING].append(pairs)
+        inks = np.array([_binary(press.ink) for press in presses])
+
+        def score(k: int, others: list[int], inks: Floats = inks) -> Floats:
+            return similarity(inks[k], inks[others], Alignment.MM)
+
+        values[CEILING].append(pair_means(len(inks), score))
         for name in models:
             drawn = _binary(images[name]) if name in images else np.zeros_like(inks[0])
-            values[name].append(np.array([_score(ink, drawn) for ink in inks]))
+            values[name].append(similarity(drawn, inks, Alignment.MM))
     if not predicted:
         return []
     cells = np.repeat(np.arange(len(predicted)), [len(presses) for presses, _ in predicted])
@@ -157,7 +160,7 @@ def held_out_scores(predicted: Sequence[Predicted], models: Sequence[str]) -> li
     for name, scores in (percent | {CEILING: ceiling}).items():
         known = np.isfinite(scores[:, 0])
         if known.any():
-            below = average(ceiling[:, 0] - scores[:, 0], cells) if name != CEILING else None
+            below = summarise(ceiling[:, 0] - scores[:, 0], cells) if name != CEILING else None
             csim, ssim = scores[known].mean(axis=0).tolist()
             rows.append(HeldOut(name, csim, ssim, int(known.sum()), below))
     return rows
@@ -213,8 +216,3 @@ def refit_bezier(strokes: Sequence[Pressed], grid: Grid) -> Draw | None:
 def _binary(image: Images) -> Floats:
     """Ink or paper as 1 or 0."""
     return np.where(image > 0.5, 1.0, 0.0)
-
-
-def _score(captured: Floats, other: Floats) -> tuple[float, float]:
-    """CSIM and SSIM; NaN where an image is blank."""
-    return similarity(captured, other, Alignment.MM) if captured.any() and other.any() else (np.nan, np.nan)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brushloop.calibrate.commands import ValidateRequest
 from brushloop.calibrate.compare import (
@@ -194,8 +195,7 @@ ScoreJob = tuple[Pixels, tuple[Sequence[Pixels], ...]]
 
 def score_job(job: ScoreJob) -> Arrays:
     """`values` (comparisons, KEYS, 2): CSIM and SSIM, NaN where there is nothing to compare with."""
-    press, compared = job
-    return {"values": np.array([similarities(press, images) for images in compared])}
+    return {"values": similarities(*job)}
 
 
 def _score(
@@ -241,7 +241,7 @@ def _similarity_by_strokes(
     fitted = [[pressed(press) for press in few] for few, _ in trials]
     jobs = [Refit(few, grid, float(brush.radius_mm), float(brush.length_mm)) for few in fitted]
     fits = refits(jobs, session.store, scheduler, "fits from few strokes")
-    values: dict[tuple[int, str], list[tuple[float, float]]] = {}
+    values: dict[tuple[int, str], list[NDArray[np.float64]]] = {}
     for (_, others), few, fit in zip(trials, fitted, fits, strict=True):
         for label, model in (("CCD-BSM", fit.outline), ("Bézier", refit_bezier(few, grid))):
             if model is not None:
@@ -251,13 +251,13 @@ def _similarity_by_strokes(
         yield Step(name, count, label, csim, ssim, len(of_model))
 
 
-def _on_others(outline: Draw, presses: Sequence[Press], view: Field) -> Iterator[tuple[float, float]]:
+def _on_others(outline: Draw, presses: Sequence[Press], view: Field) -> Iterator[NDArray[np.float64]]:
     """Yield CSIM and SSIM in millimetres, binary, of each press."""
     conditions = {press.condition for press in presses}
     images = {at: images_of(outline(at.depth_mm, at.tilt_deg), 0.0, view) for at in conditions}
     for press in presses:
         seen, drawn = (stack[MM_BINARY] / 255.0 for stack in (press.images, images[press.condition]))
-        yield similarity(seen, drawn, Alignment.MM)
+        yield similarity(seen, drawn[None], Alignment.MM)[0]
 
 
 def _trials(name: str, number: int, scores: Scores) -> Iterator[tuple[list[Press], list[Press]]]:

@@ -78,7 +78,7 @@ WRITTEN_ROWS = {
 """Label and description of the row of Table 3 for each comparison."""
 SUMMARY_COLUMNS = (
     *("model", "alignment", "tone", "measure", "depth_mm", "tilt_deg", "n", "max", "min"),
-    *("avg", "avg_low", "avg_high", "median", "median_low", "median_high", "below_ceiling", "source"),
+    *("avg", "avg_low", "avg_high", "median", "below_ceiling", "source"),
 )
 GATE = re.compile(
     r"((?P<model>[^:<>=]+):)??((?P<alignment>mm|size-normalised):)?((?P<tone>binary|gray):)?"
@@ -362,9 +362,9 @@ def summary_csv(report: Report) -> str:
     rows: list[tuple[object, ...]] = []
     for (model, source, stat), measure in itertools.product(stats, MEASURES):
         of: Summary = getattr(stat, measure)
-        avg, median = (ends or (None, None) for ends in (of.avg_interval, of.median_interval))
+        interval = of.avg_interval or (None, None)
         place = model, stat.alignment, stat.tone, measure, *(stat.cell or (None, None))
-        rows.append((*place, of.n, of.max, of.min, of.avg, *avg, of.median, *median, of.below_ceiling, source))
+        rows.append((*place, of.n, of.max, of.min, of.avg, *interval, of.median, of.below_ceiling, source))
     return csv_text(SUMMARY_COLUMNS, rows)
 
 

@@ -254,11 +254,11 @@ def read_writings(
             yield stroke_id, stroke_id.rsplit("-r", 1)[0], prepared
 
 
-def compare_ink(fixed: Ink, moving: Ink, key: Key) -> tuple[float, float]:
-    """(CSIM, SSIM) of the ink of two cells. Raises ValueError for a blank one."""
+def compare_ink(fixed: Ink, moving: Ink, key: Key) -> Floats:
+    """(2,) CSIM and SSIM of the ink of two cells. Raises ValueError for a blank one."""
     alignment, tone, polarity = key
     one, other = (to_tone(aligned(ink[tone], alignment), tone) for ink in (fixed, moving))
-    return similarity(one, other, alignment, polarity)
+    return similarity(one, other[None], alignment, polarity)[0]
 
 
 def aligned(ink: Image, alignment: Alignment) -> Image:
