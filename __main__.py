@@ -136,7 +136,7 @@ app.command("doctor", rich_help_panel=EVERY_DAY)(brushloop.collect.cli.doctor)
 app.add_typer(brushloop.collect.cli.rig_app, name="rig", rich_help_panel=SET_UP)
 app.add_typer(camera, name="camera", rich_help_panel=SET_UP)
 for name, (panel, words) in GROUPS.items():
-    groups[name] = typer.Typer(cls=PathOrCommand, help=words)
+    groups[name] = typer.Typer(cls=PathOrCommand, help=words, no_args_is_help=name == "train")
     app.add_typer(groups[name], name=name, rich_help_panel=panel)
 groups["repress"].command("session")(command(chains.LoopRequest, "collect.chains.loop:run_loop", run_chain))
 groups["write"].command("characters")(command(chains.WritingRequest, "collect.chains.writing:write", run_chain))

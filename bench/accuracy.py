@@ -191,7 +191,7 @@ def written(*, n: int | None = None, seed: int = 1) -> Sequence[Result]:
             folder, out = Path(scratch), Path(scratch) / "written"
             brush = PAPER if name == PAPER else brush_toml(folder / "brush.toml", NAMED[name], name)
             with simulated_rig(folder, brush, RATE, seed) as rig:
-                words = ("--out", out, "--sessions", folder / "sessions", "--count", str(WRITINGS))
+                words = ("--out", out, "--sessions", folder / "sessions", "--repeats", str(WRITINGS))
                 rig.run("write", CHARACTERS, *words, "--practice", "--learn", str(ROUNDS))
             records = [read_written(place) for place in (out / "round-1", out)]
             tables = [

@@ -84,9 +84,8 @@ def load_artefact(path: Path, kind: type[A]) -> A:
     """Read an artefact of this kind. Raises `CalibrationError` for any other file or version, or an edited one."""
     data = read_bounded(path)
     if not NAME.fullmatch(path.name.encode()):
-        raise CalibrationError(
-            str(path), f"is no artefact: it would be named by {HASH_CHARS} hexadecimal digits and .json"
-        )
+        what = f"is not a result of brushloop, whose name is {HASH_CHARS} hexadecimal digits and .json"
+        raise CalibrationError(str(path), what)
     try:
         made = kind.model_validate_json(data)
     except ValidationError as error:

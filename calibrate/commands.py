@@ -87,6 +87,8 @@ class PathOrCommand(TyperGroup):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Put the first command's name before anything that is not a command's name."""
         first, *others = self.commands
+        if not args and self.no_args_is_help:
+            args = ["--help"]
         if not args or args[0] not in self.commands:
             self.commands[first].epilog = f"Other commands, each with a --help of its own: {', '.join(others)}."
             args = [first, *args]
@@ -102,6 +104,10 @@ Scale = Annotated[float, Option(min=0.1, max=1.0, help="Scale of the 128 x 128 f
 Patch = Annotated[float, Option("--cell-mm", min=30, max=500, help="Side of each patch of paper.")]
 Repeats = Annotated[int, Option(min=1, max=1000, help="How often each is written.")]
 Length = Annotated[float, Option(min=5, max=200, help="Length L of the brush.")]
+CharacterData = Annotated[
+    Path | None,
+    Option(help="Folder with a file for each character, as 字.json, from github.com/chanind/hanzi-writer-data."),
+]
 PlanFile = Annotated[Path, Option(help="The plan's folder, or its plan.json.")]
 Written = Annotated[Path, Argument(help="The session in which a plan was written.")]
 
@@ -235,7 +241,7 @@ class PlanRequest:
 
     what: Annotated[str, Argument(help="Characters (字 子 永 are shipped), or a .csv trajectory.")]
     out: Annotated[Path, Option(help="Folder for protocol-write.toml and plan.png.")] = Path("write-plan")
-    data: Annotated[Path | None, Option(help="Folder of hanzi-writer files, such as 字.json.")] = None
+    data: CharacterData = None
     radius_mm: Annotated[float, Option(min=0.5, max=50, help="Radius R of the brush.")] = 6.0
     length_mm: Length = 48.0
     footprint: Annotated[

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from brushloop.calibrate.commands import PathOrCommand
-from brushloop.collect.chains import Arm, Rig, Tui, on_screen
+from brushloop.collect.chains import PROTOCOL_FILE, RIG_FILE, Arm, Rig, Tui, on_screen
 from brushloop.sessions.terminal import say
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     cls=PathOrCommand,
-    help="Collect strokes (`brushloop collect --config ... --protocol ...`), or only plan them.",
+    help="Collect strokes (`brushloop collect --protocol protocol.toml`), or only plan them.",
     pretty_exceptions_enable=False,
 )
 rig_app = typer.Typer(
@@ -38,8 +38,8 @@ StepArm = Annotated[
 
 @app.command("strokes")
 def collect(
-    config: Rig,
-    protocol: Annotated[Path, typer.Option(help="The protocol.toml to carry out.")],
+    config: Rig = RIG_FILE,
+    protocol: Annotated[Path, typer.Option(help="The protocol to carry out.")] = PROTOCOL_FILE,
     out: Annotated[Path, typer.Option(help="Folder that holds sessions.")] = Path("sessions"),
     new: Annotated[bool, typer.Option("--new", help="Start a new session although one is open.")] = False,
     sheet: Annotated[
@@ -99,8 +99,8 @@ def browse() -> None:
 
 @app.command()
 def plan(
-    config: Rig,
-    protocol: Annotated[Path, typer.Option(help="The protocol to plan.")],
+    config: Rig = RIG_FILE,
+    protocol: Annotated[Path, typer.Option(help="The protocol to plan.")] = PROTOCOL_FILE,
     picture: Annotated[
         Path | None, typer.Option(help="Draw the sheets into this file: .png, .svg, .pdf or .jpg.")
     ] = None,
@@ -145,12 +145,14 @@ def plan(
         say(json.dumps(planned.as_json() | {"poses_in_reach": asked}))
         return
     say(plan_table(planned))
+    if picture is not None:
+        say(f"The sheets are drawn in {picture}")
     if asked is not None:
         say(f"The controller finds joints for all {asked} poses.")
 
 
 def doctor(
-    config: Rig,
+    config: Rig = RIG_FILE,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object per device.")] = False,
     report: Annotated[
         Path | None, typer.Option(help="Write an archive for a bug report, without secrets: FILE.zip.")
@@ -198,9 +200,7 @@ def _first_report(config: Path, report: Path) -> bool:
 
 @rig_app.command()
 def new(
-    rig: Annotated[Path, typer.Argument(help="The rig.toml to make; what is taught is kept beside it.")] = Path(
-        "rig.toml"
-    ),
+    rig: Annotated[Path, typer.Argument(help="The rig.toml to make; what is taught is kept beside it.")] = RIG_FILE,
     arm: StepArm = False,
 ) -> None:
     """Guide you through the first day, from an unboxed arm to a rig.toml. Run it again to resume."""
@@ -210,7 +210,7 @@ def new(
 @rig_app.command()
 def teach(
     step: Annotated[str, typer.Argument(help="arm, camera, tip, sheet, places, brush, force, limits or proof.")],
-    rig: Annotated[Path, typer.Option(help="The rig.toml; what was taught is kept beside it.")] = Path("rig.toml"),
+    rig: Annotated[Path, typer.Option(help="The rig.toml; what was taught is kept beside it.")] = RIG_FILE,
     arm: StepArm = False,
 ) -> None:
     """Teach one step again. Only its values change, and those that depend on them; the changes are listed."""
@@ -240,7 +240,7 @@ def _commission(rig: Path, step: str | None, *, arm: bool) -> None:
 
 @rig_app.command()
 def show(
-    rig: RigFile,
+    rig: RigFile = RIG_FILE,
     picture: Annotated[Path | None, typer.Option(help="Draw it from above: .png, .svg, .pdf or .jpg.")] = None,
 ) -> None:
     """Show a rig: its box of limits and every place that the tip goes to. Asks no device."""
@@ -253,11 +253,14 @@ def show(
     if picture is not None:
         draw_rig(config, picture)
     say(rig_table(config))
+    if picture is not None:
+        say(f"The rig is drawn in {picture}")
 
 
 @rig_app.command()
 def check(
-    rig: RigFile, as_json: Annotated[bool, typer.Option("--json", help="One JSON object instead of text.")] = False
+    rig: RigFile = RIG_FILE,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object instead of text.")] = False,
 ) -> None:
     """Report which values of a rig.toml are plausible, contradict each other, or were not measured. Asks no device.
 

@@ -29,8 +29,12 @@ def list_(
 
     from brushloop.sessions.show import summaries
 
+    rows = list(summaries(root))
+    if not rows:
+        say(f"There are no sessions in {root}")
+        return
     table = Table("session", "state", "source", "strokes", "file")
-    for row in summaries(root):
+    for row in rows:
         table.add_row(row.session_id, row.state, row.source, str(row.strokes), row.file)
     say(table)
 
@@ -113,7 +117,7 @@ def import_(
     out: Annotated[Path | None, typer.Option(help="New session folder; sessions/<folder's name> by default.")] = None,
     kind: Annotated[
         Literal["press", "drag"], typer.Option(help="press (vertical presses) or drag (strokes that travel).")
-    ] = "drag",
+    ] = "press",
     px_per_mm: Annotated[float | None, typer.Option(min=0.01, max=1e4, help="Scale, where the table has none.")] = None,
     licence: Annotated[str, typer.Option(help="Licence of the photographs, kept in the recording.")] = "",
     origin: Annotated[str, typer.Option(help="Where they come from, kept in the recording.")] = "",

@@ -37,7 +37,7 @@ MAX_NAME_CHARS = 100
 class ImportOptions:
     """Facts about an import that its table does not contain."""
 
-    kind: Literal["press", "drag"] = "drag"
+    kind: Literal["press", "drag"] = "press"
     """`press` for vertical presses, `drag` for strokes with travel along the paper."""
     px_per_mm: float | None = None
     """Scale for tables without px_per_mm columns."""

@@ -66,8 +66,7 @@ MAX_CELLS = 60
 """Most conditions that have statistics of their own."""
 MISSING = {
     "ccd-bsmg": "not in this run: give a trained one with --generator",
-    ROBOT_WRITING: "not in this run: “brushloop repress SESSION --config RIG” presses recovered strokes again; then "
-    "validate again",
+    ROBOT_WRITING: "not in this run: “brushloop repress SESSION” presses recovered strokes again; then validate again",
 }
 WRITTEN_ROWS = {
     SIMULATED: ("simulated", "each writing against the model's image of its plan"),

@@ -143,7 +143,9 @@ def _character(name: str, data: Path | None, patch: Patch) -> Figure:
     path = folder / f"{name}.json"
     if data is None and not path.exists():
         shipped = " ".join(sorted(file.stem for file in folder.glob("*.json")))
-        raise CalibrationError(f"character {name!r}", f"is not shipped ({shipped}): name the full data set with --data")
+        raise CalibrationError(
+            f"character {name!r}", f"is not shipped ({shipped}): --data names a folder of hanzi-writer-data that has it"
+        )
     try:
         strokes = parse_glyph(_text(path))
     except ValueError as error:

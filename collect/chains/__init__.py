@@ -13,6 +13,9 @@ from typing import Annotated
 
 from typer import Argument, Option
 
+from brushloop.calibrate.commands import CharacterData
+
+RIG_FILE, PROTOCOL_FILE = Path("rig.toml"), Path("protocol.toml")
 Rig = Annotated[Path, Option(help="The rig: addresses, frames, limits.")]
 Arm = Annotated[bool, Option("--arm", help="Let real hardware move.")]
 Tui = Annotated[bool | None, Option("--tui/--no-tui", help="Show the screen; default: if there is a terminal.")]
@@ -24,7 +27,7 @@ class LoopRequest:
     """Recover every press from its image, press it again and compare both. Run the same command again to resume."""
 
     session: Annotated[Path, Argument(help="The session whose presses are recovered and made again.")]
-    config: Rig
+    config: Rig = RIG_FILE
     out: Annotated[Path | None, Option(help="Folder for what the loop makes; <session>/loop by default.")] = None
     fit: Annotated[Path | None, Option(help="Brush fit; default: the one in use, or a new one.")] = None
     presses: Annotated[int | None, Option(min=1, help="Only this many presses, spread evenly over the session.")] = None
@@ -40,14 +43,14 @@ class WritingRequest:
     """Plan characters, write them on the rig, compare with simulation and reference. Run it again to resume."""
 
     what: Annotated[str, Argument(help="Characters (字 子 永 are shipped), or a .csv trajectory.")]
-    config: Rig
+    config: Rig = RIG_FILE
     out: Annotated[Path, Option(help="Folder for the plan and the report.")] = Path("written")
     sessions: Annotated[Path, Option(help="Folder that holds sessions.")] = Path("sessions")
-    count: Annotated[int, Option(min=1, max=1000, help="How often each is written.")] = 10
+    repeats: Annotated[int, Option(min=1, max=1000, help="How often each is written.")] = 1
     learn: Annotated[int, Option(min=0, max=20, help="First learn from the ink, in at most this many rounds.")] = 0
-    learn_count: Annotated[int, Option(min=1, max=100, help="How often each is written in such a round.")] = 2
+    learn_repeats: Annotated[int, Option(min=1, max=100, help="How often each is written in such a round.")] = 2
     practice: Annotated[bool, Option(help="First write a practice sheet, and fit the brush to it.")] = False
-    data: Annotated[Path | None, Option(help="Folder of hanzi-writer files.")] = None
+    data: CharacterData = None
     references: Annotated[
         tuple[str, ...], Option("--reference", help="字=picture.png: compare with this picture.")
     ] = ()

@@ -236,8 +236,8 @@ class Demo:
         if (folder / WRITTEN_PAGE).is_file():
             return
         self._blank_sheet(folder / "plan" / WRITE)
-        config, count = self._rig.config, self._size.writings
-        write(WritingRequest(CHARACTER, config, folder, self._sessions, count=count, sheet=1, tui=False))
+        config, repeats = self._rig.config, self._size.writings
+        write(WritingRequest(CHARACTER, config, folder, self._sessions, repeats=repeats, sheet=1, tui=False))
 
     def _validate(self) -> None:
         from brushloop.calibrate.validate.command import validate  # slow to import

@@ -51,7 +51,7 @@ class Writing:
             if all(figure.settled for figure in load_plan(plan).figures):
                 say("No character gained by the last round: the best plans are written.")
                 break
-        session = self._written(plan, request.count)
+        session = self._written(plan, request.repeats)
         return self._compare(session, plan, request.out, request.references)
 
     def _first_plan(self) -> Path:
@@ -106,13 +106,13 @@ class Writing:
         from brushloop.calibrate.writing import learn  # slow to import
 
         say(f"write learn {session} --plan {plan} --out {after}")
-        repeats, settled = self._repeats(number + 1), self._request.count
+        repeats, settled = self._repeats(number + 1), self._request.repeats
         show_work(learn.learn, LearnRequest(session, plan, after, repeats=repeats, settled_repeats=settled))
         return after
 
     def _repeats(self, number: int) -> int:
         """How often each character is written in round `number`, from 1; the last round is the one that counts."""
-        return self._request.count if number > self._request.learn else self._request.learn_count
+        return self._request.repeats if number > self._request.learn else self._request.learn_repeats
 
     def _written(self, plan: Path, repeats: int) -> Path:
         """The session of a plan. Raises `ConfigError` if the plan is for other characters or another count."""

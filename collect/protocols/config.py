@@ -44,10 +44,14 @@ _R = TypeVar("_R", bound=BaseModel)
 
 def load_protocol(path: Path) -> ProtocolConfig:
     """Read `protocol.toml` with its side files, or the `.json` that a session keeps. Raises `ConfigError`."""
+    if not path.exists():
+        raise ConfigError(path, "", "no such file: --protocol names another one, such as examples/protocol.toml")
     try:
         if path.suffix == ".json":
             return _PROTOCOL.validate_json(read_text(path, MAX_EFFECTIVE_BYTES))
         values = read_toml(path, MAX_PROTOCOL_BYTES)
+        if "robot" in values and "kind" not in values:
+            raise ConfigError(path, "", "is a rig, not a protocol: give it to --config, and the protocol to --protocol")
         kind = _KINDS.get(str(values.get("kind")))
         if kind is WriteConfig:
             for i, figure in enumerate(_tables(values.get("figures"))):

@@ -366,7 +366,11 @@ def _override(values: dict[str, Any], path: tuple[str, ...], name: str) -> None:
 
 def load_rig(path: Path) -> RigConfig:
     """Read `rig.toml` and its lens file, with overrides from the environment. Raises `ConfigError`."""
+    if not path.exists():
+        raise ConfigError(path, "", "no such file: `brushloop rig new` and `brushloop sim --write-rig` make one")
     values, environment = read_toml(path, MAX_CONFIG_BYTES), overrides()
+    if "kind" in values and "robot" not in values:
+        raise ConfigError(path, "", "is a protocol, not a rig: give it to --protocol, and the rig to --config")
     for field, name in environment.items():
         _override(values, field, name)
     try:

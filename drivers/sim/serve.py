@@ -155,6 +155,7 @@ def serve(
     def announce() -> None:
         if write_rig is not None:
             _write_whole(write_rig, rig.toml())
+            tell(f"{write_rig} is written: brushloop doctor --config {write_rig}")
         tell(f"{rig.where()}; Ctrl-C ends")
 
     asyncio.run(_until_over(rig, rig, live_control(rig, control), idle_exit_s, announce))
@@ -217,5 +218,8 @@ def _refuse_to_overwrite(path: Path) -> None:
 def _write_whole(path: Path, text: str) -> None:
     """Write the file so that a reader sees all of it or none."""
     part = path.with_name(path.name + ".part")
-    part.write_text(text, encoding="utf-8")
-    part.replace(path)
+    try:
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        raise SimFileError(path, "", f"cannot be written: {error.strerror}") from None

@@ -174,7 +174,7 @@ def test_imports_are_rescaled_and_what_cannot_be_cropped_is_named(make, tmp_path
     make.photographs(photos, *rows)
     (photos / "1.png").write_bytes(blank)
     (photos / "0.png").write_bytes(cv2.imencode(".png", image)[1].tobytes() if inked else blank)
-    ran = CliRunner().invoke(app, ["sessions", "export", str(run(ImportOptions())), str(to), "--crops"])
+    ran = CliRunner().invoke(app, ["sessions", "export", str(run(ImportOptions("drag"))), str(to), "--crops"])
     if not inked:
         assert "holds no stroke that can be cropped: 0 is blank" in str(ran.exception)
         assert not to.exists()
@@ -241,7 +241,7 @@ def test_names_go_out_and_in_again_by_our_own_importer(make, photos, run, to):
     names = ["=1+1", "@home", "-2-3", "-5", "'=x", "a"]
     rows = [{"file": f"{k}.png", "name": str(as_cell(name)), "px_per_mm": "5"} for k, name in enumerate(names)]
     make.photographs(photos, *rows)
-    recorded = run(ImportOptions())
+    recorded = run(ImportOptions("drag"))
     assert [stroke.stroke_id for stroke in Recording(recorded).stroke_records()] == names
     export(ExportRequest(recorded, to, "csv"))
     cells = [row["stroke_id"] for row in rows_of(to / "strokes.csv")]

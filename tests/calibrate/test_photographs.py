@@ -38,7 +38,7 @@ def measured(session: Path) -> list[dict[str, str]]:
 
 def test_width_is_fitted_against_depth_in_a_report_that_fetches_nothing(tmp_path: Path) -> None:
     folder, hostile = photographs(tmp_path / "photos"), "<script>alert(1)</script>"
-    words = ("--csv", folder / "strokes.csv", "--licence", hostile, "--origin", hostile)
+    words = ("--csv", folder / "strokes.csv", "--kind", "drag", "--licence", hostile, "--origin", hostile)
     assert brushloop("sessions", "import", folder, *words, cwd=tmp_path).returncode == 0
     ran = brushloop("validate", "sessions/photos", cwd=tmp_path)
     assert ran.returncode == 0, ran.stderr
@@ -65,7 +65,7 @@ def imported(name: str, each: int, tmp_path: Path) -> Path:
     table = tmp_path / "strokes.csv"
     head, *rows = (DATA / name / "strokes.csv").read_text().splitlines()
     table.write_text("\n".join([head, *rows[::each]]) + "\n")
-    made = brushloop("sessions", "import", DATA / name, "--csv", table, cwd=tmp_path)
+    made = brushloop("sessions", "import", DATA / name, "--csv", table, "--kind", "drag", cwd=tmp_path)
     assert made.returncode == 0, made.stderr
     ran = brushloop("validate", tmp_path / "sessions" / name, cwd=tmp_path)
     assert ran.returncode == 0, ran.stderr

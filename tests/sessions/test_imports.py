@@ -74,7 +74,7 @@ def test_the_header_holds_what_was_given(rows, out, run, options, fields):
 def test_columns_without_a_field_of_their_own_are_kept_under_their_names(make, photos, out, run):
     others = {"depth_nominal": "0.4", "ink_frac": "0.9", "reach_mm": "2", "yaw_deg": "7"}
     make.photographs(photos, {"file": "a.png", "start_x_px": "3", "start_y_px": "4.5"} | others)
-    run(ImportOptions(px_per_mm=8.0))
+    run(ImportOptions("drag", px_per_mm=8.0))
     [capture] = Recording(out).captures()
     assert capture.stroke.anchor_px == (3.0, 4.5)
     assert capture.stroke.px_per_mm == (8.0, 8.0)
@@ -87,7 +87,7 @@ def test_a_table_may_come_from_a_spreadsheet(make, photos, out, run):
     shutil.copy(make.photographs(photos, ROWS[0]).with_name("a.png"), photos / "day 1" / "ä, 1.png")
     text = '\ufefffile, px_per_mm_x ,px_per_mm_y\r\n"day 1/ä, 1.png",10,20\r\n,,\r\n\r\n'
     (photos / "table.csv").write_text(text, encoding="utf-8", newline="")
-    run(ImportOptions())
+    run(ImportOptions("drag"))
     [capture] = Recording(out).captures()
     assert capture.stroke.stroke_id == "day 1/ä, 1"
     assert capture.stroke.px_per_mm == (10.0, 20.0)

@@ -190,7 +190,8 @@ def _read(path: Path) -> _File:
             raise SimFileError(path, "", f"is larger than {MAX_BYTES} bytes")
         return _File.model_validate(tomllib.loads(data.decode("utf-8")))
     except FileNotFoundError:
-        raise SimFileError(path, "", "no such file") from None
+        shipped = f"{LOOPBACK} and {PAPER} are shipped, any other is a brush.toml"
+        raise SimFileError(path, "", f"no such file: {shipped}") from None
     except OSError as error:
         raise SimFileError(path, "", error.strerror or str(error)) from None
     except ValidationError as error:

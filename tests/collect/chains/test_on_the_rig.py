@@ -163,7 +163,7 @@ def strict(rows: Sequence[Table3Row], pair: str, alignment: str = "mm") -> Table
 def test_a_character_is_written_twice_and_compared(bench: Bench) -> None:
     what = bench.folder / "cross.csv"
     what.write_text(CROSS, encoding="utf-8")
-    ran = write(bench, what, "--count", "2")
+    ran = write(bench, what, "--repeats", "2")
     assert ran.returncode == 0, ran.stderr
     [session] = bench.sessions.iterdir()
     assert [stroke.stroke_id for stroke in Recording(session).stroke_records()] == ["cross-r01", "cross-r02"]
@@ -184,10 +184,10 @@ def test_a_character_is_written_twice_and_compared(bench: Bench) -> None:
     assert (bench.folder / "written" / "figure-13.png").stat().st_size > 10_000
 
     # Done is done, and what was planned stays: another count is another plan.
-    again = write(bench, what, "--count", "2")
+    again = write(bench, what, "--repeats", "2")
     assert again.returncode == 0, again.stderr
     assert "brushloop collect" not in again.stdout
-    other = write(bench, what, "--count", "3")
+    other = write(bench, what, "--repeats", "3")
     assert other.returncode == 2
     assert "repeats: plans 2 writings, not 3: use another --out" in other.stderr
     report: dict[str, Any] = json.loads((bench.folder / "written" / "written.json").read_text(encoding="utf-8"))

@@ -71,7 +71,7 @@ class Chain:
         (request.out / "loop.html").touch()
 
     def write(self, request: WritingRequest) -> None:
-        self.ran.append(f"write {request.what} {request.count}")
+        self.ran.append(f"write {request.what} {request.repeats}")
         request.out.mkdir()
         (request.out / "written.html").touch()
 
@@ -289,7 +289,9 @@ def test_practice_comes_first_and_learning_ends_when_all_is_settled(
     commands = Commands(settled_after, monkeypatch)
     monkeypatch.setattr(writing, "load_rig", lambda _: Rig)
     monkeypatch.setattr(writing, "collected_session", lambda *_: tmp_path / "session")
-    request = WritingRequest("子", tmp_path / "rig.toml", tmp_path / "out", tmp_path, count=10, learn=3, practice=True)
+    request = WritingRequest(
+        "子", tmp_path / "rig.toml", tmp_path / "out", tmp_path, repeats=10, learn=3, practice=True
+    )
     assert Writing(request).run() == tmp_path / "out" / "written.html"
     assert commands.ran == ["practice", "fit", "plan", *["compare", "learn"] * rounds, "compare"]
     assert ("No character gained" in capsys.readouterr().out) == (rounds < 3)

@@ -26,7 +26,6 @@ from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.kinematics import inverted, matrix_of
 from brushloop.drivers.sim.rig import Addresses, rig_toml
 from brushloop.drivers.sim.world import World
-from tests.command import brushloop
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 HERE = "127.0.0.1"
@@ -171,21 +170,24 @@ async def test_a_controller_that_does_not_answer_is_an_error_of_the_device(rig_p
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "words"),
+    ("arguments", "words"),
     [
-        (("collect",), 2, "Missing option '--config'"),
-        (("collect", "--config", "no.toml"), 2, "Missing option '--protocol'"),
-        (("collect", "--config", "no.toml", "--protocol", "no.toml", "--no-tui"), 2, "no.toml: no such file"),
-        (("collect", "plan"), 2, "Missing option '--config'"),
-        (("collect", "plan", "--config", "no.toml", "--protocol", "no.toml"), 2, "no.toml: no such file"),
+        ((), "rig.toml: no such file: `brushloop rig new`"),
+        (("--config", "p.toml"), "p.toml: is a protocol, not a rig: give it to --protocol"),
+        (("--config", "r.toml", "--protocol", "r.toml"), "r.toml: is a rig, not a protocol: give it to --config"),
+        (("--config", "r.toml"), "protocol.toml: no such file: --protocol names another one"),
     ],
 )
-def test_the_command_line_says_what_is_missing(
-    tmp_path: Path, arguments: tuple[str, ...], code: int, words: str
+@pytest.mark.parametrize("command", ["strokes", "plan"])
+def test_files_that_are_missing_or_swapped_are_named(
+    rig_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, arguments: tuple[str, ...], words: str
 ) -> None:
-    ran = brushloop(*arguments, cwd=tmp_path)
-    assert ran.returncode == code
-    assert words in ran.stderr
+    rig_path.rename(rig_path.with_name("r.toml"))
+    rig_path.with_name("p.toml").write_text((EXAMPLES / "protocol.toml").read_text())
+    monkeypatch.chdir(rig_path.parent)
+    with pytest.raises(ConfigError) as refused:
+        CliRunner().invoke(app, [command, *arguments], catch_exceptions=False)
+    assert str(refused.value).startswith(words)
 
 
 def test_a_tip_is_where_either_tool_says_that_it_is():
