@@ -23,6 +23,8 @@ MAX_IMAGE_PIXELS = 80_000_000
 MAX_JPEG_SCANS = 100
 """Each scan of a progressive JPEG takes ten bytes or more of the file, and covers the whole image."""
 PNG_START = b"\x89PNG\r\n\x1a\n"
+MAY_TURN = (b"eXIf", b"iTXt", b"tEXt", b"zTXt")
+"""Chunks of a PNG that can hold an orientation."""
 
 
 def pose_message(
@@ -64,6 +66,7 @@ def decode_gray(data: bytes, where: str) -> NDArray[np.uint8]:
 
     Raises `SessionDamaged` for other formats, and for cut or absurdly large images.
     """
+    import cv2
     import numpy as np
     from PIL import Image, ImageOps
 
@@ -78,6 +81,11 @@ def decode_gray(data: bytes, where: str) -> NDArray[np.uint8]:
             if image.width * image.height > MAX_IMAGE_PIXELS:
                 what = f"image of {image.width} x {image.height} pixels exceeds {MAX_IMAGE_PIXELS}"
                 raise SessionDamaged(where, what)
+            if image.mode == "L" and data.startswith(PNG_START) and not any(chunk in data for chunk in MAY_TURN):
+                # OpenCV lets other threads decode meanwhile; it refuses some damaged images that Pillow reads.
+                gray = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+                if gray is not None:
+                    return gray.astype(np.uint8, copy=False)
             image.draft("L", image.size)
             ImageOps.exif_transpose(image, in_place=True)
             if image.mode.startswith("I"):
