@@ -23,8 +23,8 @@ MAX_IMAGE_PIXELS = 80_000_000
 MAX_JPEG_SCANS = 100
 """Each scan of a progressive JPEG takes ten bytes or more of the file, and covers the whole image."""
 PNG_START = b"\x89PNG\r\n\x1a\n"
-MAY_TURN = (b"eXIf", b"iTXt", b"tEXt", b"zTXt")
-"""Chunks of a PNG that can hold an orientation."""
+PIXELS_ONLY = {b"IHDR", b"IDAT", b"IEND"}
+"""Chunks of a PNG without orientation, profile or text."""
 
 
 def pose_message(
@@ -61,6 +61,16 @@ def encode_png(image: NDArray[np.uint8]) -> bytes:
     return cv2.imencode(".png", image)[1].tobytes()
 
 
+def _chunks(png: bytes) -> set[bytes]:
+    """Names of the chunks of a PNG."""
+    names, at = set[bytes](), len(PNG_START)
+    while at + 8 <= len(png):
+        length, name = struct.unpack_from(">I4s", png, at)
+        names.add(name)
+        at += 12 + length
+    return names
+
+
 def decode_gray(data: bytes, where: str) -> NDArray[np.uint8]:
     """Decode a PNG or JPEG to (h, w) uint8 gray, turned as its orientation says, so that pixels count as viewers show.
 
@@ -81,8 +91,9 @@ def decode_gray(data: bytes, where: str) -> NDArray[np.uint8]:
             if image.width * image.height > MAX_IMAGE_PIXELS:
                 what = f"image of {image.width} x {image.height} pixels exceeds {MAX_IMAGE_PIXELS}"
                 raise SessionDamaged(where, what)
-            if image.mode == "L" and data.startswith(PNG_START) and not any(chunk in data for chunk in MAY_TURN):
-                # OpenCV lets other threads decode meanwhile; it refuses some damaged images that Pillow reads.
+            if image.mode == "L" and data.startswith(PNG_START) and _chunks(data) == PIXELS_ONLY:
+                # OpenCV lets other threads decode meanwhile. It refuses some damaged images that Pillow reads, and says
+                # on stderr what stands in a profile.
                 gray = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
                 if gray is not None:
                     return gray.astype(np.uint8, copy=False)
