@@ -215,7 +215,6 @@ PARAMETERS: dict[str, tuple[str, ...]] = {
     "MotionControl.moveJoint": ("q", "a", "v", "blend_radius", "duration"),
     "MotionControl.moveLine": ("pose", "a", "v", "blend_radius", "duration"),
     "MotionControl.setSpeedFraction": ("fraction",),
-    "MotionControl.stopJoint": ("acc",),
     "MotionControl.stopLine": ("acc", "acc_rot"),
     "MotionControl.stopMove": ("quick", "all_tasks"),
     "RegisterControl.setWatchDog": ("key", "timeout", "action"),

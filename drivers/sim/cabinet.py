@@ -1,9 +1,7 @@
 """The loopback cabinet: an arm's motion, tool, power, safety and watchdogs, and its methods by their names on the wire.
 
 It simulates what a driver can get wrong: refusals by return code, poses that are accepted first and fail in planning, a
-path that a protective stop keeps. It simulates neither accuracy nor safety functions. Speeds above what the arm allows
-are clipped. The joints' speeds are those of the maker's URDF for the i5; the other maxima are the examples in the SDK's
-headers, which are for an i5H. A real cabinet reports its own.
+path that a protective stop keeps. It simulates neither accuracy nor safety functions, nor the arm's highest speeds.
 """
 
 from __future__ import annotations
@@ -16,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from brushloop.drivers.arcs.controller import LOOPBACK_CONTROL_BOX, MOVING_ALLOWED, ReturnCode, RobotMode, SafetyMode
+from brushloop.drivers.arcs.wire import numbers
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import from_wire, to_wire
 from brushloop.drivers.sim.kinematics import LIMITS_DEG, Joints, forward, inverse, inverted, matrix_of, pose_of
@@ -101,9 +100,6 @@ ROBOT = "rob1"
 IK_NO_CONVERGE = -23
 HARD_STOP_M_S2 = 10.0
 SOFT_STOP_M_S2 = 2.0
-JOINT_SPEED_RAD_S, JOINT_ACC_RAD_S2 = 2.5964, 20.7
-"""Of the slowest joint."""
-TCP_SPEED_M_S, TCP_ACC_M_S2 = 2.0, 10.0
 POSE_OUT_OF_REACH = 30047
 BLEND_M = (0.001, 1.0)
 PROTECTIVE_STOP_ACTION = 3
@@ -194,16 +190,17 @@ class Cabinet:
         """Joint positions for the present pose of the tip."""
         return self.motion.joints(self.now_s())
 
-    def fk(self, q: list[float]) -> list[Any]:
+    def fk(self, p: Params) -> list[Any]:
         """[pose of the configured tool centre point, return code]."""
-        return [to_wire(pose_of(forward([float(v) for v in q]) @ self._tool)), 0]
+        return [to_wire(pose_of(forward(numbers("forwardKinematics", p["q"])) @ self._tool)), 0]
 
-    def ik(self, near: list[float], pose: list[float]) -> list[Any]:
-        """[joints, return code]; the joints are `near` if there is no solution."""
-        joints = self._flange(from_wire([float(v) for v in pose]), _floats(near, 6))
-        return [list(near), IK_NO_CONVERGE] if joints is None else [list(joints), 0]
+    def ik(self, p: Params) -> list[Any]:
+        """[joints, return code]; the joints are `qnear` if there is no solution."""
+        target, near = (numbers("inverseKinematics", p[name]) for name in ("pose", "qnear"))
+        joints = self._solved(from_wire(target), near)
+        return [near, IK_NO_CONVERGE] if joints is None else [joints, 0]
 
-    def _flange(self, target: Pose, near: Sequence[float]) -> Joints | None:
+    def _solved(self, target: Pose, near: Sequence[float]) -> Joints | None:
         """Joints for a pose of the configured tool centre point, searched from `near`."""
         return inverse(matrix_of(target) @ inverted(self._tool), near)
 
@@ -233,42 +230,38 @@ class Cabinet:
 
     def move_line(self, p: Params) -> int:
         """Queue a line; a pose out of reach is accepted first and fails in planning, as on a controller."""
-        target = from_wire([float(v) for v in p["pose"]])
+        target = from_wire(numbers("moveLine", p["pose"]))
         if (code := self._admit(p)) != ReturnCode.OK:
             return code
-        if self._flange(target, self.motion.near) is None:
+        if self._solved(target, self.motion.near) is None:
             return self._out_of_reach()
         added = self.motion.add(
             target,
-            min(float(p["v"]), TCP_SPEED_M_S) * 1e3,
-            min(float(p["a"]), TCP_ACC_M_S2) * 1e3,
+            p["v"] * 1e3,
+            p["a"] * 1e3,
             self.now_s(),
-            float(p.get("duration", 0.0)),
-            blend_mm=float(p.get("blend_radius", 0.0)) * 1e3,
+            p.get("duration", 0.0),
+            blend_mm=p.get("blend_radius", 0.0) * 1e3,
             fix=self._fix,
         )
         return ReturnCode.OK if added else ReturnCode.REQUEST_IGNORED
 
     def move_joint(self, p: Params) -> int:
         """Queue a move that is straight in joints."""
-        q = [float(v) for v in p["q"]]
-        if len(q) != 6 or not all(math.isfinite(v) for v in q):
-            return -ReturnCode.INVALID_ARGUMENT
+        q1, q2, q3, q4, q5, q6 = q = numbers("moveJoint", p["q"])
         if (code := self._admit(p)) != ReturnCode.OK:
             return code
         if any(abs(v) > math.radians(limit) for v, limit in zip(q, LIMITS_DEG, strict=True)):
             return self._out_of_reach()
-        joints: Joints = (q[0], q[1], q[2], q[3], q[4], q[5])
-        speed_rad_s, acc_rad_s2 = min(float(p["v"]), JOINT_SPEED_RAD_S), min(float(p["a"]), JOINT_ACC_RAD_S2)
-        added = self.motion.add_joints(joints, speed_rad_s, acc_rad_s2, self.now_s())
+        added = self.motion.add_joints((q1, q2, q3, q4, q5, q6), p["v"], p["a"], self.now_s())
         return ReturnCode.OK if added else ReturnCode.REQUEST_IGNORED
 
     def _admit(self, p: Params) -> int:
         """Return code for queueing a move: OK if it may be queued."""
         if (code := self._may_move()) != ReturnCode.OK:
             return code
-        duration_s, blend_m = float(p.get("duration", 0.0)), float(p.get("blend_radius", 0.0))
-        paced = float(p["a"]) > 0.0 and float(p["v"]) > 0.0 and 0.0 <= duration_s < math.inf
+        duration_s, blend_m = p.get("duration", 0.0), p.get("blend_radius", 0.0)
+        paced = p["a"] > 0.0 and p["v"] > 0.0 and 0.0 <= duration_s < math.inf
         if not paced or not (blend_m == 0.0 or BLEND_M[0] <= blend_m <= BLEND_M[1]):
             return -ReturnCode.INVALID_ARGUMENT
         return ReturnCode.QUEUE_FULL if self.motion.size >= MOST_MOVES else ReturnCode.OK
@@ -289,11 +282,12 @@ class Cabinet:
         self.motion.advance(self.now_s())
         return self.motion.size
 
-    def set_watchdog(self, key: str, timeout_s: float, action: int) -> int:
+    def set_watchdog(self, p: Params) -> int:
         """Restart the watchdog `key` from now: action 3 is a protective stop, 0 ends it. Others are not simulated.
 
         It counts real time, as its client does.
         """
+        key, timeout_s, action = p["key"], p["timeout"], p["action"]
         if action not in (0, PROTECTIVE_STOP_ACTION) or not timeout_s >= 0.1:
             return -ReturnCode.INVALID_ARGUMENT
         if (timer := self.watchdogs.pop(key, None)) is not None:
@@ -312,34 +306,21 @@ class Cabinet:
         self.watchdogs.pop(key, None)
         self.safety_stop(SafetyMode.PROTECTIVE_STOP)
 
-    def configure(self, name: str, value: object, allowed: bool) -> int:
+    def configure(self, name: str, value: object, allowed: bool = True) -> int:
         """Set one of the cabinet's settings, if the value is allowed."""
         if not allowed:
             return -ReturnCode.INVALID_ARGUMENT
         setattr(self, name, value)
         return ReturnCode.OK
 
-    def set_tcp_offset(self, p: Params) -> int:
-        """Take the flange to tool centre point, in m and rad."""
-        offset = [float(v) for v in p["offset"]]
-        return self.configure("tcp_offset", offset, len(offset) == 6 and all(math.isfinite(v) for v in offset))
-
     def set_payload(self, p: Params) -> int:
         """Take mass in kg, centre of gravity in m, and what a robot has beside."""
-        mass_kg, inertia = float(p["m"]), [float(v) for v in p["inertia"]]
-        payload = [mass_kg, _floats(p["cog"], 3), _floats(p["aom"], 3), inertia]
-        return self.configure("payload", payload, 0.0 <= mass_kg <= 5.0 and len(inertia) in (6, 9))
+        cog_m, aom = numbers("setPayload", p["cog"], 3), numbers("setPayload", p["aom"], 3)
+        return self.configure("payload", [p["m"], cog_m, aom, p["inertia"]], 0.0 <= p["m"] <= 5.0)
 
     def peek(self, count: int, after: int) -> list[dict[str, Any]]:
         """The newest `count` messages after a time stamp."""
         return [m for m in self.messages if m["timestamp"] > after][-count:] if count > 0 else []
-
-
-def _floats(values: Any, count: int) -> list[float]:
-    floats = [float(v) for v in values]
-    if len(floats) != count or not all(math.isfinite(v) for v in floats):
-        raise ValueError(f"expected {count} finite numbers, got {values!r}")
-    return floats
 
 
 def methods(cabinet: Cabinet) -> dict[str, Callable[[Params], Any]]:
@@ -351,12 +332,11 @@ def methods(cabinet: Cabinet) -> dict[str, Callable[[Params], Any]]:
     of_robot: dict[str, Callable[[Params], Any]] = {
         "MotionControl.moveLine": cabinet.move_line,
         "MotionControl.moveJoint": cabinet.move_joint,
-        "MotionControl.stopLine": lambda p: cabinet.stop(float(p["acc"]), float(p["acc_rot"])),
-        "MotionControl.stopJoint": lambda p: cabinet.stop(SOFT_STOP_M_S2, float(p["acc"])),
+        "MotionControl.stopLine": lambda p: cabinet.stop(p["acc"], p["acc_rot"]),
         "MotionControl.stopMove": lambda _: cabinet.hold(),
         "MotionControl.startMove": lambda _: cabinet.resume(),
         "MotionControl.setSpeedFraction": lambda p: cabinet.configure(
-            "speed_fraction", float(p["fraction"]), 0.0 < float(p["fraction"]) <= 1.0
+            "speed_fraction", p["fraction"], 0.0 < p["fraction"] <= 1.0
         ),
         "MotionControl.getSpeedFraction": lambda _: cabinet.speed_fraction,
         "MotionControl.getExecId": lambda _: motion.exec_id(now_s()),
@@ -365,12 +345,12 @@ def methods(cabinet: Cabinet) -> dict[str, Callable[[Params], Any]]:
         "RobotConfig.getRobotSubType": lambda _: "aubo_i5_11",
         "RobotConfig.getControlBoxType": lambda _: LOOPBACK_CONTROL_BOX,
         "RobotConfig.getDof": lambda _: 6,
-        "RobotConfig.setTcpOffset": cabinet.set_tcp_offset,
+        "RobotConfig.setTcpOffset": lambda p: cabinet.configure("tcp_offset", numbers("setTcpOffset", p["offset"])),
         "RobotConfig.getTcpOffset": lambda _: cabinet.tcp_offset,
         "RobotConfig.setPayload": cabinet.set_payload,
         "RobotConfig.getPayload": lambda _: cabinet.payload,
         "RobotConfig.setCollisionLevel": lambda p: cabinet.configure(
-            "collision_level", int(p["level"]), 0 <= int(p["level"]) <= 9
+            "collision_level", p["level"], 0 <= p["level"] <= 9
         ),
         "RobotConfig.getCollisionLevel": lambda _: cabinet.collision_level,
         "RobotManage.poweron": lambda _: power.power_on(),
@@ -390,9 +370,9 @@ def methods(cabinet: Cabinet) -> dict[str, Callable[[Params], Any]]:
         "RobotState.getTcpPose": lambda _: to_wire(cabinet.tcp()),
         "RobotState.getJointPositions": lambda _: cabinet.joints(),
         "RobotState.getJointState": lambda _: [power.joint_state] * 6,
-        "RobotAlgorithm.forwardKinematics": lambda p: cabinet.fk(p["q"]),
-        "RobotAlgorithm.inverseKinematics": lambda p: cabinet.ik(p["qnear"], p["pose"]),
-        "Trace.peek": lambda p: cabinet.peek(int(p["num"]), int(p.get("last_time", 0))),
+        "RobotAlgorithm.forwardKinematics": cabinet.fk,
+        "RobotAlgorithm.inverseKinematics": cabinet.ik,
+        "Trace.peek": lambda p: cabinet.peek(p["num"], p["last_time"]),
     }
     of_controller: dict[str, Callable[[Params], Any]] = {
         "SystemInfo.getInterfaceVersionCode": lambda _: 24000,
@@ -400,13 +380,10 @@ def methods(cabinet: Cabinet) -> dict[str, Callable[[Params], Any]]:
         "SystemInfo.getControlSoftwareFullVersion": lambda _: f"0.31.1-{LOOPBACK_CONTROL_BOX}",
         "getRobotNames": lambda _: [ROBOT],
         "RuntimeMachine.abort": lambda _: cabinet.stop(SOFT_STOP_M_S2, SOFT_STOP_M_S2),
-        "RuntimeMachine.stop": lambda _: ReturnCode.OK,  # a program, not motion that clients asked for
         "RuntimeMachine.pause": lambda _: cabinet.hold(),
         "RuntimeMachine.resume": lambda _: cabinet.resume(),
         # Motion from a client runs with the runtime Stopped.
         "RuntimeMachine.getRuntimeState": lambda _: "Paused" if motion.held else "Stopped",
-        "RegisterControl.setWatchDog": lambda p: cabinet.set_watchdog(
-            str(p["key"]), float(p["timeout"]), int(p["action"])
-        ),
+        "RegisterControl.setWatchDog": cabinet.set_watchdog,
     }
     return {f"{ROBOT}.{name}": method for name, method in of_robot.items()} | of_controller

@@ -10,13 +10,12 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.drivers.devices import Pose
-from brushloop.drivers.geometry import columns, distance, interpolate, of_matrix, unit, vector
+from brushloop.drivers.geometry import columns, interpolate, of_matrix, unit, vector
 
 Matrix = NDArray[np.float64]
 Joints = tuple[float, float, float, float, float, float]
@@ -132,49 +131,31 @@ STRETCHES = 16
 """Number of straight pieces in which a curved path is reported to the world."""
 
 
-def fixed(pose: Pose, fix: Matrix | None) -> Pose:
-    """The true tip, from the tool centre point that was configured."""
-    return pose if fix is None else pose_of(matrix_of(pose) @ fix)
-
-
 @dataclass(frozen=True)
 class Line:
-    """Straight for the tool centre point that was configured; `fix` leads from there to the true tip (None: same)."""
+    """Straight for the tip. `travel_mm` and `turn_rad` are those of the tool centre point that was configured."""
 
     start: Pose
     end: Pose
-    fix: Matrix | None = None
-
-    @cached_property
-    def _measure(self) -> tuple[float, float]:
-        travel_mm, turn_deg = distance(self.start, self.end)
-        return travel_mm, math.radians(turn_deg)
+    travel_mm: float
+    turn_rad: float
+    stretches = 1
 
     @property
     def angular(self) -> bool:
         """True for a turn on the spot."""
-        travel_mm, turn_rad = self._measure
-        return travel_mm < ROTATION_AS_LINEAR_MM and turn_rad > TURN_RAD
+        return self.travel_mm < ROTATION_AS_LINEAR_MM and self.turn_rad > TURN_RAD
 
     @property
     def length(self) -> float:
         """Length of the line, or of the turn."""
-        return self._measure[1] if self.angular else self._measure[0]
+        return self.turn_rad if self.angular else self.travel_mm
 
-    @property
-    def stretches(self) -> int:
-        """1 unless the true tip circles a wrongly configured tool centre point."""
-        return 1 if self.fix is None or self._measure[1] < TURN_RAD else STRETCHES
-
-    def along(self, done: float) -> Pose:
-        """The configured tool centre point after `done`; the ends are exact."""
+    def pose(self, done: float) -> Pose:
+        """Where the tip is; the ends are exact."""
         if done >= self.length:
             return self.end
         return self.start if done <= 0.0 else interpolate(self.start, self.end, done / self.length)
-
-    def pose(self, done: float) -> Pose:
-        """Where the true tip is."""
-        return fixed(self.along(done), self.fix)
 
 
 @dataclass(frozen=True)
@@ -199,11 +180,10 @@ class Corner:
         return float(np.linalg.norm(directions[1] - directions[0]))
 
     def pose(self, done: float) -> Pose:
-        """Where the true tip is after `done`, by de Casteljau's algorithm."""
+        """Where the tip is after `done`, by de Casteljau's algorithm."""
         u = done / self.length
-        start, end = self.a.along(self.a.length - self.cut), self.b.along(self.cut)
-        there = interpolate(interpolate(start, self.a.end, u), interpolate(self.b.start, end, u), u)
-        return fixed(there, self.a.fix)
+        start, end = self.a.pose(self.a.length - self.cut), self.b.pose(self.cut)
+        return interpolate(interpolate(start, self.a.end, u), interpolate(self.b.start, end, u), u)
 
 
 @dataclass(frozen=True)

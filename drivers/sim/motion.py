@@ -24,8 +24,6 @@ from brushloop.drivers.sim.kinematics import (
     Joints,
     Line,
     Matrix,
-    fixed,
-    forward,
     inverse,
     inverted,
     matrix_of,
@@ -155,8 +153,6 @@ class MotionQueue:
         self._pieces: list[Piece] = []
         self._knots = [Knot(-1.0, 0.0, 0.0)]
         """From the last one passed on; the last is a rest, at the end of the path unless it is held."""
-        self._solved: tuple[Pose, Joints] | None = None
-        """The last pose whose joints were found, and the joints."""
         self._rest = home
         self._left_s = -1.0
         """When the arm left the last rest, or came to it."""
@@ -184,11 +180,13 @@ class MotionQueue:
         `target` is a pose of the configured tool centre point, and `fix` leads from there to the true tip.
         """
         self.advance(now_s)
-        start = self._last() if fix is None else fixed(self._last(), inverted(fix))
-        travel_mm, turn_deg = distance(start, target)
+        start = self._last()
+        configured = start if fix is None else pose_of(matrix_of(start) @ inverted(fix))
+        travel_mm, turn_deg = distance(configured, target)
         if travel_mm <= SAME_POSE_MM and turn_deg <= SAME_POSE_DEG:
             return False
-        line = Line(start, target, fix)
+        end = target if fix is None else pose_of(matrix_of(target) @ fix)
+        line = Line(start, end, travel_mm, math.radians(turn_deg))
         unit, blend_mm = (1e-3, 0.0) if line.angular else (1.0, blend_mm)
         self._append(line, speed_mm_s * unit, acc_mm_s2 * unit, now_s, duration_s, blend_mm)
         return True
@@ -196,15 +194,12 @@ class MotionQueue:
     def add_joints(self, joints: Joints, speed_rad_s: float, acc_rad_s2: float, now_s: float) -> bool:
         """Append a straight move in joint space, from rest to rest; False if the queue already ends there."""
         self.advance(now_s)
-        target = pose_of(forward(joints) @ self.tool)
-        travel_mm, turn_deg = distance(self._last(), target)
-        turned = max(abs(a - b) for a, b in zip(joints, self.near, strict=True))
-        same_joints = bool(self._pieces) or turned <= SAME_JOINT_RAD
-        if travel_mm <= SAME_POSE_MM and turn_deg <= SAME_POSE_DEG and same_joints:
-            return False
         last = self._pieces[-1] if self._pieces else None
         start = (last.joints(last.stop) if last else None) or self.near_joints(self._last())
-        self._append(JointLine(start, joints, self.tool), speed_rad_s, acc_rad_s2, now_s)
+        line = JointLine(start, joints, self.tool)
+        if line.length <= SAME_JOINT_RAD:
+            return False
+        self._append(line, speed_rad_s, acc_rad_s2, now_s)
         return True
 
     def advance(self, now_s: float) -> None:
@@ -265,9 +260,7 @@ class MotionQueue:
 
     def near_joints(self, tip: Pose) -> Joints:
         """The joints for a tip pose, near the last known ones; the last known ones if no solution is found."""
-        if self._solved != (tip, self.near):  # an arm at rest is asked again and again
-            self.near = inverse(matrix_of(tip) @ inverted(self.tool), self.near) or self.near
-            self._solved = (tip, self.near)
+        self.near = inverse(matrix_of(tip) @ inverted(self.tool), self.near) or self.near
         return self.near
 
     def steady(self, now_s: float) -> bool:
@@ -343,7 +336,7 @@ class MotionQueue:
         The corner has to begin beyond `along`.
         """
         match self._pieces and self._pieces[-1].path, piece.path:
-            case Line() as a, Line() as b if not a.angular and not b.angular and a.fix is b.fix:
+            case Line() as a, Line() as b if not a.angular and not b.angular:
                 last = self._pieces[-1]
                 cut = min(last.blend_mm, 0.5 * a.length, 0.5 * b.length)
             case _:
