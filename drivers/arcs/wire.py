@@ -19,12 +19,13 @@ import abc
 import asyncio
 import contextlib
 import json
-import math
 import re
 import secrets
 import struct
 from collections.abc import Mapping
 from typing import Any, Literal
+
+from pydantic import FiniteFloat, TypeAdapter, ValidationError
 
 from brushloop.drivers.errors import (
     ConnectionLost,
@@ -37,24 +38,20 @@ from brushloop.drivers.errors import (
 )
 
 MAGIC = b"SOF"
-FLAG_LONG = 0x01
-FLAG_SHORT = 0x00
+HEADERS = {0x01: struct.Struct(">4xI"), 0x00: struct.Struct(">4xH")}
+"""The length behind magic and flag, by the flag."""
 MAX_PAYLOAD_BYTES = 16 * 1024 * 1024
 """Far above any reply of a controller; a hostile length must not make the host allocate gigabytes."""
 
 
 def encode_short(payload: bytes) -> bytes:
-    """One frame with a 16-bit length, as RTDE uses. Raises ValueError where the payload does not fit."""
-    if len(payload) > 0xFFFF:
-        raise ValueError(f"payload of {len(payload)} bytes exceeds 65535")
-    return MAGIC + bytes([FLAG_SHORT]) + struct.pack(">H", len(payload)) + payload
+    """One frame with a 16-bit length, as RTDE uses. Raises `struct.error` where the payload does not fit."""
+    return MAGIC + struct.pack(">BH", 0x00, len(payload)) + payload
 
 
 def encode(payload: bytes) -> bytes:
-    """One frame with a 32-bit length. Raises ValueError above `MAX_PAYLOAD_BYTES`."""
-    if len(payload) > MAX_PAYLOAD_BYTES:
-        raise ValueError(f"payload of {len(payload)} bytes exceeds {MAX_PAYLOAD_BYTES}")
-    return MAGIC + bytes([FLAG_LONG]) + struct.pack(">I", len(payload)) + payload
+    """One frame with a 32-bit length."""
+    return MAGIC + struct.pack(">BI", 0x01, len(payload)) + payload
 
 
 class _Decoder(abc.ABC):
@@ -108,21 +105,19 @@ class FrameDecoder(_Decoder):
             raise self._violation(f"expected SOF, got {bytes(buffer[:8])!r}")
         if len(buffer) < 4:
             return None
-        match buffer[3]:
-            case 0x01:
-                head, size = 8, struct.unpack_from(">I", buffer, 4)[0] if len(buffer) >= 8 else None
-            case 0x00:
-                head, size = 6, struct.unpack_from(">H", buffer, 4)[0] if len(buffer) >= 6 else None
-            case flag:
-                raise self._violation(f"unknown SOF flag {flag:#04x}")
-        if size is None:
+        if buffer[3] not in HEADERS:
+            raise self._violation(f"unknown SOF flag {buffer[3]:#04x}")
+        header = HEADERS[buffer[3]]
+        if len(buffer) < header.size:
             return None
+        (size,) = header.unpack_from(buffer)
         if size > self._max_bytes:
             raise self._violation(f"frame of {size} bytes exceeds {self._max_bytes}")
-        if len(buffer) < head + size:
+        end = header.size + size
+        if len(buffer) < end:
             return None
-        payload = bytes(buffer[head : head + size])
-        del buffer[: head + size]
+        payload = bytes(buffer[header.size : end])
+        del buffer[:end]
         return payload
 
 
@@ -137,10 +132,7 @@ _CLOSES = {ord("}"): ord("{"), ord("]"): ord("[")}
 
 
 class BareDecoder(_Decoder):
-    """Turns a byte stream, split at any point, into JSON documents, bounded in size and depth.
-
-    NaN and Infinity are accepted, as by Python's `json`.
-    """
+    """Turns a byte stream, split at any point, into JSON documents by their brackets, bounded in size and depth."""
 
     def __init__(self, device: str = "arcs", *, max_bytes: int = MAX_DOCUMENT_BYTES) -> None:
         super().__init__(device, max_bytes)
@@ -161,10 +153,6 @@ class BareDecoder(_Decoder):
         document = bytes(self._buffer[:end])
         del self._buffer[:end]
         self._at = 0
-        try:
-            json.loads(document)
-        except (ValueError, RecursionError):
-            raise self._violation(f"not JSON: {document[:40]!r}") from None
         return document
 
     def _scan(self) -> int | None:
@@ -194,20 +182,20 @@ class BareDecoder(_Decoder):
                     raise self._violation(f"nested deeper than {MAX_DEPTH}")
 
 
+NUMBERS = TypeAdapter(list[FiniteFloat])
+
+
 def numbers(op: str, values: object, count: int = 6) -> list[float]:
     """`values` of the answer to `op` as floats. Raises `ProtocolViolation` unless it is a list of finite numbers.
 
     JSON allows integers too large for a float, and a string of six digits is not a pose.
     """
-    if not isinstance(values, list):
-        raise ProtocolViolation(DEVICE, op, f"expected {count} numbers, got {str(values)[:80]!r}")
     try:
-        floats = [float(v) if type(v) in (int, float) else math.nan for v in values]  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
-    except OverflowError:
+        floats = NUMBERS.validate_python(values, strict=True)
+    except ValidationError:
         floats = []
-    if len(floats) != count or not all(map(math.isfinite, floats)):
-        got = str(values)[:80]  # pyright: ignore[reportUnknownArgumentType]
-        raise ProtocolViolation(DEVICE, op, f"expected {count} finite numbers, got {got}")
+    if len(floats) != count:
+        raise ProtocolViolation(DEVICE, op, f"expected {count} finite numbers, got {str(values)[:80]!r}")
     return floats
 
 
@@ -230,21 +218,8 @@ PARAMETERS: dict[str, tuple[str, ...]] = {
 
 
 def parameters(method: str) -> tuple[str, ...]:
-    """The parameter names of `method`, with or without the robot's name in front."""
+    """The parameter names of `method` in the maker's order, with or without the robot's name in front."""
     return PARAMETERS.get(".".join(method.split(".")[-2:]), ())
-
-
-def positional(method: str, params: Mapping[str, object]) -> list[object]:
-    """The values in the maker's order. Raises ValueError for a missing or unknown name."""
-    names = parameters(method)
-    if set(names) != set(params):
-        raise ValueError(f"{method} takes {names}, got {tuple(params)}")
-    return [params[name] for name in names]
-
-
-def named(method: str, values: list[object]) -> dict[str, object]:
-    """The values by name. Raises ValueError for the wrong number of them."""
-    return dict(zip(parameters(method), values, strict=True))
 
 
 DEVICE = "robot"
@@ -271,14 +246,20 @@ def encode_request(ident: str, method: str, params: Mapping[str, object] | None)
 
 
 def encode_bare_request(ident: int, method: str, params: Mapping[str, object] | None) -> bytes:
-    """A request as the maker documents it. Raises ValueError for a parameter that the method does not have."""
-    values = positional(method, params or {})
+    """A request as the maker documents it. Raises ValueError for a missing or unknown parameter."""
+    names, by_name = parameters(method), params or {}
+    if set(names) != set(by_name):
+        raise ValueError(f"{method} takes {names}, got {tuple(by_name)}")
+    values = [by_name[name] for name in names]
     body = {"jsonrpc": "2.0", "method": method, "params": values, "id": ident}
     return json.dumps(body, separators=(",", ":")).encode()
 
 
+Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
+
+
 class RpcConnection:
-    """A socket with one caller at a time; late replies to calls that timed out are dropped."""
+    """A socket with one caller at a time; late replies to calls that timed out are passed over."""
 
     def __init__(self, host: str, port: int, *, timeout_s: float = 1.0, framing: Framing = "sof") -> None:
         self.host = host
@@ -287,30 +268,33 @@ class RpcConnection:
         self._framing = framing
         self._last_id = 0
         self._lock = asyncio.Lock()
-        self._writer: asyncio.StreamWriter | None = None
-        self._reader_task: asyncio.Task[None] | None = None
-        self._pending: tuple[str | int, str, asyncio.Future[Any]] | None = None
+        self._stream: Stream | None = None
+        self._decoder: FrameDecoder | BareDecoder = FrameDecoder(DEVICE)
         self._lost: str | None = None
+        """Why nothing more is read from the connection."""
 
     @property
     def lost(self) -> bool:
         """True from the moment the peer went away until `close` or a successful `open`."""
+        if self._lost is None and self._stream is not None:
+            reader, _ = self._stream
+            if reader.at_eof() or reader.exception() is not None:
+                self._lost = str(reader.exception() or "the controller closed the connection")
         return self._lost is not None
 
     async def open(self) -> None:
         """Connect. Raises `ConnectionLost` (refused) or `DeviceTimeout`."""
         try:
             async with asyncio.timeout(self._timeout_s):
-                reader, writer = await asyncio.open_connection(self.host, self.port)
+                self._stream = await asyncio.open_connection(self.host, self.port)
         except TimeoutError:
             self._lost = f"{self.host}:{self.port} did not answer"
             raise DeviceTimeout(DEVICE, "connect", self._lost) from None
         except OSError as error:
             self._lost = f"{self.host}:{self.port}: {error.strerror or error}"
             raise ConnectionLost(DEVICE, "connect", self._lost) from None
-        self._writer = writer
+        self._decoder = BareDecoder(DEVICE) if self._framing == "bare" else FrameDecoder(DEVICE)
         self._lost = None
-        self._reader_task = asyncio.create_task(self._read(reader), name=f"rpc {self.host}:{self.port}")
 
     async def login(self) -> None:
         """Send the login frame of the factory account and wait for any reply; bare clients have no login."""
@@ -340,83 +324,69 @@ class RpcConnection:
             raise
 
     async def close(self) -> None:
-        """End the reader, close the socket; a call that still waits gets `NotConnected`."""
-        reader, self._reader_task = self._reader_task, None
-        writer, self._writer = self._writer, None
-        if reader is not None:
-            reader.cancel()
-            await asyncio.wait([reader])
-        if writer is not None:
-            writer.close()
+        """Close the socket; a call that still waits gets `NotConnected`."""
+        stream, self._stream, self._lost = self._stream, None, None
+        if stream is not None:
+            stream[1].close()
             with contextlib.suppress(OSError):
-                await writer.wait_closed()
-        self._lost = None
-        if self._pending is not None and not self._pending[2].done():
-            self._pending[2].set_exception(NotConnected(DEVICE, self._pending[1], "closed while waiting"))
+                await stream[1].wait_closed()
 
     async def _exchange(self, ident: str | int, op: str, request: bytes) -> Any:
         async with self._lock:
-            if self._lost is not None:
-                raise ConnectionLost(DEVICE, op, self._lost)
-            if self._writer is None:
+            if self.lost:
+                raise ConnectionLost(DEVICE, op, str(self._lost))
+            if self._stream is None:
                 raise NotConnected(DEVICE, op, "not connected")
-            future: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
-            self._pending = (ident, op, future)
             try:
                 # No drain: requests are small, and a socket that cannot be written to fails the reader.
-                self._writer.write(request)
+                self._stream[1].write(request)
                 async with asyncio.timeout(self._timeout_s):
-                    return await future
+                    return await self._reply(ident, op, self._stream)
             except TimeoutError:
                 raise DeviceTimeout(DEVICE, op, f"no reply in {self._timeout_s:g} s") from None
-            finally:
-                self._pending = None
 
-    async def _read(self, reader: asyncio.StreamReader) -> None:
-        decoder = BareDecoder(DEVICE) if self._framing == "bare" else FrameDecoder(DEVICE)
-        try:
-            while data := await reader.read(65536):
-                for payload in decoder.feed(data):
-                    self._deliver(payload)
-            self._fail("the controller closed the connection")
-        except ProtocolViolation as error:
-            # Out of step with the stream: nothing after this can be trusted.
-            self._fail(error.what)
-        except OSError as error:
-            self._fail(error.strerror or str(error))
+    async def _reply(self, ident: str | int, op: str, stream: Stream) -> Any:
+        """Read until the call is answered. Bytes out of step end the connection: nothing after them can be trusted."""
+        while True:
+            try:
+                data = await stream[0].read(65536)
+                payloads = self._decoder.feed(data)
+                why = "" if data else "the controller closed the connection"
+            except ProtocolViolation as error:
+                payloads, why = [], error.what
+            except OSError as error:
+                payloads, why = [], error.strerror or str(error)
+            for payload in payloads:
+                if (answer := answer_in(payload, ident, op)) is not None:
+                    return answer.get("result")
+            if self._stream is not stream:
+                raise NotConnected(DEVICE, op, "closed while waiting")
+            if why:
+                self._lost = why
+                raise ConnectionLost(DEVICE, op, why)
 
-    def _deliver(self, payload: bytes) -> None:
-        if self._pending is None:
-            return
-        ident, op, future = self._pending
-        if future.done():
-            return
-        if ident == "":  # the login reply is not JSON, and its content carries no meaning
-            future.set_result(payload)
-            return
-        try:
-            reply = json.loads(payload)
-        except (ValueError, RecursionError):
-            future.set_exception(ProtocolViolation(DEVICE, op, f"reply is not JSON: {payload[:40]!r}"))
-            return
-        if not isinstance(reply, dict):
-            return
-        answer: dict[str, Any] = reply  # pyright: ignore[reportUnknownVariableType]
-        echo = answer.get("id")
-        if type(echo) is not type(ident) or echo != ident:  # True equals 1
-            return
-        match answer.get("error"):
-            case {"code": int(code), "message": str(message)}:
-                future.set_exception(RpcError(DEVICE, op, code, message))
-            case None if "result" in answer:
-                future.set_result(answer["result"])
-            case other:
-                future.set_exception(ProtocolViolation(DEVICE, op, f"neither result nor error: {other!r}"))
 
-    def _fail(self, why: str) -> None:
-        self._lost = why
-        if self._pending is not None and not self._pending[2].done():
-            self._pending[2].set_exception(ConnectionLost(DEVICE, self._pending[1], why))
+def answer_in(payload: bytes, ident: str | int, op: str) -> dict[str, Any] | None:
+    """The reply with the call's id; None for that of another call. The login, whose id is empty, takes any reply.
+
+    Raises `RpcError` for an error object, `ProtocolViolation` for what is neither result nor error.
+    """
+    if ident == "":
+        return {}
+    try:
+        reply: Any = json.loads(payload)
+    except (ValueError, RecursionError):
+        raise ProtocolViolation(DEVICE, op, f"reply is not JSON: {payload[:40]!r}") from None
+    echo = reply.get("id") if isinstance(reply, dict) else None  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
+    if type(echo) is not type(ident) or echo != ident:  # pyright: ignore[reportUnknownArgumentType] # True equals 1
+        return None
+    match reply:
+        case {"error": {"code": int(code), "message": str(message)}}:
+            raise RpcError(DEVICE, op, code, message)
+        case {"result": _} if reply.get("error") is None:
+            return reply
+        case _:
+            raise ProtocolViolation(DEVICE, op, f"neither result nor error: {payload[:80]!r}")
 
 
 async def open_arcs(connection: RpcConnection) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Any, cast
 
 from brushloop.drivers.arcs.telemetry import MAX_MESSAGE_BYTES, PING, SET_RECIPE, decode_message, encode_sample
-from brushloop.drivers.arcs.wire import BareDecoder, FrameDecoder, encode, named
+from brushloop.drivers.arcs.wire import BareDecoder, FrameDecoder, encode, parameters
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.geometry import to_wire
 from brushloop.drivers.loopback import LoopbackServer
@@ -142,7 +142,7 @@ class ArcsServer(LoopbackServer):
             return _error(ident, METHOD_NOT_FOUND, f"method not found: {name}")
         try:
             if isinstance(params, list):
-                params = named(name, params)  # pyright: ignore[reportUnknownArgumentType]
+                params = dict(zip(parameters(name), params, strict=True))  # pyright: ignore[reportUnknownArgumentType]
             result = method(params or {})
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             return _error(ident, INVALID_PARAMS, f"invalid params: {error!r}")

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
+from brushloop.drivers.arcs.wire import RpcConnection
 from brushloop.drivers.force.simulator import ForceBoard
 from brushloop.drivers.ink.simulator import PtyLine
 from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
@@ -113,6 +114,12 @@ def scripted(exchanges: Sequence[tuple[bytes, bytes]], clock: PatientClock) -> I
         yield line.path
     assert not script.surprises
     assert not script.left, f"never asked for: {script.left}"
+
+
+def cut(connection: RpcConnection) -> None:
+    """End the connection from this side, as a pulled cable does."""
+    assert connection._stream is not None
+    connection._stream[1].transport.abort()
 
 
 def mute(server: ArcsServer | RtdeServer) -> None:

@@ -21,10 +21,10 @@ from brushloop.drivers.arcs.telemetry import PING, RtdeStream, decode_message, e
 from brushloop.drivers.arcs.wire import (
     FACTORY_LOGIN_TOKEN,
     MAX_DEPTH,
-    MAX_PAYLOAD_BYTES,
     BareDecoder,
     FrameDecoder,
     RpcConnection,
+    answer_in,
     encode,
     encode_bare_request,
     encode_request,
@@ -148,14 +148,13 @@ def test_every_line_of_the_ink_stations_documented_transcript_is_sound():
     "refused",
     [
         lambda: encode_bare_request(1, "rob1.MotionControl.stopLine", {"acc": 1.0}),
-        lambda: encode(bytes(MAX_PAYLOAD_BYTES + 1)),
         *(lambda a=a: pump.write_register(*a) for a in ((248, 1, 1), (1, 0x10000, 1), (1, 1, -1))),
         *(lambda a=a: station.seal(*a) for a in ((1000, "ok"), (1, "a*b"), (1, "a\nb"), (1, "x" * 90))),
         *(lambda v=v: numbers("getTcpPose", v, 3) for v in ("123", [1, 2], [1, 2, "3"], [1, 2, True], [1, 2, 10**400])),
     ],
 )
 def test_what_a_format_cannot_carry_is_refused(refused: Callable[[], object]):
-    with pytest.raises(ValueError, match=r"stopLine|exceeds|do not fit|not a line|expected 3"):
+    with pytest.raises(ValueError, match=r"stopLine|do not fit|not a line|expected 3"):
         refused()
 
 
@@ -167,11 +166,7 @@ Read = Callable[[bytes], Awaitable[object]]
 
 async def answered(payload: bytes) -> object:
     """What a call gets for this payload."""
-    connection = RpcConnection("127.0.0.1", 1)
-    future: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
-    connection._pending = ("a", "getTcpPose", future)
-    connection._deliver(payload)
-    return future.result() or True if future.done() else None
+    return answer_in(payload, "a", "getTcpPose")
 
 
 class Cabinet(Controller):
@@ -333,7 +328,6 @@ ENDLESS: dict[str, tuple[Callable[[], Feed], bytes, bytes]] = {
     "pings": (lambda: FrameDecoder(skip=PING).feed, PING * 100_000 + b"SOF\x02", b""),
     "arrays in arrays": (lambda: BareDecoder().feed, b"[", b"["),
     "a string": (lambda: BareDecoder(max_bytes=100_000).feed, b'{"a":"', b"\\" * 300),
-    "a number": (lambda: BareDecoder().feed, b'{"a":' + b"9" * 10_000 + b"}", b""),
 }
 
 

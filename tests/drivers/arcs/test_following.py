@@ -24,6 +24,7 @@ from brushloop.drivers.errors import (
 from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.limits import Limits
 from brushloop.drivers.sim.arcs_server import ArcsServer
+from tests.drivers.failing import cut
 
 WAY = {"speed_mm_s": 40.0, "acc_mm_s2": 800.0, "blend_mm": 1.0}
 SLOW = {**WAY, "speed_mm_s": 3.0}
@@ -115,8 +116,7 @@ async def test_one_pose_outside_the_limits_and_nothing_is_sent(arm: AuboArcs, ca
 
 
 async def loses_its_connection(arm: AuboArcs, _: ArcsServer) -> None:
-    assert arm._motion.connection._writer is not None
-    arm._motion.connection._writer.transport.abort()
+    cut(arm._motion.connection)
 
 
 async def is_held(_: AuboArcs, cabinet: ArcsServer) -> None:

@@ -24,7 +24,7 @@ from brushloop.drivers.errors import (
 from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
-from tests.drivers.failing import mute
+from tests.drivers.failing import cut, mute
 
 X_MM, Y_MM = 250.0, -230.0
 HOME, TOP, DEEP = (brush_pose(X_MM, Y_MM, z_mm) for z_mm in (260.0, 300.0, 200.0))
@@ -98,9 +98,7 @@ async def test_a_host_that_is_gone_once_the_path_was_let_go_is_not_needed(arm: A
     task = asyncio.create_task(arm.sequence(PRESS, acc_mm_s2=ACC))
     await below(cabinet, 250.0)
     for controller in (arm._motion, arm._stop, arm._state):
-        writer = controller.connection._writer
-        assert writer is not None
-        writer.transport.abort()
+        cut(controller.connection)
     mute(cabinet)
     while queued(cabinet):
         await asyncio.sleep(0.01)
@@ -116,9 +114,8 @@ async def test_a_connection_that_is_lost_before_the_path_is_let_go_leaves_the_ar
     arm: AuboArcs, cabinet: ArcsServer, number: int
 ):
     def lose(now: int) -> None:
-        writer = arm._motion.connection._writer
-        if now == number and writer is not None:
-            writer.transport.abort()
+        if now == number:
+            cut(arm._motion.connection)
 
     before_each(cabinet, LINE, lose)
     with pytest.raises(ConnectionLost):

@@ -309,7 +309,9 @@ async def test_a_stop_waits_for_a_line_that_is_on_its_way(
 
     async def delayed(method: str, params: object = None) -> object:
         if method.endswith("moveLine"):
-            monkeypatch.setattr(connection, "_writer", SlowNetwork(connection._writer))
+            assert connection._stream is not None
+            reader, writer = connection._stream
+            monkeypatch.setattr(connection, "_stream", (reader, SlowNetwork(writer)))
             sent.set()
         return await send(method, params)
 
