@@ -329,9 +329,7 @@ async def write_report(path: Path, config: RigConfig, findings: list[Finding]) -
 
 async def transcript(host: str, port: int, framing: Framing, scrubber: Scrubber) -> str:
     """Every question to the controller and its answer, one JSON object a line, without names."""
-    lines = [
-        asdict(exchange) | {"took_ms": round(exchange.took_ms, 3)} for exchange in await survey(host, port, framing)
-    ]
+    lines = await survey(host, port, framing)
     return "".join(json.dumps(scrubber.value(line)) + "\n" for line in lines)
 
 

@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import asyncio
 import statistics
-from collections.abc import AsyncGenerator, AsyncIterator, Callable
+import time
+from collections.abc import AsyncGenerator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
@@ -160,10 +161,8 @@ class Controller:
     def __init__(self, connection: RpcConnection) -> None:
         self.connection = connection
         self.robot = ""
-        self.on_notice: Callable[[str], None] | None = None
         self.on_pose: Callable[[Pose, float], None] | None = None
         """Gets each pose that was asked for, and how long the answer took, in s."""
-        self._reduced = False
 
     async def ask(self, method: str, **params: object) -> Any:
         """Call a method of the robot; the answer is unchecked."""
@@ -189,6 +188,16 @@ class Controller:
         """Six joints in rad. Raises `ProtocolViolation`."""
         return numbers("getJointPositions", await self.ask("RobotState.getJointPositions"))
 
+    async def payload(self) -> tuple[float, list[float]]:
+        """(mass in kg, its centre in mm). Raises `ProtocolViolation`."""
+        answer = await self.ask("RobotConfig.getPayload")
+        try:
+            mass_kg, cog_m, *_ = answer
+            mass_kg, *centre_m = numbers("getPayload", [mass_kg, *cog_m], 4)
+        except (TypeError, ValueError):
+            raise ProtocolViolation(DEVICE, "getPayload", f"expected mass and centre, got {answer!r}") from None
+        return mass_kg, [1e3 * v for v in centre_m]
+
     async def mode(self) -> RobotMode:
         """The robot mode. Raises `ProtocolViolation` for an unknown name."""
         mode = await self.ask("RobotState.getRobotModeType")
@@ -199,23 +208,19 @@ class Controller:
 
     async def state(self, calls: int) -> ArmState:
         """Read the modes and time `calls` consecutive calls of one kind; sets nothing."""
-        loop = asyncio.get_running_loop()
         took_s: list[float] = []
         for _ in range(calls):
-            began = loop.time()
+            began_s = time.monotonic()
             await self.pose()
-            took_s.append(loop.time() - began)
+            took_s.append(time.monotonic() - began_s)
         safety = str(await self.ask("RobotState.getSafetyModeType"))
         return ArmState(str(await self.mode()), safety, statistics.median(took_s) * 1e3)
 
     async def require_safe(self, op: str) -> None:
-        """Raise `RobotNotSafe`, with condition and remedy, unless the mode allows motion; reduced is reported."""
+        """Raise `RobotNotSafe`, with condition and remedy, unless the mode allows motion."""
         mode = str(await self.ask("RobotState.getSafetyModeType"))
         if mode not in MOVING_ALLOWED:
             raise RobotNotSafe(DEVICE, op, mode, *CONDITION_AND_REMEDY.get(mode, UNKNOWN_CONDITION))
-        reduced, self._reduced = self._reduced, mode == SafetyMode.REDUCED
-        if self._reduced and not reduced and self.on_notice is not None:
-            self.on_notice("safety mode is ReducedMode: the arm may be slower than asked")
 
     async def move_line(
         self, target: Pose, speed_mm_s: float, acc_mm_s2: float, blend_mm: float = 0.0, least_s: float = 0.0
@@ -224,17 +229,8 @@ class Controller:
 
         The next line may begin `blend_mm` before its end: 0 halts there, else 1 mm to 1 m. It takes at least `least_s`.
         """
-        code = await self.ask(
-            "MotionControl.moveLine",
-            pose=to_wire(target),
-            a=acc_mm_s2 / 1e3,
-            v=speed_mm_s / 1e3,
-            blend_radius=blend_mm / 1e3,
-            duration=least_s,
-        )
-        if code not in (ReturnCode.OK, ReturnCode.REQUEST_IGNORED):
-            await self.require_safe("moveLine")
-        accepted("moveLine", code)
+        pace = {"a": acc_mm_s2 / 1e3, "v": speed_mm_s / 1e3, "blend_radius": blend_mm / 1e3, "duration": least_s}
+        await self._motion("moveLine", pose=to_wire(target), **pace)
 
     async def at_rest(self) -> bool:
         """True when the queue is empty and the arm is steady."""
@@ -261,7 +257,7 @@ class Controller:
 
     async def hold_path(self) -> None:
         """Let the controller hold its path: it accepts lines and keeps them, but carries out none."""
-        accepted("stopMove", await self.ask("MotionControl.stopMove", quick=True, all_tasks=True))
+        await self._motion("stopMove", quick=True, all_tasks=True)
 
     async def release(self) -> None:
         """End a hold while the arm is `idle`, which moves nothing; the answer is ignored, as there may be no hold."""
@@ -269,10 +265,13 @@ class Controller:
 
     async def go_on(self) -> None:
         """Carry out the lines that were kept. Raises `RobotNotSafe` or `MotionRefused`."""
-        code = await self.ask("MotionControl.startMove")
+        await self._motion("startMove")
+
+    async def _motion(self, op: str, **params: object) -> None:
+        code = await self.ask(f"MotionControl.{op}", **params)
         if code not in (ReturnCode.OK, ReturnCode.REQUEST_IGNORED):
-            await self.require_safe("startMove")
-        accepted("startMove", code)
+            await self.require_safe(op)
+        accepted(op, code)
 
     async def halt(self, acc_m_s2: float) -> None:
         """Decelerate along the path, then drop the queue, even if the first call fails."""
@@ -315,78 +314,57 @@ OF_THE_ROBOT = (
 MESSAGES = 5
 
 
-@dataclass(frozen=True, slots=True)
-class Exchange:
-    """One question and what came back."""
+async def survey(host: str, port: int, framing: Framing) -> list[dict[str, Any]]:
+    """Ask everything on one connection, in the driver's order: version before login, then all about the first robot.
 
-    method: str
-    params: dict[str, Any] | None
-    answer: dict[str, Any]
-    """`result` or `error` as the controller sent it, else `silence`, `lost` or `refused`: why there is none."""
-    took_ms: float
-
-
-async def survey(host: str, port: int, framing: Framing) -> list[Exchange]:
-    """Ask everything on one connection. An answer that is missing or senseless is noted, and the next one asked.
-
-    Ends early where the controller does not connect or hangs up. Sets, powers and moves nothing.
+    Each exchange has `method`, `params`, `took_ms` and `answer`: `result` or `error` as the controller sent it, else
+    `silence`, `lost` or `refused`, which says why there is none; then the next question is asked. Ends early where the
+    controller does not connect or hangs up. Sets, powers and moves nothing.
     """
     connection = RpcConnection(host, port, framing=framing)
+    exchanges: list[dict[str, Any]] = []
+    results: dict[str, Any] = {}
+
+    async def ask(method: str, params: dict[str, Any] | None = None) -> None:
+        if not connection.lost:
+            exchanges.append(await _exchange(method, params, connection.call(method, params)))
+            results[method.rpartition(".")[2]] = exchanges[-1]["answer"].get("result")
+
     try:
-        return [exchange async for exchange in _asked(connection)]
+        opened = await _exchange("connect", None, open_arcs(connection))
+        if "result" not in opened["answer"]:
+            return [opened]
+        await ask("SystemInfo.getInterfaceVersionCode")
+        login = await _exchange("login", None, connection.login())
+        if "result" not in login["answer"]:
+            exchanges.append(login)
+        await ask("getRobotNames")
+        names = results.get("getRobotNames")
+        robot = str(names[0]) if isinstance(names, list) and names else "rob1"  # pyright: ignore[reportUnknownArgumentType]
+        for method in (*OF_THE_CONTROLLER, *(f"{robot}.{name}" for name in OF_THE_ROBOT)):
+            await ask(method)
+        joints, pose = results.get("getJointPositions"), results.get("getTcpPose")
+        if joints and pose:
+            await ask(f"{robot}.RobotAlgorithm.forwardKinematics", {"q": joints})
+            await ask(f"{robot}.RobotAlgorithm.inverseKinematics", {"qnear": joints, "pose": pose})
+        await ask(f"{robot}.Trace.peek", {"num": MESSAGES, "last_time": 0})
     finally:
         await connection.close()
+    return exchanges
 
 
-async def _asked(connection: RpcConnection) -> AsyncIterator[Exchange]:
-    """Ask in the driver's order: version before login, then names of the robots, then everything about the first."""
+async def _exchange(method: str, params: dict[str, Any] | None, step: Awaitable[Any]) -> dict[str, Any]:
+    """One exchange of `survey`."""
+    began_s = time.monotonic()
     try:
-        await open_arcs(connection)
-    except DeviceError as error:
-        yield Exchange("connect", None, {"refused": str(error)}, 0.0)
-        return
-    answers: dict[str, Any] = {}
-
-    async def ask(method: str, params: dict[str, Any] | None = None) -> Exchange:
-        exchange = await _exchange(connection, method, params)
-        answers[method.rpartition(".")[2]] = exchange.answer.get("result")
-        return exchange
-
-    yield await ask("SystemInfo.getInterfaceVersionCode")
-    try:
-        await connection.login()
-    except DeviceError as error:
-        yield Exchange("login", None, {"refused": str(error)}, 0.0)
-        if connection.lost:
-            return
-    yield await ask("getRobotNames")
-    names = answers["getRobotNames"]
-    robot = str(names[0]) if isinstance(names, list) and names else "rob1"  # pyright: ignore[reportUnknownArgumentType]
-    for method in (*OF_THE_CONTROLLER, *(f"{robot}.{name}" for name in OF_THE_ROBOT)):
-        if connection.lost:
-            return
-        yield await ask(method)
-    joints, pose = answers["getJointPositions"], answers["getTcpPose"]
-    if isinstance(joints, list) and isinstance(pose, list):
-        yield await ask(f"{robot}.RobotAlgorithm.forwardKinematics", {"q": joints})
-        yield await ask(f"{robot}.RobotAlgorithm.inverseKinematics", {"qnear": joints, "pose": pose})
-    yield await ask(f"{robot}.Trace.peek", {"num": MESSAGES, "last_time": 0})
-
-
-async def _exchange(connection: RpcConnection, method: str, params: dict[str, Any] | None) -> Exchange:
-    loop = asyncio.get_running_loop()
-    began = loop.time()
-    try:
-        answer: dict[str, Any] = {"result": await connection.call(method, params)}
+        answer: dict[str, Any] = {"result": await step}
     except RpcError as error:
         answer = {"error": {"code": error.code, "message": error.message}}
-    except DeviceTimeout as error:
-        answer = {"silence": error.what}
-    except ConnectionLost as error:
-        answer = {"lost": error.what}
     except DeviceError as error:
-        answer = {"refused": error.what}
-    return Exchange(method, params, answer, (loop.time() - began) * 1e3)
+        reasons = {DeviceTimeout: "silence", ConnectionLost: "lost"}
+        answer = {reasons.get(type(error), "refused"): error.what}
+    took_ms = round((time.monotonic() - began_s) * 1e3, 3)
+    return {"method": method, "params": params, "answer": answer, "took_ms": took_ms}
 
 
 @asynccontextmanager

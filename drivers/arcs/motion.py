@@ -52,29 +52,31 @@ def arrived(here: Pose, target: Pose) -> bool:
     return off_mm <= ARRIVED_MM and off_deg <= ARRIVED_DEG
 
 
-Look = Callable[[], Awaitable[tuple[bool, Pose] | DeviceError]]
-"""Asks whether the arm rests, and where its tip is. An error that it returns, it does not raise: it is to ask again."""
+Look = Callable[[], Awaitable[tuple[bool, Pose]]]
+"""Asks whether the arm rests, and where its tip is."""
 
 
-async def until_settled(look: Look, target: Pose, planned_s: float) -> None:
+async def until_settled(look: Look, target: Pose, planned_s: float, *, patient: bool = False) -> None:
     """Return once `look` reports that the arm rests where it was sent.
 
     Raises `MotionFailed` if the arm rests elsewhere, or if twice the planned time has passed and it comes no nearer: an
-    arm whose speed was turned down on the pendant is slow, not stuck. An error that `look` returns, instead of raising
-    it, is raised only if it still returns one after twice the planned time.
+    arm whose speed was turned down on the pendant is slow, not stuck. If `patient`, an answer that cannot be read is an
+    error only after twice the planned time: until then `look` asks again.
     """
     loop = asyncio.get_running_loop()
     begun_at, allowed_s = loop.time(), 2.0 * planned_s + 3.0
     idle_since: float | None = None
     nearest, nearer_at = math.inf, begun_at
     while True:
-        state, now = await look(), loop.time()
-        if isinstance(state, DeviceError):
-            if now > begun_at + allowed_s:
-                raise state
+        late = loop.time() > begun_at + allowed_s
+        try:
+            steady, here = await look()
+        except DeviceError as error:
+            if late or not patient or isinstance(error, MotionError):
+                raise
             await asyncio.sleep(POLL_S)
             continue
-        steady, here = state
+        now = loop.time()
         off_mm, off_deg = distance(here, target)
         if off_mm + off_deg < nearest - PROGRESS:
             nearest, nearer_at = off_mm + off_deg, now
@@ -83,7 +85,7 @@ async def until_settled(look: Look, target: Pose, planned_s: float) -> None:
         idle_since = (idle_since or now) if steady else None
         if idle_since is not None and now - idle_since > RESTS_ELSEWHERE_S:
             raise _not_arrived(f"rests {off_mm:.2f} mm and {off_deg:.2f} deg from the target")
-        if now > begun_at + allowed_s and now - nearer_at > STUCK_S:
+        if late and now - nearer_at > STUCK_S:
             raise _not_arrived(f"not settled after {allowed_s:.1f} s, {off_mm:.2f} mm and {off_deg:.2f} deg to go")
         await asyncio.sleep(POLL_S)
 
@@ -114,40 +116,35 @@ NEWEST = 20
 
 
 class Messages:
-    """The controller's messages since `begin`."""
+    """The controller's messages, as far as they were not seen before."""
 
     def __init__(self, controller: Controller) -> None:
         self._controller = controller
         self._seen = 0
         """Newest timestamp of the controller seen so far; its unit is unknown, but it increases."""
 
-    async def begin(self) -> None:
-        """Skip the messages that are already there; they concern earlier motion."""
-        await self._new()
-
-    async def explain(self, error: MotionFailed) -> MotionFailed:
-        """`OutOfReach` if a new message reports it, else the error itself."""
-        for code in await self._new():
-            if code in PLANNING_FAILED:
-                return OutOfReach(DEVICE, error.op, code, PLANNING_FAILED[code])
-        return error
-
-    async def _new(self) -> list[int]:
-        """Codes of the messages not seen before; empty if the controller does not answer."""
-        messages: Any = []
-        with contextlib.suppress(DeviceError):
-            messages = await self._controller.ask("Trace.peek", num=NEWEST, last_time=self._seen)
-        codes: list[int] = []
-        newest = self._seen
+    async def codes(self) -> list[int]:
+        """Codes of the messages since the last call; none where the controller's answer cannot be read."""
+        try:
+            messages: Any = await self._controller.ask("Trace.peek", num=NEWEST, last_time=self._seen)
+        except DeviceError:
+            return []
+        fresh: list[tuple[int, int]] = []
         for message in messages if isinstance(messages, list) else []:  # pyright: ignore[reportUnknownVariableType]
             match message:
                 case {"code": int(code), "timestamp": int(stamp)} if stamp > self._seen:
-                    codes.append(code)
-                    newest = max(newest, stamp)
+                    fresh.append((stamp, code))
                 case _:  # pyright: ignore[reportUnknownVariableType]
                     pass
-        self._seen = newest
-        return codes
+        self._seen = max((stamp for stamp, _ in fresh), default=self._seen)
+        return [code for _, code in fresh]
+
+    async def explain(self, error: MotionFailed) -> MotionFailed:
+        """`OutOfReach` if a new message reports it, else the error itself."""
+        for code in await self.codes():
+            if code in PLANNING_FAILED:
+                return OutOfReach(DEVICE, error.op, code, PLANNING_FAILED[code])
+        return error
 
 
 MOST_QUEUED = 16
@@ -190,6 +187,11 @@ def legs_of(
     return legs
 
 
+def seconds_of(legs: Sequence[Leg]) -> float:
+    """An upper estimate of how long the legs take together."""
+    return sum(leg.seconds for leg in legs)
+
+
 async def feed(
     controller: Controller,
     legs: Sequence[Leg],
@@ -204,56 +206,46 @@ async def feed(
     """
     loop = asyncio.get_running_loop()
     room, sent = MOST_QUEUED, 0
-    seen, advanced_at = (-1, 0), loop.time()
-    dry_since: float | None = None
+    queue, advanced_at = EMPTY, loop.time()
+
+    def require_not_stopped() -> None:
+        # Checked before every line, with nothing awaited between: after a stop none may follow.
+        if stopped():
+            raise _cut_short(sent, len(legs), "the arm was stopped")
+
     await controller.require_safe("moveLine")
     while True:
         while sent < len(legs) and room > 0:
-            # Checked before every line, with nothing awaited between: after a stop none may follow.
-            if stopped():
-                raise _cut_short(sent, len(legs), "the arm was stopped")
+            require_not_stopped()
             leg = legs[sent]
             try:
                 await controller.move_line(leg.target, leg.speed_mm_s, acc_mm_s2, leg.blend_mm)
             except MotionRefused as refusal:
                 if refusal.code != ReturnCode.QUEUE_FULL or sent == 0:  # then none of those in the queue is ours
                     raise
-                # It may be sent again: the controller holds fewer lines than assumed. A controller that still refuses
-                # with nothing queued ends below, as an arm that does not advance.
-                break
+                break  # the controller holds fewer lines than assumed: it is sent again
             sent, room = sent + 1, room - 1
         if sent == len(legs):
             return
         await asyncio.sleep(POLL_S)
-        if stopped():  # also where no line may follow for want of room
-            raise _cut_short(sent, len(legs), "the arm was stopped")
+        require_not_stopped()
         await controller.require_safe("moveLine")
-        queue, now = await controller.queue(), loop.time()
-        if queue != seen:
-            seen, advanced_at = queue, now
+        before, queue, now = queue, await controller.queue(), loop.time()
+        if queue != before:
+            advanced_at = now
         elif now - advanced_at > STUCK_S + 2.0 * max(leg.seconds for leg in legs[:sent]):
             raise _cut_short(sent, len(legs), "the arm does not advance")
         room = max(MOST_QUEUED - queue[1], 0)
-        if queue != EMPTY:
-            dry_since = None
-            continue
-        # The lines came too late, or the arm has not begun, or another client stopped it: then nothing may follow.
-        here, target = await controller.pose(), legs[sent - 1].target
-        if arrived(here, target):
-            notice(f"the arm halted at point {sent} of {len(legs)}: lines did not reach the controller in time")
-            continue
-        room, dry_since = 0, dry_since or now
-        if now - dry_since > RESTS_ELSEWHERE_S:
-            off_mm, _ = distance(here, target)
-            raise _cut_short(sent, len(legs), f"the arm rests {off_mm:.2f} mm from where it was sent")
+        if queue == EMPTY:
+            # The lines came too late; or the arm has not begun, or another client stopped it: then nothing may follow.
+            if arrived(await controller.pose(), legs[sent - 1].target):
+                notice(f"the arm halted at point {sent} of {len(legs)}: lines did not reach the controller in time")
+            else:
+                room = 0
 
 
 def _cut_short(sent: int, legs: int, why: str) -> MotionFailed:
-    return MotionFailed(
-        DEVICE,
-        "follow",
-        f"{why}, after {sent} of {legs} points were sent",
-    )
+    return MotionFailed(DEVICE, "follow", f"{why}, after {sent} of {legs} points were sent")
 
 
 async def queue_all(
@@ -313,26 +305,19 @@ class OwnPath:
         self._most = self._lines = len(lines)
         self._ids: set[int] = set()
 
-    async def look(self) -> tuple[bool, Pose] | DeviceError:
-        """Whether the arm rests, and where; the error, if an answer could not be read. That says nothing about the arm,
-        which carries out all lines by itself.
+    async def look(self) -> tuple[bool, Pose]:
+        """Whether the arm rests, and where. Raises `RobotNotSafe` and `PathDisturbed`.
 
-        Raises `RobotNotSafe` and `PathDisturbed`.
+        Any other error says nothing about the arm, which carries out all lines by itself.
         """
         self.require_followed()
-        controller = self._controller
-        try:
-            if controller.connection.lost:
-                await controller.connection.reopen()
-            running, size = await controller.queue()
-            state = await controller.rest()
-        except MotionError:
-            raise
-        except DeviceError as error:
-            return error
+        if self._controller.connection.lost:
+            await self._controller.connection.reopen()
+        running, size = await self._controller.queue()
+        steady, here = await self._controller.rest()
         self._require_ours(running, size)
-        self._require_near(state[1])
-        return state
+        self._require_near(here)
+        return steady, here
 
     def require_followed(self) -> None:
         """Raise `PathDisturbed` if telemetry has shown the tip beside the path since it was first seen on it."""

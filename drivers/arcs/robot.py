@@ -9,13 +9,13 @@ from typing import Any, TypeVar
 from brushloop.drivers.arcs.controller import LOOPBACK_CONTROL_BOX, ArmState, Controller
 from brushloop.drivers.arcs.motion import (
     Leg,
-    Look,
     Messages,
     OwnPath,
     arrived,
     feed,
     legs_of,
     queue_all,
+    seconds_of,
     until_settled,
 )
 from brushloop.drivers.arcs.settings import ArcsTable, Departure, make_ready, power_on
@@ -53,8 +53,6 @@ class AuboArcs:
         self._stopper = Stopper([self._stop, self._state], self._motion, self._restore_stop)
         self._stops = 0
         """Number of stops so far; a motion compares it, because it must send no line after a stop."""
-        self._unsettled = False
-        """True from the moment a line is sent until the arm is seen at rest."""
         self._held = False
         """Whether the controller may hold its path."""
         self._connected = False
@@ -63,7 +61,6 @@ class AuboArcs:
         self._watchdog = Watchdog(self._state.connection, table.watchdog_s, on_notice)
         self._messages = Messages(self._motion)
         self._departure = Departure(self._motion)
-        self._motion.on_notice = on_notice
         self._motion.on_pose = self._telemetry.lag.asked
 
     async def connect(self) -> Identity:
@@ -108,12 +105,12 @@ class AuboArcs:
             except MotionFailed:
                 await self._motion.require_safe("power on")  # a safety stop holds the path, and is the cause
                 raise
-        settings = await make_ready(self._motion, self._table, self._notice)
+        settings = await make_ready(self._motion, self._table)
         await power_on(self._motion)
         self._held = True  # a process that was killed may have left it so
         await self._ready()
         await self._departure.enabled(settings)
-        await self._messages.begin()
+        await self._messages.codes()  # those that are there concern earlier motion
         await self._watchdog.arm()
         await self._telemetry.read()
 
@@ -131,7 +128,7 @@ class AuboArcs:
         The whole line is checked, from where the arm really is. Any failure, cancellation included, stops the arm
         before it is raised.
         """
-        await self._fed([QueuedLine(target, speed_mm_s)], acc_mm_s2, None)
+        await self._feed([QueuedLine(target, speed_mm_s)], acc_mm_s2)
 
     async def follow(self, poses: Sequence[Pose], *, speed_mm_s: float, acc_mm_s2: float, blend_mm: float) -> None:
         """Send lines through all poses without a halt between them, then wait as `move` does at the last.
@@ -141,7 +138,7 @@ class AuboArcs:
         """
         if not poses:
             raise ValueError("follow: no poses")
-        await self._fed([QueuedLine(pose, speed_mm_s) for pose in poses], acc_mm_s2, blend_mm)
+        await self._feed([QueuedLine(pose, speed_mm_s) for pose in poses], acc_mm_s2, blend_mm)
 
     async def sequence(self, lines: Sequence[QueuedLine], *, acc_mm_s2: float) -> list[Pose]:
         """Queue all lines while the controller holds its path, release it, and wait as `move` does.
@@ -153,37 +150,36 @@ class AuboArcs:
         if not lines or arrived(start, lines[-1].target):
             raise ValueError("sequence: it must not end where it begins")
         legs = legs_of(start, lines, self._limits, acc_mm_s2)
-        return await self._carry_out(self._pressed(start, legs, acc_mm_s2), legs[-1].target)
+        return await self._carry_out(self._press(start, legs, acc_mm_s2), legs)
 
-    async def _fed(self, lines: Sequence[QueuedLine], acc_mm_s2: float, blend_mm: float | None) -> None:
-        start = await self._depart("moveLine", lines, acc_mm_s2)
-        legs = legs_of(start, lines, self._limits, acc_mm_s2, blend_mm)
-        stops = self._stops
-        feeding = feed(self._motion, legs, acc_mm_s2, stopped=lambda: self._stops != stops, notice=self._notice)
-        await self._carry_out(self._settled(feeding, legs), legs[-1].target)
-
-    async def _pressed(self, start: Pose, legs: Sequence[Leg], acc_mm_s2: float) -> list[Pose]:
+    async def _press(self, start: Pose, legs: Sequence[Leg], acc_mm_s2: float) -> list[Pose]:
         stops = self._stops
         self._held = True
         with self._telemetry.seeing() as seen:
             path = OwnPath(self._motion, start, legs, seen)
-            queueing = queue_all(self._motion, start, legs, acc_mm_s2, stopped=lambda: self._stops != stops)
-            await self._settled(queueing, legs, path.look)
+            await queue_all(self._motion, start, legs, acc_mm_s2, stopped=lambda: self._stops != stops)
+            await until_settled(path.look, legs[-1].target, seconds_of(legs), patient=True)
             self._held = False
             await self._telemetry.reaching(legs[-1].target)
             path.require_followed()
             return [*seen]
 
-    async def _settled(self, command: Coroutine[Any, Any, None], legs: Sequence[Leg], look: Look | None = None) -> None:
-        await command
-        await until_settled(look or self._motion.rest, legs[-1].target, sum(leg.seconds for leg in legs))
+    async def _feed(self, lines: Sequence[QueuedLine], acc_mm_s2: float, blend_mm: float | None = None) -> None:
+        start = await self._depart("moveLine", lines, acc_mm_s2)
+        legs = legs_of(start, lines, self._limits, acc_mm_s2, blend_mm)
+        stops = self._stops
 
-    async def _carry_out(self, motion: Coroutine[Any, Any, _R], target: Pose) -> _R:
-        self._unsettled, self._departure.left = True, None
+        async def motion() -> None:
+            await feed(self._motion, legs, acc_mm_s2, stopped=lambda: self._stops != stops, notice=self._notice)
+            await until_settled(self._motion.rest, legs[-1].target, seconds_of(legs))
+
+        await self._carry_out(motion(), legs)
+
+    async def _carry_out(self, motion: Coroutine[Any, Any, _R], legs: Sequence[Leg]) -> _R:
+        """Whatever ends the motion before the arm has settled, the arm is stopped before it is raised."""
+        self._departure.left = None
         try:
             result = await motion
-            self._unsettled, self._departure.left = False, target
-            return result
         except BaseException as error:
             note = ""
             try:
@@ -196,6 +192,8 @@ class AuboArcs:
                     cause.add_note(note)
                 raise cause from error
             raise
+        self._departure.left = legs[-1].target
+        return result
 
     async def _depart(self, op: str, lines: Sequence[QueuedLine], acc_mm_s2: float) -> Pose:
         """Check that the arm may go along `lines` from where it is, and return that place; see `Departure`."""
@@ -217,7 +215,6 @@ class AuboArcs:
             raise NotConnected(DEVICE, "stop", "not connected")
         self._stops += 1
         await self._stopper.stop(STOP_ACC_M_S2)
-        self._unsettled = False
 
     async def where(self) -> Pose:
         """Ask the controller for the pose, independently of telemetry."""
@@ -255,7 +252,7 @@ class AuboArcs:
         self._telemetry.listener = None
         try:
             if self._enabled:
-                under_way = self._unsettled
+                under_way = self._departure.under_way
                 try:
                     await self.stop()
                 except DeviceError:

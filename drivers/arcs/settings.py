@@ -9,9 +9,9 @@ from __future__ import annotations
 import asyncio
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, Field
 
@@ -19,15 +19,8 @@ from brushloop.drivers.arcs.controller import Controller, RobotMode, WrongOperat
 from brushloop.drivers.arcs.motion import POLL_S
 from brushloop.drivers.arcs.wire import DEVICE, Framing, numbers
 from brushloop.drivers.devices import Pose
-from brushloop.drivers.errors import (
-    ArmMoved,
-    DeviceTimeout,
-    NotConnected,
-    NotPowered,
-    ProtocolViolation,
-    SettingsChanged,
-)
-from brushloop.drivers.geometry import distance, from_wire
+from brushloop.drivers.errors import ArmMoved, DeviceTimeout, NotConnected, NotPowered, SettingsChanged
+from brushloop.drivers.geometry import angles, distance, from_wire
 from brushloop.drivers.limits import Limits
 
 Finite = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
@@ -68,138 +61,88 @@ POWER_S = 60.0
 TOLERANCE = 1e-3
 """Largest difference in mm, deg and kg: a controller may keep single precision."""
 
-Value = tuple[float, ...] | str
-Settings = Mapping[str, Value]
-"""By name, in the units of `SETTINGS`."""
-
-
-Command = tuple[str, dict[str, Any]]
-"""Name and parameters of a method of `RobotConfig`."""
-PER_WIRE_UNIT = {"mm": 1e3, "deg": 180.0 / math.pi, "kg": 1.0, "": 1.0}
-"""How many of a unit are one unit of the wire, which has m, rad and kg."""
-
 
 @dataclass(frozen=True, slots=True)
-class Setting:
-    """One setting of the controller: numbers in `units`, or a text where there are none."""
+class Settings:
+    """What a press depends on, as the controller reports it."""
 
-    name: str
-    units: tuple[str, ...]
-    getter: str
-    pick: Callable[[Any], Any] = lambda answer: [answer]
-    """Finds the numbers in an answer."""
-    setter: Callable[[list[float]], Command] | None = None
-    """How it is set, from numbers as on the wire; None for one that is only read back."""
+    tool: Pose
+    """Brush tip in the flange's frame."""
+    payload: tuple[float, ...]
+    """Mass in kg, then its centre in mm."""
+    collision_level: float
+    speed_fraction: float
+    operational_mode: str
 
-    def value(self, answer: Any) -> Value:
-        """What an answer says. Raises `ProtocolViolation` if it has another shape."""
-        if not self.units:
-            return str(answer)
-        op = self.getter.rpartition(".")[2]
-        try:
-            picked = self.pick(answer)
-        except (TypeError, ValueError) as error:
-            raise ProtocolViolation(DEVICE, op, str(error)) from None
-        wire = numbers(op, picked, len(self.units))
-        return tuple(number * PER_WIRE_UNIT[unit] for number, unit in zip(wire, self.units, strict=True))
+    def words(self) -> dict[str, str]:
+        """Each setting by its name, for messages."""
+        tool_mm, turn_deg = self.tool.position_mm, map(math.degrees, angles(self.tool.quaternion))
+        return {
+            "tool offset": f"{_listed(tool_mm)} mm, {_listed(turn_deg)} deg",
+            "payload": f"{_figures(self.payload[0])} kg, {_listed(self.payload[1:])} mm",
+            "collision level": _figures(self.collision_level),
+            "speed fraction": _figures(self.speed_fraction),
+            "operational mode": self.operational_mode,
+        }
 
-    def wire(self, value: tuple[float, ...]) -> list[float]:
-        """The numbers as they go over the wire."""
-        return [number / PER_WIRE_UNIT[unit] for number, unit in zip(value, self.units, strict=True)]
-
-
-def _mass_and_centre(answer: Any) -> list[Any]:
-    mass_kg, cog_m, *_ = answer
-    return [mass_kg, *cog_m]
-
-
-def _set_offset(wire: list[float]) -> Command:
-    return "setTcpOffset", {"offset": wire}
+    def same(self, other: Settings) -> tuple[bool, ...]:
+        """Whether each setting is the same, in the order of `words`."""
+        return (
+            max(distance(self.tool, other.tool)) <= TOLERANCE,  # one rotation has several sets of angles
+            math.dist(self.payload, other.payload) <= TOLERANCE,
+            abs(self.collision_level - other.collision_level) <= TOLERANCE,
+            abs(self.speed_fraction - other.speed_fraction) <= TOLERANCE,
+            self.operational_mode == other.operational_mode,
+        )
 
 
-def _set_payload(wire: list[float]) -> Command:
-    return "setPayload", {"m": wire[0], "cog": wire[1:], "aom": [0.0] * 3, "inertia": [0.0] * 6}
+def _figures(number: float) -> str:
+    return f"{round(number, 4) + 0.0:g}"
 
 
-def _set_collision_level(wire: list[float]) -> Command:
-    return "setCollisionLevel", {"level": int(wire[0])}
-
-
-PAYLOAD, COLLISION_LEVEL, OPERATIONAL_MODE = "payload", "collision level", "operational mode"
-TOOL = Setting(
-    "tool offset", ("mm",) * 3 + ("deg",) * 3, "RobotConfig.getTcpOffset", lambda answer: answer, _set_offset
-)
-SETTINGS = (
-    TOOL,
-    Setting(PAYLOAD, ("kg", "mm", "mm", "mm"), "RobotConfig.getPayload", _mass_and_centre, _set_payload),
-    Setting(COLLISION_LEVEL, ("",), "RobotConfig.getCollisionLevel", setter=_set_collision_level),
-    Setting("speed fraction", ("",), "MotionControl.getSpeedFraction"),
-    Setting(OPERATIONAL_MODE, (), "RobotManage.getOperationalMode"),
-)
+def _listed(numbers: Iterable[float]) -> str:
+    return f"({', '.join(map(_figures, numbers))})"
 
 
 async def read_back(controller: Controller) -> Settings:
     """Read all settings from the controller. Raises `ProtocolViolation` for an answer of the wrong shape."""
-    return {setting.name: setting.value(await controller.ask(setting.getter)) for setting in SETTINGS}
-
-
-def configured(table: ArcsTable) -> dict[str, tuple[float, ...]]:
-    """The settings that `table` gives; the others stay as they are on the pendant."""
-    wanted: dict[str, tuple[float, ...]] = {TOOL.name: (*table.tcp_offset_mm, *table.tcp_rotation_deg)}
-    if table.payload_kg is not None:
-        wanted[PAYLOAD] = (table.payload_kg, *table.payload_cog_mm)
-    if table.collision_level is not None:
-        wanted[COLLISION_LEVEL] = (float(table.collision_level),)
-    return wanted
+    offset = numbers("getTcpOffset", await controller.ask("RobotConfig.getTcpOffset"))
+    mass_kg, centre_mm = await controller.payload()
+    [level] = numbers("getCollisionLevel", [await controller.ask("RobotConfig.getCollisionLevel")], 1)
+    [fraction] = numbers("getSpeedFraction", [await controller.ask("MotionControl.getSpeedFraction")], 1)
+    mode = str(await controller.ask("RobotManage.getOperationalMode"))
+    return Settings(from_wire(offset), (mass_kg, *centre_mm), level, fraction, mode)
 
 
 def require_same(op: str, wanted: Settings, current: Settings) -> None:
-    """Raise `SettingsChanged` naming every setting in `wanted` that was found different."""
-    changes = [
-        f"{setting.name} is {_in_words(setting, current[setting.name])}, not {_in_words(setting, wanted[setting.name])}"
-        for setting in SETTINGS
-        if setting.name in wanted and not _same(setting, wanted[setting.name], current[setting.name])
-    ]
+    """Raise `SettingsChanged` naming every setting that was found different."""
+    names = zip(current.words().items(), wanted.words().values(), current.same(wanted), strict=True)
+    changes = [f"{name} is {now}, not {before}" for (name, now), before, same in names if not same]
     if changes:
         raise SettingsChanged(DEVICE, op, "; ".join(changes))
 
 
-def _same(setting: Setting, wanted: Value, current: Value) -> bool:
-    if not isinstance(wanted, tuple) or not isinstance(current, tuple):
-        return wanted == current
-    if setting is TOOL:  # one rotation has several sets of angles, such as 180 and -180 deg
-        return max(distance(from_wire(TOOL.wire(wanted)), from_wire(TOOL.wire(current)))) <= TOLERANCE
-    return all(abs(a - b) <= TOLERANCE for a, b in zip(wanted, current, strict=True))
-
-
-def _in_words(setting: Setting, value: Value) -> str:
-    """`(0, 0, 180) mm, (0, 0, 0) deg`."""
-    if not isinstance(value, tuple):
-        return value
-    parts: list[str] = []
-    for unit, group in itertools.groupby(zip(value, setting.units, strict=True), key=lambda pair: pair[1]):
-        figures = [f"{round(number, 4) + 0.0:g}" for number, _ in group]
-        listed = figures[0] if len(figures) == 1 else f"({', '.join(figures)})"
-        parts.append(f"{listed} {unit}".strip())
-    return ", ".join(parts)
-
-
-async def make_ready(controller: Controller, table: ArcsTable, on_notice: Callable[[str], None]) -> Settings:
+async def make_ready(controller: Controller, table: ArcsTable) -> Settings:
     """Check the operational mode, set tool, payload and collision level, where configured, and read all back.
 
     Raises `WrongOperationalMode`, `MotionRefused` for a setting that the controller refuses, and `SettingsChanged` for
     one that it accepted but did not apply.
     """
-    mode = (await read_back(controller))[OPERATIONAL_MODE]
-    if mode == "Disabled":
-        on_notice("operational modes are disabled on this cabinet")
-    elif mode != "Automatic":  # manual and unknown modes are for a person next to the arm
-        raise WrongOperationalMode(DEVICE, "power on", str(mode))
-    wanted = configured(table)
-    for setting in SETTINGS:
-        if setting.setter is not None and setting.name in wanted:
-            method, params = setting.setter(setting.wire(wanted[setting.name]))
-            accepted(method, await controller.ask(f"RobotConfig.{method}", **params))
+    wanted = await read_back(controller)
+    if wanted.operational_mode not in ("Automatic", "Disabled"):  # the others are for a person next to the arm
+        raise WrongOperationalMode(DEVICE, "power on", wanted.operational_mode)
+    offset = [*(mm / 1e3 for mm in table.tcp_offset_mm), *map(math.radians, table.tcp_rotation_deg)]
+    commands: dict[str, dict[str, object]] = {"setTcpOffset": {"offset": offset}}
+    wanted = replace(wanted, tool=from_wire(offset))
+    if table.payload_kg is not None:
+        centre_m = [mm / 1e3 for mm in table.payload_cog_mm]
+        commands["setPayload"] = {"m": table.payload_kg, "cog": centre_m, "aom": [0.0] * 3, "inertia": [0.0] * 6}
+        wanted = replace(wanted, payload=(table.payload_kg, *table.payload_cog_mm))
+    if table.collision_level is not None:
+        commands["setCollisionLevel"] = {"level": table.collision_level}
+        wanted = replace(wanted, collision_level=table.collision_level)
+    for method, params in commands.items():
+        accepted(method, await controller.ask(f"RobotConfig.{method}", **params))
     settings = await read_back(controller)
     require_same("power on", wanted, settings)
     return settings
@@ -247,9 +190,14 @@ class Departure:
 
     def __init__(self, controller: Controller) -> None:
         self._controller = controller
-        self._settings: Settings = {}
+        self._settings: Settings | None = None
         self.left: Pose | None = None
         """Where the last line ended, or where `take_up` found the arm; None after a line that did not reach its end."""
+
+    @property
+    def under_way(self) -> bool:
+        """True from the moment a line is sent to the enabled arm until its place is known again."""
+        return self._settings is not None and self.left is None
 
     async def enabled(self, settings: Settings) -> None:
         """Note the settings with which the arm was enabled, and its place."""
@@ -280,36 +228,36 @@ class Departure:
         """
         await self._require_rest(op)
         start = await self._controller.pose()
-        path = [start, *poses]
-        down = any(b.z_mm < a.z_mm - DOWN_MM for a, b in itertools.pairwise(path))
-        if down or self._moved(start):
+        lines = list(itertools.pairwise([start, *poses]))
+        if self._moved(start) or any(b.z_mm < a.z_mm - DOWN_MM for a, b in lines):
             await self._require_settings(op)  # with another tool, the same place would look like another
         self._require_place(op, start)
-        for a, b in itertools.pairwise(path):
+        for a, b in lines:
             limits.check_way(DEVICE, a, b)
         return start
 
     async def _require_settings(self, op: str) -> None:
-        self._require_enabled(op)
-        values = await read_back(self._controller)
+        enabled = self._require_enabled(op)
+        current = await read_back(self._controller)
         await self._controller.require_safe(op)
         if await self._controller.mode() != RobotMode.RUNNING:
             raise NotPowered(DEVICE, op)
-        require_same(op, self._settings, values)
+        require_same(op, enabled, current)
 
     async def _require_rest(self, op: str) -> None:
         self._require_enabled(op)
         loop = asyncio.get_running_loop()
-        until = loop.time() + RESTS_S
+        until_s = loop.time() + RESTS_S
         while not await self._controller.at_rest():
-            if loop.time() > until:
+            if loop.time() > until_s:
                 await self._controller.require_safe(op)  # a safety stop holds its path: that is the cause to report
                 raise ArmMoved(DEVICE, op, *self._off(await self._controller.pose()), moving=True)
             await asyncio.sleep(POLL_S)
 
-    def _require_enabled(self, op: str) -> None:
-        if not self._settings:
+    def _require_enabled(self, op: str) -> Settings:
+        if self._settings is None:
             raise NotConnected(DEVICE, op, "not enabled")
+        return self._settings
 
     def _require_place(self, op: str, here: Pose) -> None:
         if self._moved(here):

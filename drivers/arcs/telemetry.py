@@ -21,7 +21,7 @@ import contextlib
 import json
 import math
 from collections import defaultdict, deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import AsyncGenerator, Callable, Generator, Sequence
 from typing import Any, NoReturn
 
 import cbor2
@@ -100,86 +100,77 @@ def decode_message(payload: bytes, device: str) -> tuple[int, list[Any]]:
 
 STREAM = "robot telemetry"
 CHANNEL = 0
-POSE_SEGMENT = "R1_actual_TCP_pose"
-JOINTS_SEGMENT = "R1_actual_q"
+SEGMENTS = ("R1_actual_TCP_pose", "R1_actual_q")
+SILENCE_S = 0.5
 
 
 class RtdeStream:
-    """One subscription on a socket of its own; a reader gets the newest sample, never a backlog."""
+    """One subscription on a socket of its own."""
 
-    def __init__(self, host: str, port: int, *, timeout_s: float = 0.5) -> None:
+    def __init__(self, host: str, port: int) -> None:
         self.host = host
         self.port = port
-        self._timeout_s = timeout_s
-        self._decoder = FrameDecoder(STREAM, skip=PING, max_bytes=MAX_MESSAGE_BYTES)
-        self._reader: asyncio.StreamReader | None = None
-        self._writer: asyncio.StreamWriter | None = None
-        self._segments: tuple[str, ...] = ()
         self.offered: dict[str, int] = {}
         """Names in the greeting that can be subscribed to, with their ids."""
-        self.older: list[list[Any]] = []
-        """Samples that had piled up before the newest one when it was read, oldest first."""
+        self._decoder = FrameDecoder(STREAM, skip=PING, max_bytes=MAX_MESSAGE_BYTES)
+        self._stream: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
+        self._segments: Sequence[str] = ()
 
     async def open(self, segments: Sequence[str], frequency_hz: float) -> None:
         """Connect, read the greeting, subscribe. Raises `ConnectionLost`, `DeviceTimeout`, `ProtocolViolation`."""
         try:
-            async with asyncio.timeout(self._timeout_s):
-                self._reader, self._writer = await asyncio.open_connection(
-                    self.host, self.port, limit=MAX_GREETING_BYTES
-                )
-                greeting = await self._reader.readuntil(GREETING_END)
-        except TimeoutError:
-            raise DeviceTimeout(STREAM, "connect", f"no greeting from {self.host}:{self.port}") from None
+            async with _answered("connect", f"greeting from {self.host}:{self.port}"):
+                self._stream = await asyncio.open_connection(self.host, self.port, limit=MAX_GREETING_BYTES)
+                greeting = await self._stream[0].readuntil(GREETING_END)
         except asyncio.LimitOverrunError:
             raise ProtocolViolation(STREAM, "connect", "a greeting without an end") from None
-        except (OSError, asyncio.IncompleteReadError) as error:
-            raise ConnectionLost(STREAM, "connect", f"{self.host}:{self.port}: {error}") from None
         self.offered = outputs_of(greeting, STREAM)
-        missing = set(segments) - set(self.offered)
-        if missing:
+        if missing := set(segments) - set(self.offered):
             raise ProtocolViolation(STREAM, "subscribe", f"the controller does not offer {sorted(missing)}")
-        self._segments = tuple(segments)
-        self._writer.write(encode_topic(CHANNEL, segments, frequency_hz))
+        self._segments = segments
+        self._stream[1].write(encode_topic(CHANNEL, segments, frequency_hz))
 
-    async def newest(self) -> list[Any]:
-        """The values of the newest sample, in the order of the segments.
+    async def samples(self) -> list[list[Any]]:
+        """The samples that have piled up, at least one, oldest first; each has a value for each segment.
 
-        If several have piled up, the arrival time of the older ones is unknown; they are left in `older`. Raises
-        `DeviceTimeout` after silence, `ConnectionLost`, `ProtocolViolation`.
+        Only for the newest is the arrival time known. Raises `DeviceTimeout` after silence, `ConnectionLost`,
+        `ProtocolViolation`.
         """
-        if self._reader is None:
+        if self._stream is None:
             raise NotConnected(STREAM, "read", "not connected")
         samples: list[list[Any]] = []
-        try:
-            async with asyncio.timeout(self._timeout_s):
-                while not samples:
-                    data = await self._reader.read(MAX_MESSAGE_BYTES)
-                    if not data:
-                        raise ConnectionLost(STREAM, "read", "the controller closed the connection")
-                    for payload in self._decoder.feed(data):
-                        head, values = decode_message(payload, STREAM)
-                        if head == CHANNEL:
-                            samples.append(values)
-        except TimeoutError:
-            raise DeviceTimeout(STREAM, "read", f"no sample in {self._timeout_s:g} s") from None
-        except OSError as error:
-            if isinstance(error, ConnectionLost):
-                raise
-            raise ConnectionLost(STREAM, "read", error.strerror or str(error)) from None
+        async with _answered("read", "sample"):
+            while not samples:
+                data = await self._stream[0].read(MAX_MESSAGE_BYTES)
+                if not data:
+                    raise EOFError("the controller closed the connection")
+                messages = [decode_message(payload, STREAM) for payload in self._decoder.feed(data)]
+                samples += [values for head, values in messages if head == CHANNEL]
         for values in samples:
             if len(values) != len(self._segments):
                 raise ProtocolViolation(STREAM, "read", f"{len(values)} values for {len(self._segments)} segments")
-        *self.older, newest = samples
-        return newest
+        return samples
 
     async def close(self) -> None:
         """End the subscription and close the socket."""
-        writer, self._writer, self._reader = self._writer, None, None
-        if writer is not None:
+        stream, self._stream = self._stream, None
+        if stream is not None:
             with contextlib.suppress(OSError):
-                writer.write(encode_topic(CHANNEL, (), 0.0))
-                writer.close()
-                await writer.wait_closed()
+                stream[1].write(encode_topic(CHANNEL, (), 0.0))
+                stream[1].close()
+                await stream[1].wait_closed()
+
+
+@contextlib.asynccontextmanager
+async def _answered(op: str, awaited: str) -> AsyncGenerator[None]:
+    """Raise `DeviceTimeout` if the block takes longer than `SILENCE_S`, `ConnectionLost` if the controller hangs up."""
+    try:
+        async with asyncio.timeout(SILENCE_S):
+            yield
+    except TimeoutError:
+        raise DeviceTimeout(STREAM, op, f"no {awaited} in {SILENCE_S:g} s") from None
+    except (OSError, EOFError) as error:
+        raise ConnectionLost(STREAM, op, str(error)) from None
 
 
 async def rtde_answers(host: str, port: int) -> dict[str, Any]:
@@ -187,14 +178,13 @@ async def rtde_answers(host: str, port: int) -> dict[str, Any]:
     stream = RtdeStream(host, port)
     answers: dict[str, Any] = {}
     try:
-        await stream.open((POSE_SEGMENT, JOINTS_SEGMENT), 50.0)
-        answers["offered"] = stream.offered
-        answers["sample"] = await stream.newest()
+        await stream.open(SEGMENTS, RATE_HZ)
+        answers["sample"] = (await stream.samples())[-1]
     except DeviceError as error:
-        answers |= {"offered": stream.offered, "refused": str(error)}
+        answers["refused"] = str(error)
     finally:
         await stream.close()
-    return answers
+    return {"offered": stream.offered, **answers}
 
 
 QUICK_S = 0.05
@@ -286,7 +276,12 @@ class Telemetry:
         """Read the first pose, then continue until `stop`. Raises what the first read raises."""
         await self.read()
         if self._table.rtde_port is not None:
-            await self._subscribe(self._table.rtde_port)
+            self._stream = RtdeStream(self._table.host, self._table.rtde_port)
+            try:
+                await self._stream.open(SEGMENTS, RATE_HZ)
+                await self._take_pushed(self._stream)
+            except DeviceError as error:
+                await self._fall_back(error)
         self._task = asyncio.create_task(self._run(), name="robot telemetry")
 
     async def stop(self) -> None:
@@ -326,50 +321,34 @@ class Telemetry:
         """Ask for the pose once."""
         self._take(await self._state.pose())
 
-    async def _subscribe(self, port: int) -> None:
-        stream = RtdeStream(self._table.host, port)
-        self._stream = stream
-        try:
-            await stream.open([POSE_SEGMENT, JOINTS_SEGMENT], RATE_HZ)
-            self._take(*await self._pushed(stream))
-        except DeviceError as error:
-            await self._fall_back(error)
-
     async def _run(self) -> None:
-        if self._stream is not None:
+        silences = 0
+        while self._stream is not None:
             try:
-                await self._listen(self._stream)
+                await self._take_pushed(self._stream)
+                silences = 0
             except DeviceError as error:
-                await self._fall_back(error)
+                silences += 1
+                if not isinstance(error, DeviceTimeout) or silences > MOST_SILENCES:
+                    await self._fall_back(error)
+                await self._poll()  # a short silence is bridged: the poses that piled up will still arrive
         loop = asyncio.get_running_loop()
-        period_s = 1.0 / RATE_HZ
         due = loop.time()
         while True:
-            # A gap shows as an old sample (`Stale`); the motion path reports the cause.
-            with contextlib.suppress(DeviceError):
-                await self.read()
-            due = max(due + period_s, loop.time())
+            await self._poll()
+            due = max(due + 1.0 / RATE_HZ, loop.time())
             await asyncio.sleep(due - loop.time())
 
-    async def _listen(self, stream: RtdeStream) -> None:
-        """Receive pushed poses. A short silence is bridged by polling: the poses that piled up will still arrive."""
-        silences = 0
-        while True:
-            try:
-                self._take(*await self._pushed(stream))
-                silences = 0
-            except DeviceTimeout:
-                silences += 1
-                if silences > MOST_SILENCES:
-                    raise
-                with contextlib.suppress(DeviceError):
-                    await self.read()
+    async def _poll(self) -> None:
+        # A gap shows as an old sample (`Stale`); the motion path reports the cause.
+        with contextlib.suppress(DeviceError):
+            await self.read()
 
-    async def _pushed(self, stream: RtdeStream) -> tuple[Pose, tuple[float, ...]]:
-        pose, joints = await stream.newest()
+    async def _take_pushed(self, stream: RtdeStream) -> None:
+        *older, (pose, joints) = await stream.samples()
         if self._seen is not None:
-            self._seen += [from_wire(numbers("sample", older)) for older, _ in stream.older]
-        return from_wire(numbers("sample", pose)), tuple(numbers("sample", joints))
+            self._seen += [from_wire(numbers("sample", older_pose)) for older_pose, _ in older]
+        self._take(from_wire(numbers("sample", pose)), tuple(numbers("sample", joints)))
 
     async def _fall_back(self, error: DeviceError) -> None:
         await self._drop_stream()

@@ -206,12 +206,13 @@ async def greeted(said: bytes) -> object:
 
 async def streamed(data: bytes) -> object:
     stream = RtdeStream("127.0.0.1", 1)
-    stream._segments, stream._reader = ("R1_actual_TCP_pose",), asyncio.StreamReader()
-    stream._reader.feed_data(data)
-    stream._reader.feed_eof()
-    newest = await stream.newest()
-    assert len(newest) == 1
-    return newest
+    reader = asyncio.StreamReader()
+    stream._segments, stream._stream = ("R1_actual_TCP_pose",), (reader, None)  # type: ignore[assignment]
+    reader.feed_data(data)
+    reader.feed_eof()
+    samples = await stream.samples()
+    assert all(len(values) == 1 for values in samples)
+    return samples
 
 
 async def obeyed(data: bytes) -> object:

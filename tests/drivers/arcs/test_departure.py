@@ -18,7 +18,7 @@ from brushloop.drivers.arcs.controller import (
 )
 from brushloop.drivers.arcs.motion import until_settled
 from brushloop.drivers.arcs.robot import AuboArcs
-from brushloop.drivers.arcs.settings import TOOL, require_same
+from brushloop.drivers.arcs.settings import Settings, require_same
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import (
     ArmMoved,
@@ -60,14 +60,6 @@ async def test_an_arm_that_is_not_on_automatic_is_neither_set_nor_powered(
     assert cabinet.cabinet.tcp_offset == [0.0] * 6
 
 
-async def test_a_cabinet_without_operational_modes_is_reported(
-    make_arm: MakeArm, cabinet: ArcsServer, notices: list[str]
-):
-    cabinet.cabinet.operational_mode = "Disabled"
-    await enabled(make_arm)
-    assert notices == ["operational modes are disabled on this cabinet"]
-
-
 async def test_what_is_configured_is_set_in_the_wires_units_and_nothing_moves(make_arm: MakeArm, cabinet: ArcsServer):
     before = cabinet.cabinet.world.tool()
     await enabled(make_arm, payload_kg=0.4, payload_cog_mm=(0.0, 1.0, 60.0), collision_level=8)
@@ -76,6 +68,12 @@ async def test_what_is_configured_is_set_in_the_wires_units_and_nothing_moves(ma
     assert (box.collision_level, box.tcp_offset) == (8, [0.0, 0.0, 0.18, 0.0, 0.0, 0.0])
     assert box.power.mode == RobotMode.RUNNING
     assert box.world.tool() == before
+
+
+async def test_reduced_mode_and_a_cabinet_without_operational_modes_are_allowed(make_arm: MakeArm, cabinet: ArcsServer):
+    cabinet.cabinet.operational_mode = "Disabled"
+    cabinet.cabinet.power.safety = SafetyMode.REDUCED
+    await (await enabled(make_arm)).move(NEAR, **QUICK)
 
 
 async def test_a_brush_that_is_not_square_to_the_flange_is_pressed_upright(make_arm: MakeArm, cabinet: ArcsServer):
@@ -97,17 +95,6 @@ async def test_what_the_controller_does_not_take_keeps_the_power_off(
     with pytest.raises(MotionRefused, match=method):
         await enabled(make_arm, payload_kg=0.4, collision_level=8)
     assert cabinet.cabinet.power.mode == RobotMode.POWER_OFF
-
-
-async def test_reduced_mode_is_allowed_and_reported_once(make_arm: MakeArm, cabinet: ArcsServer, notices: list[str]):
-    arm = await enabled(make_arm)
-    cabinet.cabinet.power.safety = SafetyMode.REDUCED
-    await arm.move(NEAR, **QUICK)
-    assert len(notices) == 1
-    assert "ReducedMode" in notices[0]
-    cabinet.cabinet.power.safety = SafetyMode.NORMAL
-    await arm.move(brush_pose(265.0, -220.0, 250.0), **QUICK)
-    assert len(notices) == 1
 
 
 async def test_a_target_out_of_reach_names_the_controllers_message(make_arm: MakeArm, cabinet: ArcsServer):
@@ -290,12 +277,13 @@ async def test_a_return_code_is_no_proof_that_the_tool_was_set(sleeping_arm: Aub
 
 
 def test_a_tool_that_is_read_back_in_other_angles_is_the_same_tool_and_one_turned_a_little_is_another():
-    def tool(*turn_deg: float) -> dict[str, tuple[float, ...]]:
-        return {TOOL.name: (0.0, 0.0, 180.0, *turn_deg)}
+    def tool(*turn_deg: float) -> Settings:
+        offset = from_wire([0.0, 0.0, 0.18, *map(math.radians, turn_deg)])
+        return Settings(offset, (0.0,) * 4, 6.0, 1.0, "Automatic")
 
     require_same("enable", tool(180.0, 0.0, 0.0), tool(-180.0, 0.0, 0.0))
     require_same("enable", tool(180.0, 0.0, 30.0), tool(0.0, 180.0, -150.0))
-    with pytest.raises(SettingsChanged, match=r"\(-179\.99, 0, 0\) deg, not .*\(180, 0, 0\)"):
+    with pytest.raises(SettingsChanged, match=r"\(-179\.99, 0, 0\) deg, not .*\(-?180, 0, 0\)"):
         require_same("enable", tool(180.0, 0.0, 0.0), tool(-179.99, 0.0, 0.0))
 
 

@@ -135,7 +135,7 @@ async def stops_by_itself(_: AuboArcs, cabinet: ArcsServer) -> None:
     ("act", "error", "words"),
     [
         (lambda arm, _: arm.stop(), MotionFailed, "was stopped"),
-        (is_stopped_by_another_client, MotionFailed, "from where it was sent"),
+        (is_stopped_by_another_client, MotionFailed, "does not advance"),
         (is_held, MotionFailed, "does not advance"),
         (stops_by_itself, RobotNotSafe, "ProtectiveStop"),
         (loses_its_connection, ConnectionLost, "closed|lost|reset|abort|connection"),

@@ -90,7 +90,7 @@ async def outcome(port: int) -> list[Any]:
     stream = RtdeStream(HOST, port)
     try:
         await stream.open(POSE, 50.0)
-        return await stream.newest()
+        return (await stream.samples())[-1]
     finally:
         await stream.close()
 
