@@ -361,8 +361,12 @@ async def _exchange(method: str, params: dict[str, Any] | None, step: Awaitable[
     except RpcError as error:
         answer = {"error": {"code": error.code, "message": error.message}}
     except DeviceError as error:
-        reasons = {DeviceTimeout: "silence", ConnectionLost: "lost"}
-        answer = {reasons.get(type(error), "refused"): error.what}
+        reason = "refused"
+        if isinstance(error, DeviceTimeout):
+            reason = "silence"
+        elif isinstance(error, ConnectionLost):
+            reason = "lost"
+        answer = {reason: error.what}
     took_ms = round((time.monotonic() - began_s) * 1e3, 3)
     return {"method": method, "params": params, "answer": answer, "took_ms": took_ms}
 

@@ -377,16 +377,19 @@ def answer_in(payload: bytes, ident: str | int, op: str) -> dict[str, Any] | Non
         reply: Any = json.loads(payload)
     except (ValueError, RecursionError):
         raise ProtocolViolation(DEVICE, op, f"reply is not JSON: {payload[:40]!r}") from None
-    echo = reply.get("id") if isinstance(reply, dict) else None  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
-    if type(echo) is not type(ident) or echo != ident:  # pyright: ignore[reportUnknownArgumentType] # True equals 1
+    if not isinstance(reply, dict):
         return None
-    match reply:
-        case {"error": {"code": int(code), "message": str(message)}}:
+    answer: dict[str, Any] = reply  # pyright: ignore[reportUnknownVariableType]
+    echo = answer.get("id")
+    if type(echo) is not type(ident) or echo != ident:  # True equals 1
+        return None
+    match answer.get("error"):
+        case {"code": int(code), "message": str(message)}:
             raise RpcError(DEVICE, op, code, message)
-        case {"result": _} if reply.get("error") is None:
-            return reply
-        case _:
-            raise ProtocolViolation(DEVICE, op, f"neither result nor error: {payload[:80]!r}")
+        case None if "result" in answer:
+            return answer
+        case other:
+            raise ProtocolViolation(DEVICE, op, f"neither result nor error: {other!r}")
 
 
 async def open_arcs(connection: RpcConnection) -> None:

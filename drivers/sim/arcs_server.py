@@ -141,9 +141,10 @@ class ArcsServer(LoopbackServer):
         if method is None:
             return _error(ident, METHOD_NOT_FOUND, f"method not found: {name}")
         try:
+            by_name: dict[str, Any] = params or {}
             if isinstance(params, list):
-                params = dict(zip(parameters(name), params, strict=True))  # pyright: ignore[reportUnknownArgumentType]
-            result = method(params or {})
+                by_name = dict(zip(parameters(name), params, strict=True))  # pyright: ignore[reportUnknownArgumentType]
+            result = method(by_name)
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             return _error(ident, INVALID_PARAMS, f"invalid params: {error!r}")
         return _reply(ident, result=result)
