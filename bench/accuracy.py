@@ -34,7 +34,7 @@ from bench.brushes import (
 )
 from bench.harness import BenchError, Result, at_most, brushloop, machine, rounds_of
 from bench.prior import BRISTLE
-from brushloop.calibrate.compare import TABLE_2, Field
+from brushloop.calibrate.compare import TABLE_2
 from brushloop.calibrate.fit.captures import Captures, by_cell, read_presses
 from brushloop.calibrate.fit.descent import Prior, fit_presses, learned
 from brushloop.calibrate.fit.heldout import BEZIER, FITTED, Refit, held_out_scores, image_of, leave_cell_out, refit
@@ -115,7 +115,7 @@ def _pressed(n: int | None, seed: int) -> Iterator[tuple[str, Captures, Prior]]:
             except BenchError as error:
                 sys.stderr.write(f"left out: {error}\n")
                 continue
-            yield name, read_presses(session, Field()), prior
+            yield name, read_presses(session), prior
 
 
 def intervals(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:

@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.brushes import BRISTLE_SETS, CELLS, bristle_session
-from brushloop.calibrate.compare import Field
 from brushloop.calibrate.fit.captures import Grid, Pressed, read_presses
 from brushloop.calibrate.fit.descent import FILE, KnownBrush, about, fit_presses
 from brushloop.model.fitted import chance_within, published
@@ -136,7 +135,7 @@ def known() -> Iterator[KnownBrush]:
     """Every brush of the prior, fitted. Raises BenchError where a bristle set is not at hand."""
     for name in BRISTLE_SETS:
         with tempfile.TemporaryDirectory() as folder:
-            captures = read_presses(bristle_session(Path(folder) / name, name), Field())
+            captures = read_presses(bristle_session(Path(folder) / name, name))
         yield _fitted(name, BRISTLE, captures.strokes, captures.grid, captures.radius_mm, captures.length_mm)
     centres = np.asarray((np.arange(SIZE_PX) + 0.5) * PX_MM, np.float64)
     grid = Grid(centres - TOUCH_MM[0], (TOUCH_MM[1] - centres)[ROWS])

@@ -17,7 +17,6 @@ from typing import Annotated, Any, Protocol, TypeVar, get_args, get_origin, get_
 from typer import Argument, Option
 from typer.core import TyperGroup
 
-from brushloop.calibrate import MM_PER_PX
 from brushloop.sessions.terminal import Progress, say, shown
 
 Request = TypeVar("Request")
@@ -100,7 +99,6 @@ def _command_line() -> str:
     return " ".join(["brushloop", *sys.argv[1:]])
 
 
-Scale = Annotated[float, Option(min=0.1, max=1.0, help="Scale of the 128 x 128 field, mm per pixel.")]
 Patch = Annotated[float, Option("--cell-mm", min=30, max=500, help="Side of each patch of paper.")]
 Repeats = Annotated[int, Option(min=1, max=1000, help="How often each is written.")]
 Length = Annotated[float, Option(min=5, max=200, help="Length L of the brush.")]
@@ -135,9 +133,6 @@ class FitRequest:
     """
 
     session: Annotated[Path, Argument(help="A session of presses, or of drags: its folder or its .mcap file.")]
-    mm_per_px: Annotated[
-        float | None, Option(min=0.1, max=1.0, help=f"Scale of the images; {MM_PER_PX:g}, for drags 0.4.")
-    ] = None
     prior: Annotated[Path | None, Option(help="A dragfit of this brush, whose place and width are adapted.")] = None
     strokes: Annotated[
         int | None, Option(min=1, help="With --prior: only this many strokes, as different as possible.")
@@ -154,7 +149,6 @@ class ValidateRequest:
     ]
     models: Annotated[tuple[str, ...], Option("--model", help="Only these models; all by default.")] = ()
     generators: Annotated[tuple[Path, ...], Option("--generator", help="A trained generator.safetensors.")] = ()
-    mm_per_px: Scale = MM_PER_PX
     fit: Annotated[Path | None, Option(help="Brush fit, the one in use by default; of drags, a dragfit.")] = None
     out: Annotated[Path | None, Option(help="Folder of the report; <session>/validation by default.")] = None
     gates: Annotated[
@@ -229,7 +223,6 @@ class CompareLoopRequest:
     fit: Annotated[Path | None, Option(help="Brush fit that recovered depth and tilt; else CCD-BSM as published.")] = (
         None
     )
-    mm_per_px: Scale = MM_PER_PX
     out: Annotated[Path, Option(help="Folder for loop.html, loop.csv, loop.json.")] = Path("loop")
     command: str = field(default_factory=_command_line)
     """Named by the report as what made it."""

@@ -18,7 +18,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate import MM_PER_PX
 from brushloop.calibrate.stroke.preprocess import Prepared
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.outline import Outline
@@ -30,6 +29,15 @@ Image = NDArray[np.float32]
 Pixels = NDArray[np.uint8]
 """Ink from 0 to 255."""
 SIZE_PX = 128
+MM_PER_PX = 0.3
+"""Scale of the millimetre field, wherever a press is shown, fitted, compared or inverted.
+
+38.4 mm hold an anchored stroke of any cell of the grid; 0.2 mm/px would not.
+"""
+FIELD_MM = SIZE_PX * MM_PER_PX
+"""Width and height of the millimetre field around the zero-touch point."""
+ANCHOR_MM = (0.76 * FIELD_MM, 0.5 * FIELD_MM)
+"""Distance of the zero-touch point from the left and from the top of the field."""
 NORMAL_LENGTH_PX = 100
 FINE = 4
 """Oversampling: strokes are moved on a raster finer by this factor, near their own 20 px/mm, then area-averaged."""
@@ -71,28 +79,10 @@ SHOWN_ROWS = slice(32, 96)
 """Rows to show: the middle half of a field, as a press is at most half as thick as the field is high."""
 
 
-@dataclass(frozen=True, slots=True)
-class Field:
-    """The millimetre field: 128 x 128 px around the zero-touch point."""
-
-    mm_per_px: float = MM_PER_PX
-    anchor_share: tuple[float, float] = (0.76, 0.5)
-    """Position of the zero-touch point, as a share of the field from the left and from the top."""
-
-    @property
-    def side_mm(self) -> float:
-        """Width and height."""
-        return SIZE_PX * self.mm_per_px
-
-    @property
-    def anchor_mm(self) -> tuple[float, float]:
-        """Distance of the zero-touch point from the left and from the top."""
-        return self.anchor_share[0] * self.side_mm, self.anchor_share[1] * self.side_mm
-
-    def window_mm(self, anchor: tuple[float, float]) -> tuple[float, float, float, float]:
-        """(x, y, width, height) of the field around an anchor, both in the paper frame (y upward)."""
-        left, top = self.anchor_mm
-        return anchor[0] - left, anchor[1] - (self.side_mm - top), self.side_mm, self.side_mm
+def field_around(anchor_mm: tuple[float, float]) -> tuple[float, float, float, float]:
+    """(x, y, width, height) in mm of the field around a zero-touch point, both in the paper frame (y upward)."""
+    left, top = ANCHOR_MM
+    return anchor_mm[0] - left, anchor_mm[1] - (FIELD_MM - top), FIELD_MM, FIELD_MM
 
 
 def covered(prepared: Prepared) -> Image:
@@ -141,25 +131,25 @@ def to_tone(coverage: Image, tone: Tone) -> Image:
     return coverage if tone is Tone.GRAY else (coverage > 0.5).astype(np.float32)
 
 
-def simulated(model: StrokeModel, depth_mm: float, tilt_deg: float, field: Field) -> Pixels:
+def simulated(model: StrokeModel, depth_mm: float, tilt_deg: float) -> Pixels:
     """(len(KEYS), 128, 128) predictions of a press. May raise `model.ccdbsm.DomainError`.
 
     The press tilts about the tip, then descends: the brush axis meets the paper H tan(alpha) from the zero-touch point,
     toward the side the ferrule leans to.
     """
-    return images_of(model.profile(depth_mm, tilt_deg), depth_mm * math.tan(math.radians(tilt_deg)), field)
+    return images_of(model.profile(depth_mm, tilt_deg), depth_mm * math.tan(math.radians(tilt_deg)))
 
 
-def images_of(mark: Outline, origin_x_mm: float, field: Field) -> Pixels:
+def images_of(mark: Outline, origin_x_mm: float) -> Pixels:
     """(len(KEYS), 128, 128) images of a mark: its exact coverage.
 
     `origin_x_mm` is the distance of the mark's origin from the zero-touch point.
     """
-    left, top = field.anchor_mm
+    left, top = ANCHOR_MM
     x_min_mm, x_max_mm = float(mark.x_min_mm[0]), float(mark.x_max_mm[0])
     middle_mm, normal_mm = 0.5 * (x_min_mm + x_max_mm), (x_max_mm - x_min_mm) / NORMAL_LENGTH_PX
     side_mm = SIZE_PX * normal_mm
-    views = ((field.mm_per_px, left + origin_x_mm, top), (normal_mm, 0.5 * side_mm - middle_mm, 0.5 * side_mm))
+    views = ((MM_PER_PX, left + origin_x_mm, top), (normal_mm, 0.5 * side_mm - middle_mm, 0.5 * side_mm))
     gray = dict(zip((Alignment.MM, Alignment.SIZE_NORMALISED), draw_loop(mark, views, SIZE_PX), strict=True))
     return np.stack([to_pixels(to_tone(gray[alignment], tone)) for alignment, tone in KEYS])
 

@@ -18,10 +18,10 @@ from brushloop.calibrate.artefact import made_by
 from brushloop.calibrate.commands import CompareLoopRequest
 from brushloop.calibrate.compare import (
     KEYS,
+    MM_PER_PX,
     ROBOT_WRITING,
     TABLE_1,
     Alignment,
-    Field,
     Key,
     Pixels,
     Tone,
@@ -165,7 +165,6 @@ def compare(request: CompareLoopRequest, progress: Progress = unseen) -> Written
     Raises `CalibrationError` where the two sessions do not belong together, and OSError.
     """
     check_writable(request.out)
-    view = Field(mm_per_px=request.mm_per_px)
     first, second = (open_session(path, kind="press") for path in (request.original, request.again))
     where, source = str(second.recording.path), second.header.source
     if (first.header.source == Source.LOOPBACK) != (source == Source.LOOPBACK):
@@ -177,10 +176,9 @@ def compare(request: CompareLoopRequest, progress: Progress = unseen) -> Written
     model, fit = BrushFit.model_of(request.fit, first.header)
     refused: list[Refused] = []
     originals, repetitions = (
-        list(read_presses(session, view, refused, uncommanded, too_thin, progress=progress))
-        for session in (first, second)
+        list(read_presses(session, refused, uncommanded, too_thin, progress=progress)) for session in (first, second)
     )
-    pairs = pair_up(originals, repetitions, model, view, refused)
+    pairs = pair_up(originals, repetitions, model, refused)
     if not pairs:
         why = f": {refused[0][0]}: {refused[0][1]}" if refused else ""
         raise CalibrationError(where, f"not one pair can be compared{why}")
@@ -193,7 +191,7 @@ def compare(request: CompareLoopRequest, progress: Progress = unseen) -> Written
         again_sha256=second.sha256,
         model=model.label,
         in_sample=fit is not None and fit.recording_sha256 == first.sha256,
-        mm_per_px=view.mm_per_px,
+        mm_per_px=MM_PER_PX,
         pairs=len(pairs),
         goal_points=GOAL_POINTS,
         stats=tuple(statistics_of(scores)),
@@ -207,7 +205,7 @@ def compare(request: CompareLoopRequest, progress: Progress = unseen) -> Written
 
 
 def pair_up(
-    originals: Sequence[Press], repetitions: Iterable[Press], model: StrokeModel, view: Field, refused: list[Refused]
+    originals: Sequence[Press], repetitions: Iterable[Press], model: StrokeModel, refused: list[Refused]
 ) -> list[Pair]:
     """Pair presses by `again_of`. Those without a partner, originals included, go to `refused`."""
     by_name = {press.stroke.stroke_id: press for press in originals}
@@ -219,7 +217,7 @@ def pair_up(
             refused.append((name, why))
             continue
         try:
-            images = simulated(model, press.condition.depth_mm, press.condition.tilt_deg, view)
+            images = simulated(model, press.condition.depth_mm, press.condition.tilt_deg)
         except DomainError as error:
             refused.append((name, f"the model does not predict it: {error}"))
             continue

@@ -20,7 +20,7 @@ from pydantic import ValidationError
 
 from brushloop.calibrate.artefact import current, load_artefact
 from brushloop.calibrate.commands import CalibrateRequest, FitRequest, RecoverRequest, ValidateRequest
-from brushloop.calibrate.compare import GRAY_MM, Field, brush_of, simulated
+from brushloop.calibrate.compare import GRAY_MM, brush_of, simulated
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.presses import Refused, crop, read_presses
 from brushloop.calibrate.remote import local_path
@@ -138,7 +138,7 @@ class RecordedPress:
     def coverage(self) -> NDArray[np.float32]:
         """(128, 128) share of each pixel that is ink, on the field that `predict` draws on. Raises `CaptureRefused`."""
         refused: list[Refused] = []
-        for press in read_presses(self._session.opened, Field(), refused, chosen={self.name}):
+        for press in read_presses(self._session.opened, refused, chosen={self.name}):
             return press.coverage
         raise CaptureRefused(*refused[0])
 
@@ -273,7 +273,7 @@ def predict(condition: Condition, brush: Brush | BrushFit | None = None, model: 
     Raises `UnknownModelError`, and `DomainError` for a press that the model does not predict.
     """
     chosen = _model(brush or Brush(), model)
-    images = simulated(chosen, condition.depth_mm, condition.tilt_deg, Field())
+    images = simulated(chosen, condition.depth_mm, condition.tilt_deg)
     image = np.asarray(images[GRAY_MM] / 255.0, np.float32)
     edge = chosen.profile(condition.depth_mm, condition.tilt_deg).polyline()[0]
     return Prediction(chosen.name, image, edge)

@@ -13,14 +13,7 @@ from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
-from brushloop.calibrate.compare import (
-    KEYS,
-    Field,
-    Image,
-    Pixels,
-    captured,
-    covered,
-)
+from brushloop.calibrate.compare import ANCHOR_MM, FIELD_MM, KEYS, Image, Pixels, captured, covered, field_around
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.report import source_label
 from brushloop.calibrate.session import Calibration, OpenSession
@@ -88,7 +81,6 @@ def too_thin(press: Press) -> str:
 
 def read_presses(
     session: OpenSession,
-    view: Field,
     refused: list[Refused],
     *unless: Unless,
     chosen: Collection[str] | None = None,
@@ -101,11 +93,11 @@ def read_presses(
     """
     store, bad = session.store, bad_stills(session.recording.path.parent)
     wanted = [k for k, stroke in enumerate(session.strokes) if chosen is None or stroke.stroke_id in chosen]
-    keys = {k: key_of("press", session.sha256, session.calibration_digest, view, k) for k in wanted}
+    keys = {k: key_of("press", session.sha256, session.calibration_digest, k) for k in wanted}
 
     def prepare(numbers: Collection[int]) -> None:
         jobs = (
-            (keys[k], PrepareJob(capture, session.calibration, view))
+            (keys[k], PrepareJob(capture, session.calibration))
             for k, capture in enumerate(session.recording.captures() if numbers else ())
             if k in numbers
         )
@@ -135,13 +127,12 @@ class PrepareJob:
 
     capture: Capture
     calibration: Calibration | None
-    view: Field
 
 
 def prepare_job(job: PrepareJob) -> Arrays:
     """The entry of a press in the store; `refused` alone says why there is none."""
     try:
-        prepared = prepare_press(job.capture, job.calibration, job.view)
+        prepared = prepare_press(job.capture, job.calibration)
     except (CaptureRefused, SessionDamaged) as error:
         return {"refused": np.array(error.what)}
     assert prepared.anchor_px is not None, "`prepare_press` refuses a stroke without one"
@@ -176,11 +167,11 @@ def crop(capture: Capture, calibration: Calibration | None) -> tuple[Gray, Mask,
 
     The ink of a press is its largest connected ink, as everywhere; that of a stroke that travels is all in its cell.
     """
-    raster, prepared = rectified(capture, calibration, Field())
+    raster, prepared = rectified(capture, calibration)
     return raster, prepared.ink if capture.stroke.kind == "drag" else prepared.mask, prepared
 
 
-def rectified(capture: Capture, calibration: Calibration | None, view: Field) -> tuple[Gray, Prepared]:
+def rectified(capture: Capture, calibration: Calibration | None) -> tuple[Gray, Prepared]:
     """The surroundings of a stroke at 20 px/mm, (h, w) gray, and what was found in them.
 
     A press is cropped to the field around its zero-touch point, a stroke that travels to its paper cell. A press in an
@@ -190,7 +181,7 @@ def rectified(capture: Capture, calibration: Calibration | None, view: Field) ->
     """
     stroke, image, params = capture.stroke, capture.image(), Params() if calibration is None else calibration.params
     if calibration is not None and stroke.anchor_mm is not None:
-        window, (left_mm, top_mm) = view.window_mm(stroke.anchor_mm), view.anchor_mm
+        window, (left_mm, top_mm) = field_around(stroke.anchor_mm), ANCHOR_MM
         if stroke.kind == "drag" and stroke.cell_mm is not None:
             window = x_mm, y_mm, _, tall_mm = stroke.cell_mm
             left_mm, top_mm = stroke.anchor_mm[0] - x_mm, y_mm + tall_mm - stroke.anchor_mm[1]
@@ -202,8 +193,8 @@ def rectified(capture: Capture, calibration: Calibration | None, view: Field) ->
         raise CaptureRefused(stroke.stroke_id, "has neither a calibration nor a scale of its own")
     anchor_px = stroke.anchor_px
     if anchor_px is not None and stroke.kind == "press":
-        around, (left_mm, top_mm) = 0.5 * params.background_mm, view.anchor_mm
-        right_mm, bottom_mm = view.side_mm - left_mm, view.side_mm - top_mm
+        around, (left_mm, top_mm) = 0.5 * params.background_mm, ANCHOR_MM
+        right_mm, bottom_mm = FIELD_MM - left_mm, FIELD_MM - top_mm
         reach_mm = (left_mm + around, top_mm + around, right_mm + around, bottom_mm + around)
         image, anchor_px = cut_out(image, anchor_px, stroke.px_per_mm, reach_mm, capture.where)
     raster = rescale(image, stroke.px_per_mm, capture.where)
@@ -211,29 +202,29 @@ def rectified(capture: Capture, calibration: Calibration | None, view: Field) ->
     return raster, prepare(raster, anchor, capture.where, params)
 
 
-def prepare_press(capture: Capture, calibration: Calibration | None, view: Field) -> Prepared:
+def prepare_press(capture: Capture, calibration: Calibration | None) -> Prepared:
     """Rectify a stroke to the millimetre field, whether or not it was marked bad: that may change, the result is kept.
 
     Raises as `rectified` does.
     """
     stroke = capture.stroke
-    _, prepared = rectified(capture, calibration, view)
+    _, prepared = rectified(capture, calibration)
     if calibration is not None and stroke.anchor_mm is not None:
         return prepared
     if prepared.anchor_px is None:
         raise CaptureRefused(stroke.stroke_id, "has no anchor (start_x_px, start_y_px): it cannot be laid on a model")
-    return _cropped(prepared, prepared.anchor_px, view)
+    return _cropped(prepared, prepared.anchor_px)
 
 
-def _cropped(prepared: Prepared, anchor_px: tuple[float, float], view: Field) -> Prepared:
+def _cropped(prepared: Prepared, anchor_px: tuple[float, float]) -> Prepared:
     """Crop a raster to the field around its anchor; `cut` is set where ink is left out.
 
     Raises `CaptureRefused` if none of the stroke lies in the field.
     """
-    side, (height, width) = round(view.side_mm * PX_PER_MM), prepared.mask.shape
+    side, (height, width) = round(FIELD_MM * PX_PER_MM), prepared.mask.shape
     left, top = (
         min(max(round(at - away_mm * PX_PER_MM), -side), most)
-        for at, away_mm, most in zip(anchor_px, view.anchor_mm, (width, height), strict=True)
+        for at, away_mm, most in zip(anchor_px, ANCHOR_MM, (width, height), strict=True)
     )
     window = slice(top + side, top + 2 * side), slice(left + side, left + 2 * side)
     mask, soft = (np.pad(part, side)[window] for part in (prepared.mask, prepared.soft))

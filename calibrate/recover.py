@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.commands import RecoverRequest
-from brushloop.calibrate.compare import Field
+from brushloop.calibrate.compare import MM_PER_PX
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import check_target, write_whole
 from brushloop.calibrate.fit.fit import BrushFit
@@ -153,7 +153,7 @@ def recover(request: RecoverRequest, progress: Progress = unseen) -> Recovered:
     count, refused = len(session.strokes), list[Refused]()
     most = min(count, request.presses or count)
     chosen = {session.strokes[number * count // most].stroke_id for number in range(most)}
-    presses = read_presses(session, Field(), refused, cut, chosen=chosen, progress=progress)
+    presses = read_presses(session, refused, cut, chosen=chosen, progress=progress)
     rows = [row for press in presses if (row := _row(press, inverter, refused))]
     recovered = Recovered(session, inverter.model.name, with_model_error(rows, fitted), refused, request.out)
     _write(recovered, request.repeats, request.seed)
@@ -169,7 +169,7 @@ def _inverter(request: RecoverRequest, session: OpenSession) -> tuple[Inverter, 
     low_mm, high_mm = request.depth_range_mm
     try:
         within = Range((max(low_mm, least_mm), high_mm), request.tilt_range_deg)
-        return Inverter(model, within, px_mm=Field().mm_per_px, anchor_sigma_mm=ANCHOR_SD_MM), fitted
+        return Inverter(model, within, px_mm=MM_PER_PX, anchor_sigma_mm=ANCHOR_SD_MM), fitted
     except ValueError as error:
         raise CalibrationError(str(request.session), f"no press of this brush in the range: {error}") from None
 

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from brushloop.calibrate.artefact import made_by
 from brushloop.calibrate.commands import TwinRequest
-from brushloop.calibrate.compare import Field
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written, check_target, write_whole
 from brushloop.calibrate.fit.captures import Cell, Grid, Pressed, by_cell, near_ink, read_presses
@@ -120,7 +119,7 @@ def twin(request: TwinRequest, progress: Progress = unseen) -> Written:
     check_target(target, ".toml")
     if target.exists() and not request.replace:
         raise CalibrationError(str(target), "exists: give --out FILE or --replace")
-    captures = read_presses(request.session, Field(), progress)
+    captures = read_presses(request.session, progress)
     header, store = captures.session.header, captures.session.store
     strokes, grid = near_ink(captures.strokes, captures.grid)
     with workers() as pool:

@@ -22,7 +22,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.compare import Field
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.presses import Refused, rectified
 from brushloop.calibrate.session import OpenSession, open_session
@@ -136,11 +135,6 @@ class Drags:
         paths = [commanded_path(*command[:4]) for command in self.commands.tolist()]
         return Drawings.of([[path] for path in paths], np.array([drag.ink for drag in self.placed]), *self.grid)
 
-    @property
-    def mm_per_px(self) -> float:
-        """The side of a pixel of the grid."""
-        return float(self.grid[0][1] - self.grid[0][0])
-
     def widths(self) -> list[tuple[float, float]]:
         """(commanded depth, width at the middle) in mm of the strokes that are neither cut nor have a defect."""
         whole = ((depth_of(drag.stroke), drag) for drag in self.strokes if not drag.cut and not drag.flags)
@@ -152,14 +146,14 @@ class Drags:
         return fit_line([depth for depth, _ in points], [width for _, width in points])
 
 
-def read_drags(path: Path, mm_per_px: float = MM_PER_PX, progress: Progress = unseen) -> Drags:
+def read_drags(path: Path, progress: Progress = unseen) -> Drags:
     """Read and measure every drag. Raises `CalibrationError` for presses, and for figures that the arm wrote."""
     session = open_session(path, "drag")
     if session.calibration is not None:
         what = "holds figures that the arm wrote: `write fit` fits their brush, `write compare` compares them"
         raise CalibrationError(str(session.recording.path), what)
     ends, travel_mm = _ends(session.strokes)
-    grid = _grid([command_of(stroke, travel_mm) for stroke in session.strokes], mm_per_px)
+    grid = _grid([command_of(stroke, travel_mm) for stroke in session.strokes])
     drags = Drags(session, [], [], grid, ends)
     for capture in counted(session.recording.captures(), "drags read", len(session.strokes), progress):
         try:
@@ -204,16 +198,16 @@ def _ends(strokes: Sequence[Stroke]) -> tuple[str, float | None]:
     return (SHARE_ENDS, float(np.median(travels_mm))) if travels_mm else ("", None)
 
 
-def _grid(commands: Sequence[tuple[float, ...] | None], mm_per_px: float) -> tuple[Floats, Floats]:
+def _grid(commands: Sequence[tuple[float, ...] | None]) -> tuple[Floats, Floats]:
     """Pixel centres of the grid that holds all commanded paths."""
     paths = [commanded_path(*command[:4]) for command in commands if command is not None]
     if not paths:
         return np.zeros(0), np.zeros(0)
     places = np.concatenate(paths)
-    # Pixel k covers [k, k + 1) mm_per_px in every session, so that one session's ink lies on the other's grid.
-    left, low = (int(k) for k in np.floor((places[:, :2].min(axis=0) - MARGIN_MM) / mm_per_px))
-    right, high = (int(k) for k in np.ceil((places[:, :2].max(axis=0) + MARGIN_MM) / mm_per_px))
-    x_mm, y_mm = (np.arange(left, right) + 0.5) * mm_per_px, (np.arange(high, low, -1) - 0.5) * mm_per_px
+    # Pixel k covers [k, k + 1) times MM_PER_PX in every session, so that one session's ink lies on the other's grid.
+    left, low = (int(k) for k in np.floor((places[:, :2].min(axis=0) - MARGIN_MM) / MM_PER_PX))
+    right, high = (int(k) for k in np.ceil((places[:, :2].max(axis=0) + MARGIN_MM) / MM_PER_PX))
+    x_mm, y_mm = (np.arange(left, right) + 0.5) * MM_PER_PX, (np.arange(high, low, -1) - 0.5) * MM_PER_PX
     return np.asarray(x_mm, np.float64), np.asarray(y_mm, np.float64)
 
 
@@ -222,7 +216,7 @@ def _read(capture: Capture, command: tuple[float, ...] | None, grid: tuple[Float
 
     Raises as `rectified` does.
     """
-    raster, prepared = rectified(capture, None, Field())
+    raster, prepared = rectified(capture, None)
     mask, anchor = prepared.mask, prepared.anchor_px
     whole = fill_holes(components(prepared.ink, anchor, WIDE)[0], WIDE)
     glare = tuple(flag for flag in prepared.flags if flag.startswith("glare"))

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from brushloop.calibrate.artefact import FittedValue, Frozen, SessionFit, made_by
-from brushloop.calibrate.drags import COMMANDS, Drags, commanded_path
+from brushloop.calibrate.drags import COMMANDS, MM_PER_PX, Drags, commanded_path
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.stats import farthest_first
 from brushloop.model.drag import DragModel, Drawings, Floats, Indices, Trails, derivatives, fit_to_ink, lagging
@@ -32,6 +32,8 @@ from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.messages import decode_gray
 from brushloop.sessions.terminal import Progress, counted, unseen
 
+GridScale = Annotated[float, Field(ge=MM_PER_PX, le=MM_PER_PX)]
+"""Scale of the grid in a file: ink on another grid is refused."""
 FOLDER = "dragfit"
 PREDICTED, LAG = "predicted", "bristle lag alone"
 SPREAD_MM = 0.9
@@ -128,7 +130,7 @@ class Kept(Frozen):
         Field(min_length=1, max_length=MOST_STROKES),
     ]
     """`COMMANDS` of each stroke."""
-    mm_per_px: Annotated[float, Field(ge=0.05, le=5.0)]
+    mm_per_px: GridScale
     left_mm: Number
     """Centre of the first column; the stroke starts at x = 0."""
     top_mm: Number
@@ -143,11 +145,11 @@ class Kept(Frozen):
         picture = 255 * (drawings.ink[used] > 0.5).astype(np.uint8).reshape(-1, len(drawings.x_mm))
         data = base64.b64encode(cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_BILEVEL, 1])[1].tobytes()).decode()
         if len(data) > MOST_BYTES:
-            what = f"{drags.mm_per_px:g} is too fine for the artefact of {len(used)} strokes"
-            raise CalibrationError("--mm-per-px", what)
+            what = f"holds strokes so long that {len(used)} of them do not fit into the artefact"
+            raise CalibrationError(drags.session.header.session_id, what)
         return Kept(
             commands=np.round(drags.commands[used], 6).tolist(),
-            mm_per_px=round(drags.mm_per_px, 9),
+            mm_per_px=MM_PER_PX,
             left_mm=round(float(drawings.x_mm[0]), 6),
             top_mm=round(float(drawings.y_mm[0]), 6),
             ink=data,
@@ -175,10 +177,10 @@ class Kept(Frozen):
 
         known, picture = np.array(self.commands), self._picture()
         seen = (picture > 127).reshape(len(known), -1, picture.shape[1])
-        own_x = np.asarray(self.left_mm + np.arange(seen.shape[2]) * self.mm_per_px, np.float64)
-        own_y = np.asarray(self.top_mm - np.arange(seen.shape[1]) * self.mm_per_px, np.float64)
+        own_x = np.asarray(self.left_mm + np.arange(seen.shape[2]) * MM_PER_PX, np.float64)
+        own_y = np.asarray(self.top_mm - np.arange(seen.shape[1]) * MM_PER_PX, np.float64)
         drawn = lagging([commanded_path(*row[:4]) for row in self.commands], model.vector()).distances(own_x, own_y)
-        missed = clipped(captured_distance(seen, self.mm_per_px)) - clipped(drawn)
+        missed = clipped(captured_distance(seen)) - clipped(drawn)
         spread = known.std(axis=0)
         # A command that never changes in training has no influence.
         scales = np.where(spread > 1e-9, np.array(SPREADS) * spread, 1e9)
@@ -186,8 +188,8 @@ class Kept(Frozen):
         ridge = RBFInterpolator(known / scales, images, smoothing=RIDGE, kernel="gaussian", epsilon=width, degree=-1)
         change = np.pad(ridge(commands / scales).reshape(-1, *seen.shape[1:]), ((0, 0), (1, 1), (1, 1)))
         # The margin of 0 stands for everything outside the known grid.
-        rows = np.rint((self.top_mm - y_mm) / self.mm_per_px + 1).clip(0, seen.shape[1] + 1).astype(np.int64)
-        columns = np.rint((x_mm - self.left_mm) / self.mm_per_px + 1).clip(0, seen.shape[2] + 1).astype(np.int64)
+        rows = np.rint((self.top_mm - y_mm) / MM_PER_PX + 1).clip(0, seen.shape[1] + 1).astype(np.int64)
+        columns = np.rint((x_mm - self.left_mm) / MM_PER_PX + 1).clip(0, seen.shape[2] + 1).astype(np.int64)
         return np.asarray(change[:, rows[:, None], columns], np.float64)
 
 
@@ -209,19 +211,19 @@ def clipped(distance_mm: NDArray[np.floating]) -> NDArray[np.float32]:
     return (REACH_MM * np.tanh(np.asarray(distance_mm, np.float32) / REACH_MM)).astype(np.float32)
 
 
-def captured_distance(masks: NDArray[np.bool_], mm_per_px: float) -> Floats:
+def captured_distance(masks: NDArray[np.bool_]) -> Floats:
     """Signed distance to the edge of captured ink (n, rows, columns), positive inside, mm."""
 
     def to_other(inked: NDArray[np.bool_]) -> list[cv2.typing.MatLike]:
         return [cv2.distanceTransform(each, cv2.DIST_L2, 5) - 0.5 for each in inked.astype(np.uint8)]
 
-    return np.where(masks, np.array(to_other(masks)), -np.array(to_other(~masks))).astype(np.float64) * mm_per_px
+    return np.where(masks, np.array(to_other(masks)), -np.array(to_other(~masks))).astype(np.float64) * MM_PER_PX
 
 
 class DragArtefact(SessionFit):
     """The fitted drag model on disk. Equal inputs give an equal file."""
 
-    mm_per_px: float
+    mm_per_px: GridScale
     parameters: dict[str, FittedValue]
     held_out: dict[str, tuple[float, float]] = Field(default_factory=dict)
     """CSIM and IoU by model of strokes that it was not fitted to, percent; empty with too few to leave any out."""
@@ -259,16 +261,14 @@ def fit_drags(drags: Drags, progress: Progress = unseen) -> DragArtefact:
     return _artefact(drags, images, fit_values(_coarse(drags, images)), held_out=held_out, kept=kept)
 
 
-def adapt_drags(drags: Drags, prior: DragArtefact, where: str, strokes: int) -> DragArtefact:
+def adapt_drags(drags: Drags, prior: DragArtefact, strokes: int) -> DragArtefact:
     """Adapt a known brush to `strokes` strokes of a session, as different as possible (`session_change`).
 
-    Raises `CalibrationError` if the session has fewer, or if its scale is not that of `prior`.
+    Raises `CalibrationError` if the session has fewer.
     """
     count = len(drags.sound)
     if not 1 <= strokes <= count:
         raise CalibrationError("--strokes", f"{strokes}: allowed 1 to {count}, the usable strokes")
-    if abs(drags.mm_per_px - prior.mm_per_px) > 1e-6:
-        raise CalibrationError(where, f"mm_per_px is {prior.mm_per_px:g}, here {drags.mm_per_px:g}")
     images = np.sort(drags.sound[different(drags.commands[drags.sound], strokes)])
     drawings = _coarse(drags, images)
     # A prior that is narrower by the root of a weight counts as much as ink of that weight.
@@ -299,7 +299,7 @@ def session_change(commands: Floats) -> dict[str, float]:
 
 def _coarse(drags: Drags, images: Indices) -> Drawings:
     """These strokes with pixels of about `FIT_MM`."""
-    return drags.drawings.only(images).every(max(1, round(FIT_MM / drags.mm_per_px)))
+    return drags.drawings.only(images).every(max(1, round(FIT_MM / MM_PER_PX)))
 
 
 def _artefact(drags: Drags, images: Indices, values: dict[str, FittedValue], **more: Any) -> DragArtefact:
@@ -309,7 +309,7 @@ def _artefact(drags: Drags, images: Indices, values: dict[str, FittedValue], **m
         recording_sha256=drags.session.sha256,
         calibration="",
         software=made_by(),
-        mm_per_px=round(drags.mm_per_px, 9),
+        mm_per_px=MM_PER_PX,
         parameters=values,
         fitted_strokes=tuple(drags.placed[int(k)].stroke.stroke_id for k in images),
         **more,

@@ -19,7 +19,7 @@ from rich.table import Table
 
 from brushloop.calibrate.artefact import load_artefact, made_by, put_to_use
 from brushloop.calibrate.commands import FitRequest
-from brushloop.calibrate.drags import MM_PER_PX, Drags, read_drags
+from brushloop.calibrate.drags import Drags, read_drags
 from brushloop.calibrate.drags.fit import FOLDER, PREDICTED, DragArtefact, adapt_drags, fit_drags, predicted
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written
@@ -124,9 +124,9 @@ def validate_drags(session: Path, fit: Path | None, progress: Progress = unseen)
     """
     if fit is None:
         nothing = np.zeros(0, np.bool_)
-        return DragValidation(read_drags(session, progress=progress), None, {}, nothing, nothing)
+        return DragValidation(read_drags(session, progress), None, {}, nothing, nothing)
     artefact = load_artefact(fit, DragArtefact)
-    drags = read_drags(session, artefact.mm_per_px, progress)
+    drags = read_drags(session, progress)
     truth = drags.drawings.ink > 0.5
     known = artefact.fitted_strokes if artefact.recording_sha256 == drags.session.sha256 else ()
     fitted = np.array([drag.stroke.stroke_id in known for drag in drags.placed])
@@ -288,11 +288,11 @@ def fit_session(request: FitRequest, progress: Progress = unseen) -> Written:
     if request.strokes is not None and request.prior is None:
         raise CalibrationError("--strokes", "needs --prior, the fit that is adapted to so many strokes")
     before = None if request.prior is None else load_artefact(request.prior, DragArtefact)
-    drags = read_drags(request.session, request.mm_per_px or (before.mm_per_px if before else MM_PER_PX), progress)
+    drags = read_drags(request.session, progress)
     if before is None:
         artefact = fit_drags(drags, progress)
     else:
-        artefact = adapt_drags(drags, before, str(request.prior), request.strokes or len(drags.placed))
+        artefact = adapt_drags(drags, before, request.strokes or len(drags.placed))
     path = put_to_use(artefact, drags.session.recording.path.parent, FOLDER)
     return Written(path, (*fit_lines(drags, artefact), f"Fit: {path}"))
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate import presses
-from brushloop.calibrate.compare import SIZE_PX, Field, brush_of
+from brushloop.calibrate.compare import ANCHOR_MM, MM_PER_PX, SIZE_PX, brush_of
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.presses import Refused, cut, uncommanded
 from brushloop.calibrate.session import OpenSession, open_session
@@ -84,23 +84,23 @@ class Captures:
     """Captures that cannot be used or are cut by the edge of their photograph."""
 
 
-def grid_of(view: Field) -> Grid:
+def field_grid() -> Grid:
     """The pixel centres of the millimetre field around the point of touch."""
-    left, top = view.anchor_mm
-    centres = np.asarray((np.arange(SIZE_PX) + 0.5) * view.mm_per_px, np.float64)
+    left, top = ANCHOR_MM
+    centres = np.asarray((np.arange(SIZE_PX) + 0.5) * MM_PER_PX, np.float64)
     return Grid(np.asarray(centres - left), np.asarray(top - centres))
 
 
-def read_presses(session: Path, view: Field, progress: Progress = unseen) -> Captures:
+def read_presses(session: Path, progress: Progress = unseen) -> Captures:
     """Read every usable press of a session. Raises `CalibrationError` where it holds none, or was not calibrated."""
     opened = open_session(session, "press")
     refused: list[Refused] = []
-    usable = presses.read_presses(opened, view, refused, uncommanded, cut, progress=progress)
+    usable = presses.read_presses(opened, refused, uncommanded, cut, progress=progress)
     strokes = [pressed(press) for press in usable]
     if not strokes:
         raise CalibrationError(str(opened.recording.path), "holds no press that can be used for a fit")
     brush = brush_of(opened.header)
-    return Captures(opened, float(brush.radius_mm), float(brush.length_mm), grid_of(view), strokes, refused)
+    return Captures(opened, float(brush.radius_mm), float(brush.length_mm), field_grid(), strokes, refused)
 
 
 def near_ink(strokes: Sequence[Pressed], grid: Grid) -> tuple[list[Pressed], Grid]:

@@ -14,10 +14,9 @@ from typing import Any, Self
 import numpy as np
 from pydantic import model_validator
 
-from brushloop.calibrate import MM_PER_PX
 from brushloop.calibrate.artefact import SessionFit, load_artefact, made_by, put_to_use
 from brushloop.calibrate.commands import FitRequest
-from brushloop.calibrate.compare import Field, brush_of
+from brushloop.calibrate.compare import MM_PER_PX, brush_of
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written
 from brushloop.calibrate.fit.captures import (
@@ -175,8 +174,7 @@ def fit_presses(request: FitRequest, progress: Progress = unseen) -> FitResult:
     """
     if request.prior is not None:
         raise CalibrationError("--prior", "adapts a fit of drags, and this session holds presses")
-    mm_per_px = request.mm_per_px or MM_PER_PX
-    captures = read_presses(request.session, Field(mm_per_px=mm_per_px), progress)
+    captures = read_presses(request.session, progress)
     session, grid, strokes = captures.session, captures.grid, captures.strokes
     press = fit_parameters(strokes, grid, captures.radius_mm, captures.length_mm)
     held_out = leave_cell_out(strokes, grid, press, progress=progress, store=session.store)
@@ -190,7 +188,7 @@ def fit_presses(request: FitRequest, progress: Progress = unseen) -> FitResult:
         length_mm=captures.length_mm,
         strokes=len(strokes),
         cells=tuple(by_cell(strokes)),
-        mm_per_px=mm_per_px,
+        mm_per_px=MM_PER_PX,
         parameters=dict(zip(NAMES, press.values.tolist(), strict=True)),
         edges_mm=press.edges.tolist(),
         ends_mm=press.ends.tolist(),

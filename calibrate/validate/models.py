@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from brushloop.calibrate.artefact import Frozen
-from brushloop.calibrate.compare import Field, Pixels, brush_of, images_of
+from brushloop.calibrate.compare import Pixels, brush_of, images_of
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.fit import BrushFit
 from brushloop.calibrate.fit.heldout import Draw
@@ -115,9 +115,7 @@ class Model:
         return self.info.name
 
 
-def predicted(
-    models: Iterable[Model], at: Condition, view: Field, store: Store
-) -> tuple[dict[str, Pixels], dict[str, str]]:
+def predicted(models: Iterable[Model], at: Condition, store: Store) -> tuple[dict[str, Pixels], dict[str, str]]:
     """(len(KEYS), 128, 128) of a condition by model, and why there is none by model that does not predict it.
 
     Marks that were drawn before are in the store.
@@ -130,10 +128,10 @@ def predicted(
         except DomainError as error:
             refused[model.name] = f"{model.name} does not predict it: {error}"
     parts = ((mark.points, mark.weights, origin_x_mm) for mark, origin_x_mm in marks.values())
-    key = key_of("drawn", view, *itertools.chain.from_iterable(parts))
+    key = key_of("drawn", *itertools.chain.from_iterable(parts))
     drawn = store.get(key)
     if drawn is None:
-        drawn = {str(k): images_of(*mark, view) for k, mark in enumerate(marks.values())}
+        drawn = {str(k): images_of(*mark) for k, mark in enumerate(marks.values())}
         store.put(key, drawn)
     return dict(zip(marks, (drawn[str(k)] for k in range(len(marks))), strict=True)), refused
 

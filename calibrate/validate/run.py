@@ -17,7 +17,6 @@ from brushloop.calibrate.commands import ValidateRequest
 from brushloop.calibrate.compare import (
     KEYS,
     Alignment,
-    Field,
     Pixels,
     Tone,
     brush_of,
@@ -25,7 +24,7 @@ from brushloop.calibrate.compare import (
     similarity,
 )
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.fit.captures import Pressed, grid_of, pressed
+from brushloop.calibrate.fit.captures import Pressed, field_grid, pressed
 from brushloop.calibrate.fit.heldout import MAX_FOLDS, Draw, Refit, leave_out, refit_bezier, refits
 from brushloop.calibrate.presses import Press, read_presses, too_thin, uncommanded
 from brushloop.calibrate.scores import Scores, similarities
@@ -54,11 +53,6 @@ DRAWS = 2
 MAX_SCORED, MIN_LEFT = 200, 5
 """Most and fewest other presses that such a fit is scored on."""
 MM_BINARY = KEYS.index((Alignment.MM, Tone.BINARY))
-
-
-def field_of(request: ValidateRequest) -> Field:
-    """The millimetre field on which strokes are compared."""
-    return Field(mm_per_px=request.mm_per_px)
 
 
 class Refused(NamedTuple):
@@ -103,7 +97,7 @@ class Outcome:
         cell = press.session, press.condition
         if cell not in self.drawn:
             [store] = (session.store for session in self.sessions if session.header.session_id == press.session)
-            self.drawn[cell] = predicted(self.models[press.session], press.condition, field_of(self.request), store)[0]
+            self.drawn[cell] = predicted(self.models[press.session], press.condition, store)[0]
         return self.drawn[cell]
 
 
@@ -131,9 +125,7 @@ def validate_presses(
     for session in sessions:
         name, left_out = session.header.session_id, list[tuple[str, str]]()
         reasons = uncommanded, too_thin
-        of_session = list(
-            read_presses(session, field_of(request), left_out, *reasons, scheduler=scheduler, progress=progress)
-        )
+        of_session = list(read_presses(session, left_out, *reasons, scheduler=scheduler, progress=progress))
         refused += (Refused(name, *reason) for reason in left_out)
         every = in_order([*models[name], *_held_out(session, of_session, request, scheduler, progress)])
         models[name] = [model for model in every if not request.models or model.name in request.models]
@@ -141,10 +133,10 @@ def validate_presses(
     names = list(dict.fromkeys(model.name for model in in_order([m for group in models.values() for m in group])))
     scores = Scores(presses, (*names, ANOTHER))
     for session in sessions:
-        _score(scores, session, models[session.header.session_id], field_of(request), refused, scheduler, progress)
+        _score(scores, session, models[session.header.session_id], refused, scheduler, progress)
     steps: list[Step] = []
     for number, session in enumerate(sessions if request.ablations else ()):
-        steps += _similarity_by_strokes(session, number, scores, field_of(request), scheduler)
+        steps += _similarity_by_strokes(session, number, scores, scheduler)
     return Outcome(sessions, request, models, scores, refused, steps)
 
 
@@ -152,14 +144,14 @@ def _held_out(
     session: FittedSession, presses: Sequence[Press], request: ValidateRequest, scheduler: Scheduler, progress: Progress
 ) -> Iterator[Model]:
     """Yield the models fitted to the session without the cells that they predict."""
-    view, wanted = field_of(request), request.models or (FITTED_HELD_OUT, BEZIER_REFITTED)
+    wanted = request.models or (FITTED_HELD_OUT, BEZIER_REFITTED)
     if request.held_out and (FITTED_HELD_OUT in wanted or BEZIER_REFITTED in wanted):
         left_out = _left_out(presses, MAX_FOLDS)
-        fits = _refitted(session, left_out, view, scheduler, progress)
+        fits = _refitted(session, left_out, scheduler, progress)
         if fits:
             yield held_out(BRUSH_LEFT_OUT, fits)
         if left_out:
-            beziers = {cell: refit_bezier(others, grid_of(view)) for fold, others in left_out for cell in fold}
+            beziers = {cell: refit_bezier(others, field_grid()) for fold, others in left_out for cell in fold}
             yield held_out(BEZIER_LEFT_OUT, beziers)
 
 
@@ -177,12 +169,12 @@ def _left_out(presses: Sequence[Press], most: int) -> LeftOut:
 
 
 def _refitted(
-    session: FittedSession, left_out: LeftOut, view: Field, scheduler: Scheduler, progress: Progress
+    session: FittedSession, left_out: LeftOut, scheduler: Scheduler, progress: Progress
 ) -> dict[Condition, Draw]:
     """The marks of the brush fitted without each cell; empty for a session that was not fitted."""
     if session.fit is None:
         return {}
-    start, grid = session.fit.press(), grid_of(view)
+    start, grid = session.fit.press(), field_grid()
     jobs = [Refit(others, grid, start.radius_mm, start.length_mm, start=start.values) for _, others in left_out]
     what = f"{session.header.session_id}: cells left out in turn"
     fits = refits(jobs, session.store, scheduler, what, progress)
@@ -202,7 +194,6 @@ def _score(
     scores: Scores,
     session: FittedSession,
     models: Sequence[Model],
-    view: Field,
     refused: list[Refused],
     scheduler: Scheduler,
     progress: Progress,
@@ -216,7 +207,7 @@ def _score(
     def jobs() -> Iterator[tuple[str, ScoreJob]]:
         for cell in cells:
             presses = [scores.presses[k] for k in cell]
-            images, reasons = predicted(models, presses[0].condition, view, session.store)
+            images, reasons = predicted(models, presses[0].condition, session.store)
             for why in reasons.values():
                 refused.extend(Refused(press.session, press.stroke.stroke_id, why) for press in presses)
             predictions = [[images[model.name]] if model.name in images else [] for model in models]
@@ -232,11 +223,9 @@ def _score(
         scores.values[np.ix_(numbers[key], columns)] = arrays["values"]
 
 
-def _similarity_by_strokes(
-    session: FittedSession, number: int, scores: Scores, view: Field, scheduler: Scheduler
-) -> Iterator[Step]:
+def _similarity_by_strokes(session: FittedSession, number: int, scores: Scores, scheduler: Scheduler) -> Iterator[Step]:
     """Yield scores of fits from few presses on others of the session; none for a session with too few presses."""
-    name, brush, grid = session.header.session_id, brush_of(session.header), grid_of(view)
+    name, brush, grid = session.header.session_id, brush_of(session.header), field_grid()
     trials = list(_trials(name, number, scores))
     fitted = [[pressed(press) for press in few] for few, _ in trials]
     jobs = [Refit(few, grid, float(brush.radius_mm), float(brush.length_mm)) for few in fitted]
@@ -245,16 +234,16 @@ def _similarity_by_strokes(
     for (_, others), few, fit in zip(trials, fitted, fits, strict=True):
         for label, model in (("CCD-BSM", fit.outline), ("Bézier", refit_bezier(few, grid))):
             if model is not None:
-                values.setdefault((len(few), label), []).extend(_on_others(model, others, view))
+                values.setdefault((len(few), label), []).extend(_on_others(model, others))
     for (count, label), of_model in sorted(values.items()):
         csim, ssim = (round(float(value), 6) for value in 100.0 * np.mean(of_model, axis=0))
         yield Step(name, count, label, csim, ssim, len(of_model))
 
 
-def _on_others(outline: Draw, presses: Sequence[Press], view: Field) -> Iterator[NDArray[np.float64]]:
+def _on_others(outline: Draw, presses: Sequence[Press]) -> Iterator[NDArray[np.float64]]:
     """Yield CSIM and SSIM in millimetres, binary, of each press."""
     conditions = {press.condition for press in presses}
-    images = {at: images_of(outline(at.depth_mm, at.tilt_deg), 0.0, view) for at in conditions}
+    images = {at: images_of(outline(at.depth_mm, at.tilt_deg), 0.0) for at in conditions}
     for press in presses:
         seen, drawn = (stack[MM_BINARY] / 255.0 for stack in (press.images, images[press.condition]))
         yield similarity(seen, drawn[None], Alignment.MM)[0]

@@ -19,6 +19,7 @@ import numpy as np
 
 from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.compare import (
+    MM_PER_PX,
     ROBOT_WRITING,
     TABLE_1,
     TABLE_2,
@@ -192,7 +193,7 @@ def report_of(
         source=outcome.sessions[0].header.source,
         software={name: version(name) for name in PACKAGES} | {"python": platform.python_version()},
         command=outcome.request.command,
-        mm_per_px=outcome.request.mm_per_px,
+        mm_per_px=MM_PER_PX,
         ssim_settings=SSIM_SETTINGS,
         sessions=tuple(_session(session, outcome.scores) for session in outcome.sessions),
         models=(*_models(outcome), *(kind for kind in KINDS_OF_PRESS if kind.name in present)),
@@ -314,8 +315,6 @@ def robot_writing(report: Report, key: Key = NORMAL) -> list[TableRow]:
     rows: list[TableRow] = []
     for loop in report.loops:
         basis = f"{loop.original} pressed again as {loop.again}, recovered by {loop.model}"
-        if loop.mm_per_px != report.mm_per_px and key[0] is Alignment.MM:
-            basis += f"; at {loop.mm_per_px:g} mm per pixel"
         rows.append(TableRow(ROBOT_WRITING, basis, loop.stat(AGAIN, key), TABLE_1[ROBOT_WRITING]))
     return rows
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from brushloop.calibrate.commands import CapturesRequest
-from brushloop.calibrate.compare import FINE, Field, Image, averaged, brush_of
+from brushloop.calibrate.compare import FINE, Image, averaged, brush_of
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.files import Written, check_target
 from brushloop.calibrate.presses import Refused, prepare_press
@@ -69,7 +69,7 @@ def align_captures(sessions: Sequence[OpenSession], generator: Path) -> AlignedP
                 continue
             try:
                 target.check(np.array([[stroke.depth_mm, stroke.tilt_deg]]))
-                prepared = prepare_press(capture, session.calibration, Field())
+                prepared = prepare_press(capture, session.calibration)
                 if prepared.cut:
                     raise CaptureRefused(stroke.stroke_id, "is cut by the edge of its photograph or cell")
                 image = _placed(prepared, target)

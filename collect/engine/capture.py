@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.board.pix2len import Plane, see_board
-from brushloop.calibrate.compare import SIZE_PX, Field, covered
+from brushloop.calibrate.compare import ANCHOR_MM, MM_PER_PX, SIZE_PX, covered, field_around
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.stats import odd_waits, wait_limit_s, waits_of
 from brushloop.calibrate.stroke import PX_PER_MM, Gray, Params
@@ -345,7 +345,6 @@ def _stroke(step: CaptureStep, patch: Patch, still: int) -> Stroke:
 
 # What a screen shows of a capture
 
-FIELD = Field()
 FINE = 8
 """Points per pixel and axis at which the model's mark is evaluated."""
 
@@ -355,8 +354,8 @@ def mark_of(brush: FittedPress, condition: Condition) -> NDArray[np.bool_] | Non
 
     A brush of which only radius and length are given leaves the mark of CCD-BSM as published.
     """
-    left, top = FIELD.anchor_mm
-    centres = (np.arange(FINE * SIZE_PX) + 0.5) * (FIELD.mm_per_px / FINE)
+    left, top = ANCHOR_MM
+    centres = (np.arange(FINE * SIZE_PX) + 0.5) * (MM_PER_PX / FINE)
     try:
         upper, lower = brush.edges_at(condition.depth_mm, condition.tilt_deg, np.asarray(centres - left, np.float64))
     except ValueError:
@@ -369,8 +368,8 @@ def mark_of(brush: FittedPress, condition: Condition) -> NDArray[np.bool_] | Non
 
 def pictures_of(image: Gray, plane: Plane, patch: Patch) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
     """The field around the patch's zero-touch point, and its ink on 128 x 128 px, or None if there is no ink."""
-    window = FIELD.window_mm(patch.anchor_mm)
-    left, top = FIELD.anchor_mm
+    window = field_around(patch.anchor_mm)
+    left, top = ANCHOR_MM
     raster = rectify(image, plane.homography, window)
     anchor_px = left * PX_PER_MM, top * PX_PER_MM
     try:

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from brushloop.__main__ import app
 from brushloop.calibrate.calibrated import calibrate_session
 from brushloop.calibrate.commands import CalibrateRequest, ExportRequest
-from brushloop.calibrate.compare import Field
+from brushloop.calibrate.compare import ANCHOR_MM, field_around
 from brushloop.calibrate.export import StrokesLeftOut, export
 from brushloop.calibrate.stats import odd_waits, waits_of
 from brushloop.sessions.disk import as_cell, as_text, number
@@ -157,9 +157,9 @@ def test_crops_and_masks_lie_over_the_true_marks(photographed: Photographed, tmp
         crop, mask = (cv2.imread(str(to / row[name]), cv2.IMREAD_GRAYSCALE) for name in ("file", "mask_file"))
         assert crop.shape == mask.shape == (768, 768)
         assert (float(row["px_per_mm_x"]), float(row["px_per_mm_y"])) == (20.0, 20.0)
-        left, top = (20.0 * v for v in Field().anchor_mm)
+        left, top = (20.0 * v for v in ANCHOR_MM)
         assert (float(row["anchor_x_px"]), float(row["anchor_y_px"])) == pytest.approx((left, top))
-        truth = true_mask(shot, Field().window_mm(anchor), 20.0)
+        truth = true_mask(shot, field_around(anchor), 20.0)
         assert ((mask > 0) & truth).sum() / ((mask > 0) | truth).sum() >= 0.9
         assert crop[mask > 0].mean() < 0.5 * crop[mask == 0].mean()
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 
-from brushloop.calibrate.compare import Alignment, Field, Tone
+from brushloop.calibrate.compare import Alignment, Tone
 from brushloop.calibrate.loop import (
     AGAIN,
     ANOTHER,
@@ -52,13 +52,13 @@ def press(name: str, shown: tuple[float, float], asked: tuple[float, float], of:
         again_of=of,
     )
     capture = Capture(stroke, encode_png(photograph(*shown)), f"test {name}")
-    return press_of(HEADER, stroke, prepare_job(PrepareJob(capture, CALIBRATION, Field())))
+    return press_of(HEADER, stroke, prepare_job(PrepareJob(capture, CALIBRATION)))
 
 
 def paired(originals: Iterable[Press], again: Iterable[Press]) -> tuple[list[Pair], dict[str, str]]:
     """Pairs, and why presses are in none."""
     refused: list[tuple[str, str]] = []
-    return pair_up(list(originals), list(again), MODEL, Field(), refused), dict(refused)
+    return pair_up(list(originals), list(again), MODEL, refused), dict(refused)
 
 
 ORIGINALS = [

@@ -68,7 +68,7 @@ def pages(photographed: Photographed, tmp_path_factory: pytest.TempPathFactory) 
         "calibrate": run("calibrate", session),
         "loop": _loop(folder),
         "write": _written(folder),
-        "fit": run("fit", _pressed(folder), "--mm-per-px", "0.8"),
+        "fit": run("fit", _pressed(folder)),
     }
 
 

@@ -19,7 +19,7 @@ import pytest
 
 from brushloop.calibrate import presses, work
 from brushloop.calibrate.commands import FitRequest, ValidateRequest
-from brushloop.calibrate.compare import Field
+from brushloop.calibrate.compare import ANCHOR_MM, FIELD_MM
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.fit import heldout
 from brushloop.calibrate.fit.fit import fit_presses
@@ -35,10 +35,9 @@ CELLS = [(11.0, 0.0), (15.0, 5.0), (20.0, 10.0)]
 READ = """
 import sys
 from pathlib import Path
-from brushloop.calibrate.compare import Field
 from brushloop.calibrate.presses import read_presses
 from brushloop.calibrate.session import open_session
-print([float(press.coverage.sum()) for press in read_presses(open_session(Path(sys.argv[1])), Field(), [])])
+print([float(press.coverage.sum()) for press in read_presses(open_session(Path(sys.argv[1])), [])])
 """
 
 
@@ -67,12 +66,10 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     return counts
 
 
-def read(
-    session: Path | OpenSession, view: Field | None = None, refused: list[tuple[str, str]] | None = None
-) -> list[Press]:
+def read(session: Path | OpenSession, refused: list[tuple[str, str]] | None = None) -> list[Press]:
     refused = [] if refused is None else refused
     opened = open_session(session) if isinstance(session, Path) else session
-    return list(presses.read_presses(opened, view or Field(), refused, uncommanded, cut, too_thin))
+    return list(presses.read_presses(opened, refused, uncommanded, cut, too_thin))
 
 
 def same(one: Press, other: Press) -> bool:
@@ -98,15 +95,13 @@ def test_what_a_press_depends_on_makes_it_anew(
     assert all(map(same, first, read(session)))
     assert calls["prepare_job"] == 3
 
-    read(session, Field(mm_per_px=0.4))
-    assert calls["prepare_job"] == 6, "another scale"
     params = CALIBRATION.model_copy(update={"preprocess": {"contrast_gate": 0.3}})
     for calibration in (CALIBRATION, params):
         read(replace(open_session(session), calibration=calibration))
-    assert calls["prepare_job"] == 12, "other parameters"
+    assert calls["prepare_job"] == 9, "other parameters"
     monkeypatch.setattr(work, "VERSION", "of tomorrow")
     read(session)
-    assert calls["prepare_job"] == 15, "other software"
+    assert calls["prepare_job"] == 12, "other software"
 
     photograph = tmp_path / "photos" / "0.png"
     image = cv2.imread(str(photograph), cv2.IMREAD_GRAYSCALE)
@@ -115,7 +110,7 @@ def test_what_a_press_depends_on_makes_it_anew(
     other = imported(tmp_path / "photos", lines, tmp_path / "other", "press")
     shutil.copytree(session / work.FOLDER, other / work.FOLDER)
     assert not same(first[0], read(other)[0])
-    assert calls["prepare_job"] == 18, "another photograph"
+    assert calls["prepare_job"] == 15, "another photograph"
 
 
 def test_damaged_large_and_lost_entries_are_prepared_again(
@@ -182,14 +177,14 @@ def test_a_press_is_cut_out_of_its_page_before_the_page_is_resampled(session: Pa
     assert np.abs(whole.coverage - near.coverage).mean() < 0.001
     [capture] = Recording(page).captures()
     raster, _, prepared = presses.crop(capture, None)
-    side = round(20.0 * (Field().side_mm + 32.0))
+    side = round(20.0 * (FIELD_MM + 32.0))
     assert raster.shape == pytest.approx((side, side), abs=40), "its field, and what its light is estimated from"
-    assert prepared.anchor_px == pytest.approx([20.0 * (at + 16.0) for at in Field().anchor_mm], abs=20.0)
+    assert prepared.anchor_px == pytest.approx([20.0 * (at + 16.0) for at in ANCHOR_MM], abs=20.0)
 
 
 def test_a_start_outside_its_page_is_refused_and_a_photograph_that_cannot_be_read(session: Path) -> None:
     capture = next(Recording(session).captures())
-    torn = presses.PrepareJob(replace(capture, still_png=capture.still_png[:100]), None, Field())
+    torn = presses.PrepareJob(replace(capture, still_png=capture.still_png[:100]), None)
     assert list(presses.prepare_job(torn)) == ["refused"]
     stroke = capture.stroke.model_copy(update={"anchor_px": (9000.0, 150.0)})
     with pytest.raises(CaptureRefused, match="none of it is in the field"):

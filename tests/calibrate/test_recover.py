@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from brushloop.calibrate.commands import RecoverRequest
-from brushloop.calibrate.compare import Field
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.presses import PrepareJob, prepare_job
 from brushloop.calibrate.recover import (
@@ -104,7 +103,7 @@ def test_what_cannot_be_inverted_is_refused_and_writes_nothing(tmp_path: Path) -
 def test_a_capture_without_any_scale_is_refused() -> None:
     stroke = Stroke(stroke_id="s", kind="press", still=0, anchor_mm=(3.0, 4.0))
     capture = Capture(stroke, encode_png(photograph(12.0, 3.0)), "s")
-    [(name, why)] = prepare_job(PrepareJob(capture, None, Field())).items()
+    [(name, why)] = prepare_job(PrepareJob(capture, None)).items()
     assert (name, str(why)) == ("refused", "has neither a calibration nor a scale of its own")
 
 

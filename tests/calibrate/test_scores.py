@@ -12,7 +12,6 @@ from brushloop.calibrate.compare import (
     BEST_SHIFT_PX,
     KEYS,
     Alignment,
-    Field,
     Polarity,
     Tone,
     best_shift,
@@ -144,12 +143,12 @@ def page_of(depth_mm: float, tilt_deg: float, model: str = "ccd-bsm") -> np.ndar
 def images_of(page: np.ndarray) -> np.ndarray:
     """(KEYS, 128, 128): the press of a page, as it is compared."""
     stroke = Stroke(stroke_id="a", kind="press", still=0, cell_mm=CELL, anchor_mm=ANCHOR)
-    return prepare_job(PrepareJob(Capture(stroke, encode_png(page), "test"), CALIBRATION, Field()))["images"]
+    return prepare_job(PrepareJob(Capture(stroke, encode_png(page), "test"), CALIBRATION))["images"]
 
 
 def scores_of(page: np.ndarray, depth_mm: float, tilt_deg: float) -> dict[str, np.ndarray]:
     """(KEYS, 2) scores of every model's press of that command."""
-    images = tuple([simulated(model, depth_mm, tilt_deg, Field())] for model in MODELS.values())
+    images = tuple([simulated(model, depth_mm, tilt_deg)] for model in MODELS.values())
     return dict(zip(MODELS, score_job((images_of(page), images))["values"], strict=True))
 
 
@@ -191,7 +190,7 @@ def test_scores_of_several_images_are_averaged_and_of_none_are_missing() -> None
 
 def test_the_field_holds_every_cell_of_the_grid() -> None:
     for depth_mm, tilt_deg in ((11.0, 0.0), (11.0, 10.0), (20.0, 0.0), (20.0, 10.0)):
-        image = simulated(MODELS["ccd-bsm"], depth_mm, tilt_deg, Field())[KEYS.index((Alignment.MM, Tone.GRAY))] / 255
+        image = simulated(MODELS["ccd-bsm"], depth_mm, tilt_deg)[KEYS.index((Alignment.MM, Tone.GRAY))] / 255
         assert np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]).max() == 0.0
         assert image.sum() * 0.3**2 == pytest.approx(
             MODELS["ccd-bsm"].profile(depth_mm, tilt_deg).area_mm2[0], rel=1e-3

@@ -13,8 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brushloop.calibrate.compare import Field
-from brushloop.calibrate.fit.captures import Grid, Pressed, grid_of
+from brushloop.calibrate.fit.captures import Grid, Pressed, field_grid
 from brushloop.collect.rig.config import QualityConfig
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 from brushloop.drivers.sim.brush.spec import ALLOWED, PAPER, load_brush
@@ -77,7 +76,7 @@ def test_a_mark_has_the_area_and_the_place_of_the_press_that_it_stands_for() -> 
 
 
 def test_the_quality_limits_hold_for_other_presses_of_the_brush() -> None:
-    grid, cells = grid_of(Field()), [(11.0, 0.0), (20.0, 0.0), (11.0, 10.0), (20.0, 10.0)]
+    grid, cells = field_grid(), [(11.0, 0.0), (20.0, 0.0), (11.0, 10.0), (20.0, 10.0)]
     brush = Brush(load_brush(Path(PAPER)).spec)
     head = sound_head(brush.spec, cells, grid)
     assert head is not None

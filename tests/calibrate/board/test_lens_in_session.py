@@ -19,7 +19,7 @@ from brushloop.calibrate.board.lens import Lens, fit_lens, read_lens
 from brushloop.calibrate.board.pix2len import see_board
 from brushloop.calibrate.calibrated import calibrate_session as calibrate
 from brushloop.calibrate.commands import CalibrateRequest
-from brushloop.calibrate.compare import Field
+from brushloop.calibrate.compare import MM_PER_PX, field_around
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.presses import prepare_press
 from brushloop.calibrate.session import Calibration
@@ -114,13 +114,13 @@ def test_a_lens_file_makes_scale_anchors_and_masks_right(
 
     for capture in Recording(session).captures():
         assert capture.stroke.anchor_mm is not None
-        mask = prepare_press(capture, made, Field()).mask
-        truth = true_mask(shot, Field().window_mm(capture.stroke.anchor_mm), PX_PER_MM)
+        mask = prepare_press(capture, made).mask
+        truth = true_mask(shot, field_around(capture.stroke.anchor_mm), PX_PER_MM)
         # The cell of the model's field may end in the middle of the stroke's neighbour; here there is none.
         assert (mask & truth).sum() / (mask | truth).sum() >= 0.95
     small = made.model_copy(update={"lens": made.lens.model_copy(update={"size_px": (1024, 768)})})
     with pytest.raises(CaptureRefused, match="is 2048 x 1536 px, the calibration is for 1024 x 768 px"):
-        prepare_press(capture, small, Field())
+        prepare_press(capture, small)
 
 
 def test_a_session_that_was_collected_with_a_lens_needs_no_other(
@@ -163,7 +163,7 @@ def test_the_review_looks_through_the_lens_that_the_session_recorded(
         assert looked.binary is not None
         assert looked.photo.shape == (768, 768), "the field, not the whole photograph"
         anchor = shot.anchors_mm[review.captures.index(seen)]
-        truth = true_mask(shot, Field().window_mm(anchor), 1.0 / Field().mm_per_px)
+        truth = true_mask(shot, field_around(anchor), 1.0 / MM_PER_PX)
         assert (looked.binary & truth).sum() / (looked.binary | truth).sum() >= 0.9
     alike = review.repeatability(Condition(13.0, 5.0))
     assert alike is not None

@@ -7,14 +7,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from brushloop.calibrate.drags import Drag, Drags, commanded_path
+from brushloop.calibrate.drags import MM_PER_PX, Drag, Drags, commanded_path
 from brushloop.calibrate.drags import fit as drags
 from brushloop.calibrate.drags.fit import LAG, PREDICTED, Kept, different, fit_values, model_of, predicted
 from brushloop.calibrate.stroke.preprocess import Measured
 from brushloop.model.drag import DragModel, Drawings, ink, lagging
 from brushloop.sessions.records import Header, Source, Stroke
 
-X_MM, Y_MM = np.arange(-10.0, 50.0, 1.0), np.arange(18.0, -18.0, -1.0)
+X_MM, Y_MM = np.arange(-10.0, 50.0, MM_PER_PX), np.arange(18.0, -18.0, -MM_PER_PX)
 TRUTH = DragModel(half_mm=1.5, half_per_mm=0.4, leash_mm=3.0, leash_per_mm=0.5, drift_y_mm=0.5, settle_mm=2.0)
 
 
@@ -34,15 +34,15 @@ def drawings(paths: list[np.ndarray], model: DragModel = TRUTH) -> Drawings:
     return Drawings(paths, np.arange(len(paths) + 1), ink(away, drags.SPREAD_MM).astype(np.float32), X_MM, Y_MM)
 
 
-def repeated(conditions: int, repeats: int, rows_up: list[int] | None = None, flawed: tuple[int, ...] = ()) -> Drags:
-    """An imported session in which each command was drawn several times; each image is moved up by a number of rows."""
+def repeated(conditions: int, repeats: int, mm_up: list[int] | None = None, flawed: tuple[int, ...] = ()) -> Drags:
+    """An imported session in which each command was drawn several times; each image is moved up by some mm."""
     length, bend = np.linspace(20.0, 35.0, conditions), np.linspace(-9.0, 9.0, conditions)
     commands = [(a, b, 5.0, 5.0, 0.0) for a, b in zip(length, bend, strict=True) for _ in range(repeats)]
     images = drawings([commanded_path(*command[:4]) for command in commands]).ink > 0.5
     strokes = []
-    for k, (command, image, by) in enumerate(zip(commands, images, rows_up or [0] * len(commands), strict=True)):
+    for k, (command, image, by) in enumerate(zip(commands, images, mm_up or [0] * len(commands), strict=True)):
         stroke, flags = Stroke(stroke_id=str(k), kind="drag", still=k), ("torn",) if k in flawed else ()
-        ink = np.roll(image, by, axis=0).astype(np.float32)
+        ink = np.roll(image, round(by / MM_PER_PX), axis=0).astype(np.float32)
         strokes.append(Drag(stroke, command, Measured(1.0, 1.0, 1.0, 1.0, 1.0), False, flags, np.zeros((1, 1)), ink))
     header = Header(session_id="s", source=Source.IMPORT, software="test", protocol="")
     return Drags(SimpleNamespace(header=header, sha256=""), strokes, [], (X_MM, Y_MM), "")

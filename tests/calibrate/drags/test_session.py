@@ -47,7 +47,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def fit_command(session: Path, *more: str) -> tuple[Path, str]:
     """The artefact that `brushloop fit` writes for drags, and what it prints."""
-    ran = CliRunner().invoke(app, ["fit", str(session), "--mm-per-px", "1.0", *more])
+    ran = CliRunner().invoke(app, ["fit", str(session), *more])
     assert ran.exit_code == 0, ran.output
     path = current(session, FOLDER)
     assert path is not None
@@ -121,7 +121,7 @@ def test_an_edited_file_hostile_ink_and_presses_are_refused_with_one_line(
 
 
 def test_the_ink_lies_where_the_command_put_it(session: Path) -> None:
-    drags = read_drags(session, 1.0)
+    drags = read_drags(session)
     straight = next(drag.ink for drag in drags.placed if drag.stroke.stroke_id == "0") > 0.5
     x, y = drags.grid[0][straight.any(axis=0)], drags.grid[1][straight.any(axis=1)]
     assert -12.0 < x.min() < 2.0

@@ -28,7 +28,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> None:
     narrow = CliRunner(env={"COLUMNS": "60"})
-    ran = narrow.invoke(app, ["fit", str(session), "--mm-per-px", "0.4"])
+    ran = narrow.invoke(app, ["fit", str(session)])
     assert ran.exit_code == 0, ran.output
     said = " ".join(ran.output.split())
     for words in ("heel", "width", "95 %", "left out of the fit in turn", "refitted Bezier", "uncalibrated"):
@@ -41,7 +41,7 @@ def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> Non
     assert fit.strokes == 5
     assert set(fit.cells) == set(CELLS)
     assert fit.csim_percent["fitted"] > fit.csim_percent["uncalibrated"] + 3.0
-    ran = narrow.invoke(app, ["validate", str(session), "--mm-per-px", "0.4", "--model", "ccd-bsm", "--model", NAME])
+    ran = narrow.invoke(app, ["validate", str(session), "--model", "ccd-bsm", "--model", NAME])
     assert ran.exit_code == 0, ran.output
     assert "paper's" in ran.output
     assert "…" not in ran.output

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import brushloop
-from brushloop.calibrate import MM_PER_PX
+from brushloop.calibrate.compare import MM_PER_PX
 from tests.blocks import ROOT, blocks_of
 from tests.calibrate.validate.conftest import MakeSession
 

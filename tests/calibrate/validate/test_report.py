@@ -21,6 +21,7 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.fit import fit_presses
 from brushloop.calibrate.fit.heldout import BEZIER, FITTED
 from brushloop.calibrate.stats import CEILING
+from brushloop.calibrate.validate import models
 from brushloop.calibrate.validate.command import validate
 from brushloop.calibrate.validate.diff import compare
 from brushloop.calibrate.validate.findings import trust
@@ -270,16 +271,19 @@ def test_a_report_does_not_differ_from_itself(before: Path) -> None:
     assert all(change.test.mean == 0.0 and change.test.n == 10 for change in found.changes)
 
 
-def test_another_scale_of_the_field_is_reported_stroke_by_stroke(session: Path, before: Path, tmp_path: Path) -> None:
-    run(session, "--out", tmp_path, *TWO, "--mm-per-px", "0.5")
-    found = {change.series: change for change in compare(DiffRequest(before, tmp_path)).changes}
-    # A coarser field: more blank paper in every window of SSIM, in each of the five cells.
-    coarser = found[("line", "mm", "binary", "ssim")]
-    assert (coarser.test.n, coarser.test.groups) == (10, 5)
-    assert coarser.test.interval is not None
-    assert coarser.test.interval[0] > 0.0
-    assert coarser.test.p == pytest.approx(2 / 2**5)  # signs are flipped by cell: five alike are no proof yet
-    assert coarser.verdict == "no significant difference"
+def test_another_version_of_a_model_is_compared_stroke_by_stroke(
+    session: Path, before: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(models, "_pressed", lambda model, at: (model.profile(at.depth_mm, at.tilt_deg), -9.0))
+    run(session, "--out", tmp_path, *TWO)
+    changes = {change.series: change for change in compare(DiffRequest(before, tmp_path)).changes}
+    # Every mark is drawn 9 mm too far to the left, in each of the five cells.
+    worse = changes[("line", "mm", "binary", "csim")]
+    assert (worse.test.n, worse.test.groups) == (10, 5)
+    assert worse.test.interval is not None
+    assert worse.test.interval[1] < 0.0
+    assert worse.test.p == pytest.approx(2 / 2**5)  # signs are flipped by cell: five alike are no proof yet
+    assert worse.verdict == "no significant difference"
     table = run("diff", before, tmp_path)
     assert "the same stroke" in table
     assert "n = 10 in 5 cells" in table

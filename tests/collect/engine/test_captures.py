@@ -13,7 +13,7 @@ from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 
 from brushloop.calibrate.calibrated import calibrate_session
 from brushloop.calibrate.commands import CalibrateRequest
-from brushloop.calibrate.compare import KEYS, Alignment, Field, Tone, simulated
+from brushloop.calibrate.compare import KEYS, Alignment, Tone, simulated
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.engine import capture as capturing
 from brushloop.collect.engine import recorder
@@ -249,7 +249,7 @@ BRUSH = FittedPress(6.0, 48.0)
 def test_the_mark_is_the_one_of_the_closed_form(depth_mm: float, tilt_deg: float) -> None:
     mark = mark_of(BRUSH, Condition(depth_mm, tilt_deg))
     model = stroke_model("ccd-bsm", BRUSH)
-    exact = simulated(model, depth_mm, tilt_deg, Field())[KEYS.index((Alignment.MM, Tone.BINARY))] > 0
+    exact = simulated(model, depth_mm, tilt_deg)[KEYS.index((Alignment.MM, Tone.BINARY))] > 0
     assert mark is not None
     assert exact.sum() > 100
     assert np.logical_xor(mark, exact).sum() <= 0.01 * exact.sum()
