@@ -85,7 +85,7 @@ class ArmReader:
 
     async def _ask(self, method: str) -> Any:
         if self._controller.connection.lost:
-            await self._controller.connection.reopen()
+            await self._controller.connection.open()
         return await self._controller.ask(method)
 
     async def _name(self, method: str) -> str:

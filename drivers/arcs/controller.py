@@ -54,36 +54,26 @@ class ReturnCode(IntEnum):
 
 
 class RobotMode(StrEnum):
-    """`getRobotModeType`; the spelling is the controller's."""
+    """The values of `getRobotModeType` that matter here; the spelling is the controller's."""
 
-    NO_CONTROLLER = "NoController"
-    DISCONNECTED = "Disconnected"
-    CONFIRM_SAFETY = "ConfirmSafety"
     BOOTING = "Booting"
     POWER_OFF = "PowerOff"
     POWER_ON = "PowerOn"
     IDLE = "Idle"
     BRAKE_RELEASING = "BrakeReleasing"
-    BACK_DRIVE = "BackDrive"
     RUNNING = "Running"
-    MAINTENANCE = "Maintaince"
-    ERROR = "Error"
     POWERING_OFF = "PowerOffing"
 
 
 class SafetyMode(StrEnum):
-    """`getSafetyModeType`."""
+    """The values of `getSafetyModeType` that matter here."""
 
-    UNDEFINED = "Undefined"
     NORMAL = "Normal"
     REDUCED = "ReducedMode"
-    RECOVERY = "Recovery"
-    VIOLATION = "Violation"
     PROTECTIVE_STOP = "ProtectiveStop"
     SAFEGUARD_STOP = "SafeguardStop"
     SYSTEM_EMERGENCY_STOP = "SystemEmergencyStop"
     ROBOT_EMERGENCY_STOP = "RobotEmergencyStop"
-    FAULT = "Fault"
 
 
 MOVING_ALLOWED = frozenset({SafetyMode.NORMAL, SafetyMode.REDUCED})
@@ -198,13 +188,9 @@ class Controller:
             raise ProtocolViolation(DEVICE, "getPayload", f"expected mass and centre, got {answer!r}") from None
         return mass_kg, [1e3 * v for v in centre_m]
 
-    async def mode(self) -> RobotMode:
-        """The robot mode. Raises `ProtocolViolation` for an unknown name."""
-        mode = await self.ask("RobotState.getRobotModeType")
-        try:
-            return RobotMode(mode)
-        except ValueError:
-            raise ProtocolViolation(DEVICE, "getRobotModeType", f"unknown mode {mode!r}") from None
+    async def mode(self) -> str:
+        """The robot mode."""
+        return str(await self.ask("RobotState.getRobotModeType"))
 
     async def state(self, calls: int) -> ArmState:
         """Read the modes and time `calls` consecutive calls of one kind; sets nothing."""
@@ -214,7 +200,7 @@ class Controller:
             await self.pose()
             took_s.append(time.monotonic() - began_s)
         safety = str(await self.ask("RobotState.getSafetyModeType"))
-        return ArmState(str(await self.mode()), safety, statistics.median(took_s) * 1e3)
+        return ArmState(await self.mode(), safety, statistics.median(took_s) * 1e3)
 
     async def require_safe(self, op: str) -> None:
         """Raise `RobotNotSafe`, with condition and remedy, unless the mode allows motion."""
@@ -315,7 +301,7 @@ MESSAGES = 5
 
 
 async def survey(host: str, port: int, framing: Framing) -> list[dict[str, Any]]:
-    """Ask everything on one connection, in the driver's order: version before login, then all about the first robot.
+    """Ask everything on one connection, in the driver's order: version, then all about the first robot.
 
     Each exchange has `method`, `params`, `took_ms` and `answer`: `result` or `error` as the controller sent it, else
     `silence`, `lost` or `refused`, which says why there is none; then the next question is asked. Ends early where the
@@ -335,9 +321,6 @@ async def survey(host: str, port: int, framing: Framing) -> list[dict[str, Any]]
         if "result" not in opened["answer"]:
             return [opened]
         await ask("SystemInfo.getInterfaceVersionCode")
-        login = await _exchange("login", None, connection.login())
-        if "result" not in login["answer"]:
-            exchanges.append(login)
         await ask("getRobotNames")
         names = results.get("getRobotNames")
         robot = str(names[0]) if isinstance(names, list) and names else "rob1"  # pyright: ignore[reportUnknownArgumentType]
@@ -380,7 +363,6 @@ async def only_asking(host: str, port: int, framing: Framing) -> AsyncGenerator[
     controller = Controller(RpcConnection(host, port, framing=framing))
     try:
         await open_arcs(controller.connection)
-        await controller.connection.login()
         [controller.robot, *_] = await controller.robot_names()
         yield controller
     finally:

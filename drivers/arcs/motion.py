@@ -312,7 +312,7 @@ class OwnPath:
         """
         self.require_followed()
         if self._controller.connection.lost:
-            await self._controller.connection.reopen()
+            await self._controller.connection.open()
         running, size = await self._controller.queue()
         steady, here = await self._controller.rest()
         self._require_ours(running, size)

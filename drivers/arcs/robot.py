@@ -60,7 +60,8 @@ class AuboArcs:
         self._telemetry = Telemetry(self._state, table, clock, on_notice)
         self._watchdog = Watchdog(self._state.connection, table.watchdog_s, on_notice)
         self._messages = Messages(self._motion)
-        self._departure = Departure(self._motion)
+        self._departure: Departure | None = None
+        """Of the arm since it was enabled."""
         self._motion.on_pose = self._telemetry.lag.asked
 
     async def connect(self) -> Identity:
@@ -69,24 +70,19 @@ class AuboArcs:
         After a failure nothing is left open, and nothing was set on an arm that was not identified.
         """
         try:
-            return await self._connect()
+            await open_arcs(self._state.connection)
+            version = await self._state.connection.call("SystemInfo.getInterfaceVersionCode")
+            for controller in (self._stop, self._motion):
+                await controller.connection.open()
+            [name, *_] = await self._state.robot_names()
+            self._motion.robot = self._state.robot = self._stop.robot = name
+            self._connected = True
+            model = str(await self._state.ask("RobotConfig.getRobotType"))
+            box = str(await self._state.ask("RobotConfig.getControlBoxType"))
+            await self._telemetry.start()
         except BaseException:
             await self._hang_up()
             raise
-
-    async def _connect(self) -> Identity:
-        await open_arcs(self._state.connection)
-        version = await self._state.connection.call("SystemInfo.getInterfaceVersionCode")
-        await self._state.connection.login()
-        for controller in (self._stop, self._motion):
-            await controller.connection.open()
-            await controller.connection.login()
-        [name, *_] = await self._state.robot_names()
-        self._motion.robot = self._state.robot = self._stop.robot = name
-        self._connected = True
-        model = str(await self._state.ask("RobotConfig.getRobotType"))
-        box = str(await self._state.ask("RobotConfig.getControlBoxType"))
-        await self._telemetry.start()
         firmware = f"interface {version}"
         if self._table.rtde_port is not None:
             firmware += f", telemetry by {self._telemetry.source}"
@@ -109,7 +105,7 @@ class AuboArcs:
         await power_on(self._motion)
         self._held = True  # a process that was killed may have left it so
         await self._ready()
-        await self._departure.enabled(settings)
+        self._departure = Departure(self._motion, settings, await self._motion.pose())
         await self._messages.codes()  # those that are there concern earlier motion
         await self._watchdog.arm()
         await self._telemetry.read()
@@ -177,7 +173,8 @@ class AuboArcs:
 
     async def _carry_out(self, motion: Coroutine[Any, Any, _R], legs: Sequence[Leg]) -> _R:
         """Whatever ends the motion before the arm has settled, the arm is stopped before it is raised."""
-        self._departure.left = None
+        departure = self._require_enabled("moveLine")
+        departure.left = None
         try:
             result = await motion
         except BaseException as error:
@@ -192,16 +189,16 @@ class AuboArcs:
                     cause.add_note(note)
                 raise cause from error
             raise
-        self._departure.left = legs[-1].target
+        departure.left = legs[-1].target
         return result
 
     async def _depart(self, op: str, lines: Sequence[QueuedLine], acc_mm_s2: float) -> Pose:
         """Check that the arm may go along `lines` from where it is, and return that place; see `Departure`."""
         for line in lines:
             self.check(line.target, speed_mm_s=line.speed_mm_s, acc_mm_s2=acc_mm_s2)
-        stops = self._stops
+        departure, stops = self._require_enabled(op), self._stops
         await self._ready()
-        start = await self._departure.ready(op, self._limits, [line.target for line in lines])
+        start = await departure.ready(op, self._limits, [line.target for line in lines])
         if self._stops != stops:
             raise MotionFailed(DEVICE, op, "the arm was stopped", condition="Nothing was sent to it.")
         return start
@@ -222,11 +219,16 @@ class AuboArcs:
 
     async def confirm(self) -> None:
         """Raise `RobotNotSafe`, `NotPowered`, `SettingsChanged` or `ArmMoved` if the arm is not as it was left."""
-        await self._departure.confirm()
+        await self._require_enabled("confirm").confirm()
 
     async def take_up(self) -> Pose:
         """Accept the place where the arm rests as the start of the next move. Raises as `confirm` does."""
-        return await self._departure.take_up()
+        return await self._require_enabled("take up").take_up()
+
+    def _require_enabled(self, op: str) -> Departure:
+        if self._departure is None:
+            raise NotConnected(DEVICE, op, "not enabled")
+        return self._departure
 
     def latest(self) -> PoseSample:
         """The newest pose. Raises `NotConnected` before the first, `Stale` after `stale_after_ms`."""
@@ -252,7 +254,7 @@ class AuboArcs:
         self._telemetry.listener = None
         try:
             if self._enabled:
-                under_way = self._departure.under_way
+                under_way = self._departure is not None and self._departure.left is None
                 try:
                     await self.stop()
                 except DeviceError:
@@ -269,7 +271,7 @@ class AuboArcs:
         for controller in (self._motion, self._stop, self._state):
             await controller.connection.close()
         self._connected = self._enabled = False
-        self._departure = Departure(self._motion)
+        self._departure = None
 
     async def _ready(self) -> None:
         """Before each motion, make sure that it can be stopped and that the controller does not hold its path."""
@@ -282,4 +284,4 @@ class AuboArcs:
         """Reopen the stop connection if it is lost: the controller may have dropped it while idle."""
         async with self._reopening:
             if self._stop.connection.lost:
-                await self._stop.connection.reopen()
+                await self._stop.connection.open()

@@ -19,7 +19,7 @@ from brushloop.drivers.arcs.controller import Controller, RobotMode, WrongOperat
 from brushloop.drivers.arcs.motion import POLL_S
 from brushloop.drivers.arcs.wire import DEVICE, Framing, numbers
 from brushloop.drivers.devices import Pose
-from brushloop.drivers.errors import ArmMoved, DeviceTimeout, NotConnected, NotPowered, SettingsChanged
+from brushloop.drivers.errors import ArmMoved, DeviceTimeout, NotPowered, SettingsChanged
 from brushloop.drivers.geometry import angles, distance, from_wire
 from brushloop.drivers.limits import Limits
 
@@ -186,23 +186,13 @@ RESTS_S = 0.5
 
 
 class Departure:
-    """Place and settings in which one arm was left."""
+    """Place and settings in which an enabled arm was left."""
 
-    def __init__(self, controller: Controller) -> None:
+    def __init__(self, controller: Controller, settings: Settings, left: Pose) -> None:
         self._controller = controller
-        self._settings: Settings | None = None
-        self.left: Pose | None = None
-        """Where the last line ended, or where `take_up` found the arm; None after a line that did not reach its end."""
-
-    @property
-    def under_way(self) -> bool:
-        """True from the moment a line is sent to the enabled arm until its place is known again."""
-        return self._settings is not None and self.left is None
-
-    async def enabled(self, settings: Settings) -> None:
-        """Note the settings with which the arm was enabled, and its place."""
         self._settings = settings
-        self.left = await self._controller.pose()
+        self.left: Pose | None = left
+        """Where the last line ended, or where `take_up` found the arm; None after a line that did not reach its end."""
 
     async def take_up(self) -> Pose:
         """Accept the place where the arm rests as the start of the next line.
@@ -237,15 +227,13 @@ class Departure:
         return start
 
     async def _require_settings(self, op: str) -> None:
-        enabled = self._require_enabled(op)
         current = await read_back(self._controller)
         await self._controller.require_safe(op)
         if await self._controller.mode() != RobotMode.RUNNING:
             raise NotPowered(DEVICE, op)
-        require_same(op, enabled, current)
+        require_same(op, self._settings, current)
 
     async def _require_rest(self, op: str) -> None:
-        self._require_enabled(op)
         loop = asyncio.get_running_loop()
         until_s = loop.time() + RESTS_S
         while not await self._controller.at_rest():
@@ -253,11 +241,6 @@ class Departure:
                 await self._controller.require_safe(op)  # a safety stop holds its path: that is the cause to report
                 raise ArmMoved(DEVICE, op, *self._off(await self._controller.pose()), moving=True)
             await asyncio.sleep(POLL_S)
-
-    def _require_enabled(self, op: str) -> Settings:
-        if self._settings is None:
-            raise NotConnected(DEVICE, op, "not enabled")
-        return self._settings
 
     def _require_place(self, op: str, here: Pose) -> None:
         if self._moved(here):

@@ -29,7 +29,6 @@ from pydantic import FiniteFloat, TypeAdapter, ValidationError
 
 from brushloop.drivers.errors import (
     ConnectionLost,
-    DeviceError,
     DeviceTimeout,
     NotConnected,
     ProtocolViolation,
@@ -283,25 +282,31 @@ class RpcConnection:
         return self._lost is not None
 
     async def open(self) -> None:
-        """Connect. Raises `ConnectionLost` (refused) or `DeviceTimeout`."""
+        """Connect and log in with the factory account, which bare clients do not; closes what was open before.
+
+        Raises `ConnectionLost` (refused) or `DeviceTimeout`. Then it counts as lost, so that its next user opens it.
+        """
+        await self.close()
+        try:
+            self._stream = await self._connected()
+            self._decoder = BareDecoder(DEVICE) if self._framing == "bare" else FrameDecoder(DEVICE)
+            if self._framing == "sof":
+                token = f"__login__\naubo\n{FACTORY_LOGIN_TOKEN}\n{SDK_INTERFACE_VERSION}\n"
+                await self._exchange("", "login", encode(token.encode()))
+        except BaseException:
+            await self.close()
+            self._lost = f"{self.host}:{self.port} was not opened"
+            raise
+
+    async def _connected(self) -> Stream:
+        where = f"{self.host}:{self.port}"
         try:
             async with asyncio.timeout(self._timeout_s):
-                self._stream = await asyncio.open_connection(self.host, self.port)
+                return await asyncio.open_connection(self.host, self.port)
         except TimeoutError:
-            self._lost = f"{self.host}:{self.port} did not answer"
-            raise DeviceTimeout(DEVICE, "connect", self._lost) from None
+            raise DeviceTimeout(DEVICE, "connect", f"{where} did not answer") from None
         except OSError as error:
-            self._lost = f"{self.host}:{self.port}: {error.strerror or error}"
-            raise ConnectionLost(DEVICE, "connect", self._lost) from None
-        self._decoder = BareDecoder(DEVICE) if self._framing == "bare" else FrameDecoder(DEVICE)
-        self._lost = None
-
-    async def login(self) -> None:
-        """Send the login frame of the factory account and wait for any reply; bare clients have no login."""
-        if self._framing == "bare":
-            return
-        token = f"__login__\naubo\n{FACTORY_LOGIN_TOKEN}\n{SDK_INTERFACE_VERSION}\n"
-        await self._exchange("", "login", encode(token.encode()))
+            raise ConnectionLost(DEVICE, "connect", f"{where}: {error.strerror or error}") from None
 
     async def call(self, method: str, params: Mapping[str, object] | None = None) -> Any:
         """The result of `method`. Raises `RpcError`, `DeviceTimeout`, `ConnectionLost`, `ProtocolViolation`."""
@@ -310,18 +315,6 @@ class RpcConnection:
             return await self._exchange(self._last_id, method, encode_bare_request(self._last_id, method, params))
         ident = request_id()
         return await self._exchange(ident, method, encode(encode_request(ident, method, params)))
-
-    async def reopen(self) -> None:
-        """Close, connect and log in again. Raises what `open` and `login` raise."""
-        await self.close()
-        try:
-            await self.open()
-            await self.login()
-        except BaseException:
-            # A half-open connection counts as lost, so that its next user opens it again.
-            await self.close()
-            self._lost = "it was not opened again"
-            raise
 
     async def close(self) -> None:
         """Close the socket; a call that still waits gets `NotConnected`."""
@@ -396,8 +389,8 @@ async def open_arcs(connection: RpcConnection) -> None:
     """Open the connection. Raises `WrongGeneration` if only the older software's port answers."""
     try:
         await connection.open()
-    except (ConnectionLost, DeviceTimeout):
-        if await answers(connection.host, AUBOPE_PORT):
+    except (ConnectionLost, DeviceTimeout) as error:
+        if error.op == "connect" and await answers(connection.host, AUBOPE_PORT):
             raise WrongGeneration(
                 DEVICE,
                 "connect",
@@ -408,10 +401,10 @@ async def open_arcs(connection: RpcConnection) -> None:
 
 async def answers(host: str, port: int) -> bool:
     """Whether anything listens there."""
-    probe = RpcConnection(host, port)
     try:
-        await probe.open()
-    except DeviceError:
+        async with asyncio.timeout(1.0):
+            _, writer = await asyncio.open_connection(host, port)
+    except OSError:
         return False
-    await probe.close()
+    writer.close()
     return True

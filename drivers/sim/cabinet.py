@@ -36,8 +36,6 @@ class Power:
         self._now_s = now_s
         self._steps: list[tuple[float, RobotMode]] = [(-1.0, RobotMode.POWER_OFF)]
         self.safety = SafetyMode.NORMAL
-        self.button_down = False
-        """Whether the emergency stop button is down; a person pushes and releases it."""
 
     @property
     def mode(self) -> RobotMode:
@@ -73,21 +71,6 @@ class Power:
         if self.mode != RobotMode.IDLE or self.safety not in MOVING_ALLOWED:
             return ReturnCode.BAD_STATE
         self.then((0.0, RobotMode.BRAKE_RELEASING), (BRAKE_RELEASE_S, RobotMode.RUNNING))
-        return ReturnCode.OK
-
-    def unlock(self) -> int:
-        """Clear a protective stop and nothing else. The arm does not resume by itself."""
-        if self.safety != SafetyMode.PROTECTIVE_STOP:
-            return ReturnCode.REQUEST_IGNORED if self.safety == SafetyMode.NORMAL else ReturnCode.BAD_STATE
-        self.safety = SafetyMode.NORMAL
-        return ReturnCode.OK
-
-    def restart_interface_board(self) -> int:
-        """Clear an emergency stop or a fault, once the button is released and the power is off."""
-        if self.button_down or self.mode != RobotMode.POWER_OFF:
-            return ReturnCode.BAD_STATE
-        if self.safety in EMERGENCY_STOPS or self.safety == SafetyMode.FAULT:
-            self.safety = SafetyMode.NORMAL
         return ReturnCode.OK
 
     def then(self, *steps: tuple[float, RobotMode]) -> None:
@@ -132,14 +115,13 @@ class Cabinet:
     def safety_stop(self, mode: SafetyMode = SafetyMode.PROTECTIVE_STOP) -> None:
         """Enter a safety stop where the arm is; only a person can clear it, and no lesser stop replaces it.
 
-        A protective stop keeps the path. An emergency stop, whose button is then down, switches the power off at once.
+        A protective stop keeps the path. An emergency stop switches the power off at once.
         """
         if mode == SafetyMode.PROTECTIVE_STOP:
             self.hold(HARD_STOP_M_S2)
         else:
             self.stop(HARD_STOP_M_S2, HARD_STOP_M_S2)
         if mode in EMERGENCY_STOPS:
-            self.power.button_down = True
             self.power.then((0.0, RobotMode.POWER_OFF))
         if mode in EMERGENCY_STOPS or self.power.safety not in EMERGENCY_STOPS:
             self.power.safety = mode
@@ -147,15 +129,9 @@ class Cabinet:
     def release(self) -> str:
         """End a safety stop as a person at the arm would; return the previous safety mode.
 
-        A protective stop is unlocked at the pendant, and a safeguard stop is reset at its input. For an emergency stop,
-        the button is released and the interface board restarted, which leaves the arm without power.
+        After an emergency stop the arm stays without power.
         """
-        before = self.power.safety
-        if before in EMERGENCY_STOPS:
-            self.power.button_down = False
-            self.power.restart_interface_board()
-        elif before in {SafetyMode.PROTECTIVE_STOP, SafetyMode.SAFEGUARD_STOP}:
-            self.power.safety = SafetyMode.NORMAL
+        before, self.power.safety = self.power.safety, SafetyMode.NORMAL
         return before.value
 
     def power_off(self) -> int:
@@ -360,8 +336,6 @@ def methods(cabinet: Cabinet) -> dict[str, Callable[[Params], Any]]:
         "RobotManage.setOperationalMode": lambda p: cabinet.configure(
             "operational_mode", p["mode"], p["mode"] in OPERATIONAL_MODES
         ),
-        "RobotManage.setUnlockProtectiveStop": lambda _: power.unlock(),
-        "RobotManage.restartInterfaceBoard": lambda _: power.restart_interface_board(),
         "RobotManage.isSimulationEnabled": lambda _: True,  # no arm is behind this controller
         "RobotState.getRobotModeType": lambda _: power.mode.value,
         "RobotState.getSafetyModeType": lambda _: power.safety.value,

@@ -78,7 +78,7 @@ def test_a_protective_stop_keeps_the_path_until_a_person_unlocks_and_someone_res
     rest_mm = on.off_mm(NEAR)
     assert (on.safety, on.exec_id) == ("ProtectiveStop", 0)
     assert (on.line(START), on.ask("RuntimeMachine.resume")) == (1, 1)
-    assert on.ask("RobotManage.setUnlockProtectiveStop") == 0
+    on.cabinet.release()
     on.clock.s += 5.0
     assert (on.safety, on.exec_id) == ("Normal", 0)
     assert on.off_mm(NEAR) == rest_mm
@@ -134,7 +134,6 @@ async def test_a_watchdog_that_is_not_fed_bites_and_one_that_is_fed_does_not(on:
     assert on.safety == "Normal"
     await bitten(on)
     assert on.safety == "ProtectiveStop"
-    on.ask("RobotManage.setUnlockProtectiveStop")
     assert not on.cabinet.watchdogs, "it bites once"
 
 
@@ -153,30 +152,17 @@ def test_nothing_less_takes_the_place_of_an_emergency_stop(on: Any):
         assert on.safety == "RobotEmergencyStop"
 
 
-def test_no_method_brings_an_arm_back_while_the_button_is_down(on: Any):
-    on.cabinet.safety_stop(SafetyMode.ROBOT_EMERGENCY_STOP)
-    methods = ("restartInterfaceBoard", "poweron", "startup", "setUnlockProtectiveStop")
-    for method in (*(f"RobotManage.{name}" for name in methods), "RuntimeMachine.resume"):
-        assert on.ask(method) != 0
-        on.clock.s += 5.0
-    assert (on.safety, on.mode) == ("RobotEmergencyStop", "PowerOff")
-    on.cabinet.power.button_down = False
-    on.clock.s += 5.0
-    assert on.safety == "RobotEmergencyStop", "releasing the button alone brings nothing back"
-    assert on.ask("RobotManage.restartInterfaceBoard") == 0
-    on.run()
-    assert (on.mode, on.line(NEAR)) == ("Running", 0)
-
-
-def test_a_safeguard_is_reset_by_a_person_and_the_path_is_gone(on: Any):
+@pytest.mark.parametrize("mode", [SafetyMode.ROBOT_EMERGENCY_STOP, SafetyMode.SAFEGUARD_STOP])
+def test_only_a_person_ends_a_stop_that_drops_the_path(on: Any, mode: SafetyMode):
     on.line(NEAR)
     on.clock.s += 0.5
-    on.cabinet.safety_stop(SafetyMode.SAFEGUARD_STOP)
-    assert on.ask("RobotState.isPowerOn") is True
-    for method in ("RobotManage.setUnlockProtectiveStop", "RuntimeMachine.resume", "RobotManage.restartInterfaceBoard"):
-        assert on.ask(method) == 1
-    assert on.cabinet.release() == SafetyMode.SAFEGUARD_STOP
-    on.clock.s += 5.0
+    on.cabinet.safety_stop(mode)
+    powered = mode is SafetyMode.SAFEGUARD_STOP
+    assert on.ask("RobotState.isPowerOn") is powered
+    assert on.ask("RuntimeMachine.resume") != 0
+    assert on.ask("RobotManage.poweron") == (0 if powered else 1)
+    assert on.cabinet.release() == mode
+    on.run()
     assert (on.safety, on.exec_id) == ("Normal", -1)
     assert on.off_mm(NEAR) > 10.0
     assert on.line(NEAR) == 0

@@ -41,7 +41,6 @@ async def lab() -> AsyncIterator[UnknownLab]:
 async def controller(lab: UnknownLab) -> AsyncIterator[Controller]:
     asked = Controller(RpcConnection(lab.host, ARCS_PORT, timeout_s=10.0))
     await open_arcs(asked.connection)
-    await asked.connection.login()
     [asked.robot, *_] = await asked.robot_names()
     yield asked
     await asked.connection.close()
