@@ -107,14 +107,6 @@ async def test_a_target_out_of_reach_names_the_controllers_message(make_arm: Mak
     await arm.move(NEAR, **QUICK)
 
 
-async def test_without_a_message_it_is_just_a_failed_motion(make_arm: MakeArm, cabinet: ArcsServer):
-    arm = await enabled(make_arm)
-    cabinet._methods["rob1.Trace.peek"] = lambda _: [5, {}, {"code": "x", "timestamp": 1}, {"code": 30047}]
-    with pytest.raises(MotionFailed) as caught:
-        await arm.move(BEYOND, **QUICK)
-    assert type(caught.value) is MotionFailed
-
-
 # ---------------------------------------------------------------- the watchdog
 
 
@@ -302,19 +294,3 @@ async def test_from_below_the_floor_only_the_tool_axis_leads_up(arm: AuboArcs, o
     up = brush_pose(x_mm, -200.0, 200.0, tilt_deg=10.0)
     await arm.move(up, **QUICK)
     assert distance(cabinet.cabinet.world.tool(), up)[0] < 0.05
-
-
-@pytest.mark.parametrize(
-    ("stands", "field"),
-    [
-        (brush_pose(190.0, -200.0, 200.0), "x"),
-        (brush_pose(300.0, -270.0, 200.0), "y"),
-        (brush_pose(300.0, -200.0, 410.0), "z"),
-        (brush_pose(300.0, -200.0, 80.0, tilt_deg=20.0), "tilt"),
-    ],
-)
-async def test_from_outside_no_line_is_known(arm: AuboArcs, other: Controller, stands: Pose, field: str):
-    await send(other, stands)
-    await arm.take_up()
-    with pytest.raises(LimitExceeded, match=f"the arm stands where {field} = .*Jog the arm up"):
-        await arm.move(ABOVE, **QUICK)

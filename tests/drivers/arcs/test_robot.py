@@ -213,11 +213,6 @@ async def comes_to_rest(cabinet: ArcsServer) -> bool:
     return at_rest(cabinet) and 100.0 < to_go_mm(cabinet) < 199.0
 
 
-async def test_a_stop_is_fine_in_a_protective_stop(arm: AuboArcs, cabinet: ArcsServer):
-    cabinet.cabinet.safety_stop()
-    await arm.stop()
-
-
 @pytest.mark.parametrize("silent", ["MotionControl.getExecId", "RobotState.getSafetyModeType"])
 async def test_a_stop_does_not_wait_behind_a_command_that_hangs(
     arm: AuboArcs, cabinet: ArcsServer, move: asyncio.Task[None], silent: str

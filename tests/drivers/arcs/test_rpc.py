@@ -1,31 +1,25 @@
 """Transcripts: what the client must send, what the controller answers, what the caller gets.
 
-Every archive of `brushloop doctor --report` in the folder `reports` is a test too: put a lab's there. The driver must
-read its controller as it did in the lab: the same words, and what it makes of them.
+Every archive of `brushloop doctor --report` in the folder `reports` is a test too: put a lab's there.
 """
 
 from __future__ import annotations
 
 import asyncio
-import json
+import math
 import re
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from brushloop.drivers.arcs.controller import survey
-from brushloop.drivers.arcs.robot import AuboArcs
-from brushloop.drivers.arcs.settings import ArcsTable
-from brushloop.drivers.arcs.wire import BareDecoder, FrameDecoder, RpcConnection, encode
+from brushloop.drivers.arcs.wire import Framing, RpcConnection, encode
 from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation, RpcError
-from brushloop.drivers.limits import Limits
 from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.rig import HOST
 from tests.drivers.arcs.transcript import (
     Answer,
-    AnsweringByName,
     Archive,
     Controller,
     following,
@@ -34,12 +28,9 @@ from tests.drivers.arcs.transcript import (
     reply,
     result,
     sends,
-    serving,
 )
-from tests.simulated_time import LoopClock
 
 REPORTS = sorted((Path(__file__).parent / "reports").glob("*.zip"))
-NOWHERE = Limits((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), 1.0, 1.0, 1.0)
 
 
 @pytest.fixture
@@ -166,71 +157,37 @@ async def test_closing_wakes_the_caller_that_still_waits(controller: Controller,
         await waiting
 
 
-# ---------------------------------------------------------------- the loopback controller, asked byte by byte
+STOP_LINE, MOVE_LINE = "rob1.MotionControl.stopLine", "rob1.MotionControl.moveLine"
+PACE = {"a": 1.0, "v": 1.0, "blend_radius": 0.0, "duration": 0.0}
+NONSENSE: list[tuple[str, dict[str, object], int]] = [
+    ("Nonsense", {}, -32601),
+    (STOP_LINE, {"acc": "fast", "acc_rot": 1.0}, -32602),
+    (MOVE_LINE, {"pose": [1], **PACE}, -32602),
+    ("rob1.RobotAlgorithm.forwardKinematics", {"q": [math.inf] * 6}, -32602),
+]
 
-Ask = Callable[[bytes], Awaitable[dict[str, Any]]]
-STOP = "rob1.MotionControl.stopLine"
+
+@pytest.mark.parametrize("framing", ["sof", "bare"])
+async def test_the_loopback_controller_answers_nonsense_with_the_codes_of_json_rpc(
+    cabinet: ArcsServer, framing: Framing
+):
+    connection = RpcConnection(HOST, cabinet.port, framing=framing)
+    await connection.open()
+    for method, params, code in NONSENSE:
+        with pytest.raises(RpcError) as caught:
+            await connection.call(method, params)
+        assert caught.value.code == code
+    assert await connection.call("getRobotNames") == ["rob1"]
+    await connection.close()
 
 
-@pytest.fixture(params=["sof", "short sof", "bare"])
-async def ask(request: pytest.FixtureRequest, cabinet: ArcsServer) -> AsyncIterator[Ask]:
-    """Send the bytes of a request in one framing, and hand back the reply."""
+@pytest.mark.parametrize(("sent", "answer"), [(b"{]", b"-32700"), (b"SOF\x00\x00\x09__login__", b"SUCCEED")])
+async def test_a_bare_client_that_sends_no_json_gets_an_error_and_a_frame_may_be_short(
+    cabinet: ArcsServer, sent: bytes, answer: bytes
+):
     reader, writer = await asyncio.open_connection(HOST, cabinet.port)
-    decoder = BareDecoder() if request.param == "bare" else FrameDecoder()
-
-    async def exchange(payload: bytes) -> dict[str, Any]:
-        match request.param:
-            case "sof":
-                writer.write(encode(payload))
-            case "short sof":
-                writer.write(b"SOF\x00" + len(payload).to_bytes(2, "big") + payload)
-            case _:
-                writer.write(payload)
-        replies: list[bytes] = []
-        while not replies:
-            data = await reader.read(4096)
-            assert data, "hung up"
-            replies = decoder.feed(data)
-        return json.loads(replies[0])
-
-    yield exchange
-    writer.close()
-    await writer.wait_closed()
-
-
-def request(method: str, **body: Any) -> bytes:
-    return json.dumps({"jsonrpc": "2.0", "method": method, **body}).encode()
-
-
-@pytest.mark.parametrize(
-    ("payload", "code"),
-    [
-        (request("Nonsense", id="a"), -32601),
-        (request(STOP, id="a"), -32602),
-        (request(STOP, id="a", params={"acc": "fast", "acc_rot": 1.0}), -32602),
-        (request("rob1.MotionControl.moveLine", id="a", params={"pose": [1], "a": 1, "v": 1}), -32602),
-        (request("rob1.RobotAlgorithm.forwardKinematics", id="a", params=[[1e999] * 6]), -32602),
-    ],
-)
-async def test_nonsense_gets_the_codes_of_json_rpc_and_its_id_back(ask: Ask, payload: bytes, code: int):
-    reply = await ask(payload)
-    assert (reply["id"], reply["error"]["code"]) == ("a", code)
-    assert (await ask(request("getRobotNames", id=2)))["result"] == ["rob1"]
-
-
-async def test_a_bare_client_that_sends_no_json_gets_an_error_and_is_disconnected(cabinet: ArcsServer):
-    reader, writer = await asyncio.open_connection(HOST, cabinet.port)
-    writer.write(b"{]")
-    assert json.loads(await reader.read())["error"]["code"] == -32700
-    writer.close()
-    await writer.wait_closed()
-
-
-async def test_the_header_of_a_reply_comes_in_one_piece(cabinet: ArcsServer):
-    reader, writer = await asyncio.open_connection(HOST, cabinet.port)
-    for _ in range(50):
-        writer.write(encode(request("rob1.RobotState.getTcpPose", id="a")))
-        assert len(await reader.read(65536)) > 8
+    writer.write(sent)
+    assert answer in await reader.read(4096)
     writer.close()
     await writer.wait_closed()
 
@@ -250,24 +207,3 @@ async def test_the_same_questions_get_the_same_answers(archive: Archive) -> None
         assert (exchange["method"], exchange["params"]) == (line["method"], line["params"])
         assert exchange["answer"].keys() == line["answer"].keys(), line["method"]
         assert exchange["answer"].get("result") == line["answer"].get("result"), line["method"]
-
-
-async def test_the_driver_finds_what_the_doctor_found(archive: Archive) -> None:
-    if not archive.robot["answers"]:
-        pytest.skip("the driver could not connect to this cabinet")
-    controller = AnsweringByName(archive)
-    async with serving(controller):
-        table = ArcsTable(
-            kind="aubo-arcs",
-            host="127.0.0.1",
-            port=controller.port,
-            tcp_offset_mm=(0.0, 0.0, 0.0),
-            framing=archive.framing,
-        )
-        arm = AuboArcs(table, NOWHERE, LoopClock())
-        identity = await arm.connect()
-        state = await arm.state(1)
-        await arm.close()
-    assert identity.model == archive.robot["identity"]
-    assert archive.robot["firmware"].startswith(identity.firmware)
-    assert f"{state.mode}, safety {state.safety}" in archive.robot["notes"]

@@ -21,11 +21,10 @@ from brushloop.drivers.arcs.telemetry import (
     encode_sample,
     encode_topic,
 )
-from brushloop.drivers.arcs.wire import FrameDecoder, encode, encode_short
+from brushloop.drivers.arcs.wire import FrameDecoder, encode
 from brushloop.drivers.devices import Pose, PoseSample, QueuedLine, Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, ProtocolViolation, Stale
 from brushloop.drivers.geometry import brush_pose, distance
-from brushloop.drivers.loopback import LoopbackServer
 from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 from brushloop.drivers.sim.rig import HOST
@@ -48,51 +47,36 @@ def test_a_topic_is_the_one_that_the_makers_client_sends():
     assert type(topic["frequency"]) is float
 
 
-class Scripted(LoopbackServer):
-    """Says to every client what its script says."""
-
-    def __init__(self, script: Serve) -> None:
-        super().__init__()
-        self._script = script
-
-    async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        await self._script(reader, writer)
-
-
-@pytest.fixture
-async def served() -> AsyncIterator[Callable[[Serve], Awaitable[int]]]:
-    """Serve one script on a port of its own."""
-    servers: list[Scripted] = []
-
-    async def serve(script: Serve) -> int:
-        servers.append(Scripted(script))
-        await servers[-1].start(HOST, 0)
-        return servers[-1].port
-
-    yield serve
-    for server in servers:
-        await server.stop()
-
-
 def says(*pieces: bytes, then: str = "silence") -> Serve:
     async def script(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         for piece in pieces:
             writer.write(piece)
-            await writer.drain()
             await asyncio.sleep(0.01)
         if then == "silence":
-            await asyncio.sleep(60.0)
+            await reader.read()
+        writer.close()
 
     return script
 
 
-async def outcome(port: int) -> list[Any]:
-    stream = RtdeStream(HOST, port)
-    try:
-        await stream.open(POSE, 50.0)
-        return (await stream.samples())[-1]
-    finally:
-        await stream.close()
+async def newest(script: Serve) -> list[Any]:
+    """The newest sample of a controller that says what its script says."""
+    over = asyncio.Event()
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            await script(reader, writer)
+        finally:
+            over.set()
+
+    async with await asyncio.start_server(serve, HOST, 0) as server:
+        stream = RtdeStream(HOST, server.sockets[0].getsockname()[1])
+        try:
+            await stream.open(POSE, 50.0)
+            return (await stream.samples())[-1]
+        finally:
+            await stream.close()
+            await over.wait()
 
 
 @pytest.mark.parametrize(
@@ -110,13 +94,13 @@ async def outcome(port: int) -> list[Any]:
         (says(GREETING, encode_sample(7, [1])), DeviceTimeout),
     ],
 )
-async def test_what_is_no_telemetry_is_distinguished(served: Any, script: Serve, error: type[Exception]):
+async def test_what_is_no_telemetry_is_distinguished(script: Serve, error: type[Exception]):
     with pytest.raises(error):
-        await outcome(await served(script))
+        await newest(script)
 
 
 @pytest.mark.parametrize(
-    ("frames", "newest"),
+    ("frames", "sample"),
     [
         (encode_sample(0, [[1, 2]]), [1, 2]),
         (encode(b"[0,[1,2]]"), [1, 2]),
@@ -125,8 +109,8 @@ async def test_what_is_no_telemetry_is_distinguished(served: Any, script: Serve,
     ],
     ids=["CBOR", "JSON", "after a ping", "a backlog"],
 )
-async def test_the_newest_sample_is_handed_over(served: Any, frames: bytes, newest: object):
-    assert await outcome(await served(says(GREETING, frames))) == [newest]
+async def test_the_newest_sample_is_handed_over(frames: bytes, sample: object):
+    assert await newest(says(GREETING, frames)) == [sample]
 
 
 @pytest.fixture
@@ -234,17 +218,6 @@ async def test_where_both_ways_are_silent_the_pose_goes_stale(rtde: RtdeServer, 
     arm.latest()  # fresh again by itself
 
 
-async def test_a_pose_that_is_none_ends_the_stream_not_the_arm(
-    rtde: RtdeServer, make_arm: MakeArm, notices: list[str], monkeypatch: pytest.MonkeyPatch
-):
-    value, pose = rtde._value, "R1_actual_TCP_pose"
-    monkeypatch.setattr(rtde, "_value", lambda name, rest: [None] * 6 if name == pose else value(name, rest))
-    arm = make_arm(rtde_port=rtde.port)
-    assert (await arm.connect()).firmware.endswith("polling")
-    assert len(notices) == 1
-    arm.latest()
-
-
 # ---------------------------------------------------------------- what the loopback controller pushes
 
 
@@ -252,9 +225,6 @@ class Client:
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.reader, self.writer = reader, writer
         self.decoder = FrameDecoder()
-
-    async def greeting(self) -> bytes:
-        return await self.reader.readuntil(b"}\n\n")
 
     async def pushes(self, seconds: float) -> list[Any]:
         got: list[Any] = []
@@ -267,14 +237,15 @@ class Client:
 
 @pytest.fixture
 async def client(rtde: RtdeServer) -> AsyncIterator[Client]:
-    it = Client(*await asyncio.open_connection(HOST, rtde.port))
-    yield it
-    it.writer.close()
-    await it.writer.wait_closed()
+    """A client that has been greeted."""
+    client = Client(*await asyncio.open_connection(HOST, rtde.port))
+    await client.reader.readuntil(b"}\n\n")
+    yield client
+    client.writer.close()
+    await client.writer.wait_closed()
 
 
 async def test_the_makers_own_bytes_subscribe(client: Client):
-    await client.greeting()
     client.writer.write(
         b"SOF\x00\x00\\\x82\x18d\xa5fchanel\x00ifrequency\xfaBH\x00\x00hsegments\x82kR1_actual_qrR1_actual_TCP_poseito_server\xf4gtrigger\x1aAAAA"
     )
@@ -288,17 +259,9 @@ async def test_the_makers_own_bytes_subscribe(client: Client):
     assert await client.pushes(0.1) == []
 
 
-@pytest.mark.parametrize("junk", [b"GET /", b"SOF\x02\x00\x01x", encode_short(b"\xff"), encode_short(b"[100, 5]")])
-async def test_a_client_that_talks_nonsense_is_hung_up_on(client: Client, junk: bytes):
-    await client.greeting()
-    client.writer.write(junk)
-    assert await client.reader.read() == b""
-
-
 async def test_where_the_arm_rested_between_two_pushes_is_reported_where_time_runs_fast(
     client: Client, cabinet: ArcsServer
 ):
-    await client.greeting()
     client.writer.write(encode_topic(0, ["R1_actual_TCP_pose", "timestamp"], 10.0))
     await client.pushes(0.15)
     motion, now_s = cabinet.cabinet.world.motion, cabinet.cabinet.now_s()

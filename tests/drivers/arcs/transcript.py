@@ -47,9 +47,9 @@ async def hang_up(_: str, writer: asyncio.StreamWriter) -> None:
 class Controller:
     """Expects the lines of its script in order, and nothing else."""
 
-    def __init__(self, framing: Framing = "sof") -> None:
+    def __init__(self, script: list[Line], framing: Framing) -> None:
         self.framing = framing
-        self.script: list[Line] = []
+        self.script = script
         self.surprises: list[str] = []
         self.ids: list[str] = []
         self.port = 0
@@ -58,13 +58,13 @@ class Controller:
         decoder = FrameDecoder() if self.framing == "sof" else BareDecoder()
         while data := await reader.read(4096):
             for payload in decoder.feed(data):
-                await self._follow(payload, writer)
+                if payload.startswith(b"__login__"):
+                    writer.write(encode(b"logged in"))
+                else:
+                    await self._follow(payload, writer)
         writer.close()
 
     async def _follow(self, payload: bytes, writer: asyncio.StreamWriter) -> None:
-        if payload.startswith(b"__login__"):
-            writer.write(encode(b"logged in"))
-            return
         request = json.loads(payload)
         if not self.script:
             self.surprises.append(f"nobody expected {request}")
@@ -80,22 +80,14 @@ class Controller:
 @asynccontextmanager
 async def following(script: list[Line], framing: Framing = "sof") -> AsyncIterator[Controller]:
     """Serve the script on a port of 127.0.0.1; fail where anything else was sent, or anything was left unsent."""
-    it = Controller(framing)
-    it.script = script
-    async with serving(it):
-        yield it
-    assert not it.surprises
-    assert not it.script, f"never asked for: {it.script}"
-
-
-@asynccontextmanager
-async def serving(it: Controller) -> AsyncIterator[None]:
-    """Serve on a port of 127.0.0.1 until the block ends."""
-    server = await asyncio.start_server(it.serve, "127.0.0.1", 0)
-    it.port = server.sockets[0].getsockname()[1]
-    yield
+    controller = Controller(script, framing)
+    server = await asyncio.start_server(controller.serve, "127.0.0.1", 0)
+    controller.port = server.sockets[0].getsockname()[1]
+    yield controller
     server.close()
     await server.wait_closed()
+    assert not controller.surprises
+    assert not controller.script, f"never asked for: {controller.script}"
 
 
 @dataclass(frozen=True)
@@ -103,8 +95,6 @@ class Archive:
     """What `brushloop doctor --report` wrote."""
 
     framing: Framing
-    robot: dict[str, Any]
-    """The doctor's finding about the arm."""
     lines: list[dict[str, Any]]
     """`arcs.jsonl`: each has method, params and answer."""
 
@@ -113,8 +103,7 @@ class Archive:
         with zipfile.ZipFile(path) as archive:
             report = json.loads(archive.read("report.json"))
             lines = [json.loads(line) for line in archive.read("arcs.jsonl").splitlines()]
-        [robot] = [finding for finding in report["findings"] if finding["device"] == "robot"]
-        return cls(report["framing"], robot, lines)
+        return cls(report["framing"], lines)
 
     def script(self) -> list[Line]:
         """Its lines as a test writes them."""
@@ -126,24 +115,5 @@ class Archive:
         if "lost" in answer:
             return hang_up
         body = {key: value for key, value in answer.items() if key in ("result", "error")}  # of `refused`: neither
-        return sends(lambda ident: self._framed({"id": ident, "jsonrpc": "2.0", **body}))
-
-    def _framed(self, body: dict[str, Any]) -> bytes:
-        payload = json.dumps(body).encode()
-        return encode(payload) if self.framing == "sof" else payload
-
-
-class AnsweringByName(Controller):
-    """Answers each method as an archive has it, whenever and however often it is asked."""
-
-    def __init__(self, archive: Archive) -> None:
-        super().__init__(archive.framing)
-        self.answers = {method: answer for method, _, answer in archive.script()}
-        self.unknown = sends(lambda i: archive._framed({"id": i, "error": {"code": -32601, "message": "unknown"}}))
-
-    async def _follow(self, payload: bytes, writer: asyncio.StreamWriter) -> None:
-        if payload.startswith(b"__login__"):
-            await super()._follow(payload, writer)
-            return
-        request = json.loads(payload)
-        await self.answers.get(request["method"], self.unknown)(request["id"], writer)
+        framed = encode if self.framing == "sof" else bytes
+        return sends(lambda ident: framed(json.dumps({"id": ident, "jsonrpc": "2.0", **body}).encode()))
