@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine, Sequence
-from typing import Any, TypeVar
+import contextlib
+from collections.abc import AsyncGenerator, Callable, Sequence
 
 from brushloop.drivers.arcs.controller import LOOPBACK_CONTROL_BOX, ArmState, Controller
 from brushloop.drivers.arcs.motion import (
@@ -30,7 +30,6 @@ from brushloop.drivers.limits import Limits
 __all__ = ["ArcsTable", "ArmState", "AuboArcs"]
 
 STOP_ACC_M_S2 = 2.0
-_R = TypeVar("_R")
 
 
 class AuboArcs:
@@ -146,37 +145,34 @@ class AuboArcs:
         if not lines or arrived(start, lines[-1].target):
             raise ValueError("sequence: it must not end where it begins")
         legs = legs_of(start, lines, self._limits, acc_mm_s2)
-        return await self._carry_out(self._press(start, legs, acc_mm_s2), legs)
-
-    async def _press(self, start: Pose, legs: Sequence[Leg], acc_mm_s2: float) -> list[Pose]:
-        stops = self._stops
-        self._held = True
-        with self._telemetry.seeing() as seen:
-            path = OwnPath(self._motion, start, legs, seen)
-            await queue_all(self._motion, start, legs, acc_mm_s2, stopped=lambda: self._stops != stops)
-            await until_settled(path.look, legs[-1].target, seconds_of(legs), patient=True)
-            self._held = False
-            await self._telemetry.reaching(legs[-1].target)
-            path.require_followed()
-            return [*seen]
+        async with self._under_way(legs) as stopped:
+            self._held = True
+            with self._telemetry.seeing() as seen:
+                path = OwnPath(self._motion, start, legs, seen)
+                await queue_all(self._motion, start, legs, acc_mm_s2, stopped=stopped)
+                await until_settled(path.look, legs[-1].target, seconds_of(legs), patient=True)
+                self._held = False
+                await self._telemetry.reaching(legs[-1].target)
+                path.require_followed()
+            return seen
 
     async def _feed(self, lines: Sequence[QueuedLine], acc_mm_s2: float, blend_mm: float | None = None) -> None:
         start = await self._depart("moveLine", lines, acc_mm_s2)
         legs = legs_of(start, lines, self._limits, acc_mm_s2, blend_mm)
-        stops = self._stops
-
-        async def motion() -> None:
-            await feed(self._motion, legs, acc_mm_s2, stopped=lambda: self._stops != stops, notice=self._notice)
+        async with self._under_way(legs) as stopped:
+            await feed(self._motion, legs, acc_mm_s2, stopped=stopped, notice=self._notice)
             await until_settled(self._motion.rest, legs[-1].target, seconds_of(legs))
 
-        await self._carry_out(motion(), legs)
+    @contextlib.asynccontextmanager
+    async def _under_way(self, legs: Sequence[Leg]) -> AsyncGenerator[Callable[[], bool]]:
+        """Whatever ends the block before the arm has settled, the arm is stopped before it is raised.
 
-    async def _carry_out(self, motion: Coroutine[Any, Any, _R], legs: Sequence[Leg]) -> _R:
-        """Whatever ends the motion before the arm has settled, the arm is stopped before it is raised."""
-        departure = self._require_enabled("moveLine")
+        Yields a function that tells whether the arm was stopped since the block began.
+        """
+        departure, stops = self._require_enabled("moveLine"), self._stops
         departure.left = None
         try:
-            result = await motion
+            yield lambda: self._stops != stops
         except BaseException as error:
             note = ""
             try:
@@ -190,7 +186,6 @@ class AuboArcs:
                 raise cause from error
             raise
         departure.left = legs[-1].target
-        return result
 
     async def _depart(self, op: str, lines: Sequence[QueuedLine], acc_mm_s2: float) -> Pose:
         """Check that the arm may go along `lines` from where it is, and return that place; see `Departure`."""

@@ -1,9 +1,8 @@
-"""Time is simulated here: no test waits, and none depends on how busy the machine is."""
+"""A loopback cabinet and arms on it. Time is simulated: no test waits, and none depends on how busy the machine is."""
 
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 from collections.abc import AsyncIterator, Callable
 from typing import Any
 
@@ -15,9 +14,13 @@ from brushloop.drivers.arcs.settings import ArcsTable
 from brushloop.drivers.arcs.wire import RpcConnection
 from brushloop.drivers.limits import Limits
 from brushloop.drivers.sim.arcs_server import ArcsServer
+from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import HOST
+from brushloop.drivers.sim.world import SimClock, World
 from tests.simulated_time import LoopClock, SimulatedTimeLoop
 
+RATE = 20.0
+LIMITS = Limits((-2000.0, 2000.0), (-260.0, 260.0), (95.0, 400.0), tilt_deg=15.0, speed_mm_s=250.0, acc_mm_s2=1000.0)
 MakeArm = Callable[..., AuboArcs]
 
 
@@ -26,24 +29,41 @@ def pytest_asyncio_loop_factories() -> dict[str, Callable[[], asyncio.AbstractEv
 
 
 @pytest.fixture
+async def cabinet() -> AsyncIterator[ArcsServer]:
+    """A controller with its power off, 20 times faster than life."""
+    server = ArcsServer(World(SimConfig(rate=RATE), SimClock(RATE, asyncio.get_running_loop().time)))
+    await server.start(HOST, 0)
+    yield server
+    await server.stop()
+
+
+@pytest.fixture
 def notices() -> list[str]:
     return []
 
 
 @pytest.fixture
-async def make_arm(cabinet: ArcsServer, limits: Limits, notices: list[str]) -> AsyncIterator[MakeArm]:
-    """An arm that is not connected, by fields of its table; its box is as wide as the room."""
+async def make_arm(cabinet: ArcsServer, notices: list[str]) -> AsyncIterator[MakeArm]:
+    """An arm that is not connected, by fields of its table."""
     arms: list[AuboArcs] = []
-    wide = dataclasses.replace(limits, x_mm=(-2000.0, 2000.0))
 
     def make(**fields: Any) -> AuboArcs:
         table = {"kind": "aubo-arcs", "host": HOST, "port": cabinet.port, "tcp_offset_mm": (0.0, 0.0, 180.0), **fields}
-        arms.append(AuboArcs(ArcsTable.model_validate(table), wide, LoopClock(), notices.append))
+        arms.append(AuboArcs(ArcsTable.model_validate(table), LIMITS, LoopClock(), notices.append))
         return arms[-1]
 
     yield make
     for arm in arms:
         await arm.close()
+
+
+@pytest.fixture
+async def arm(make_arm: MakeArm) -> AuboArcs:
+    """Connected, powered, brakes released."""
+    arm = make_arm()
+    await arm.connect()
+    await arm.enable()
+    return arm
 
 
 @pytest.fixture

@@ -261,10 +261,10 @@ async def test_an_arm_without_power_is_not_as_it_was_left_and_enabling_it_powers
 
 
 @pytest.mark.parametrize("code", [0, 13])
-async def test_a_return_code_is_no_proof_that_the_tool_was_set(sleeping_arm: AuboArcs, cabinet: ArcsServer, code: int):
+async def test_a_return_code_is_no_proof_that_the_tool_was_set(make_arm: MakeArm, cabinet: ArcsServer, code: int):
     cabinet._methods["rob1.RobotConfig.setTcpOffset"] = lambda _: code
     with pytest.raises(SettingsChanged, match=r"tool offset is \(0, 0, 0\) mm, .*, not \(0, 0, 180\) mm"):
-        await sleeping_arm.enable()
+        await enabled(make_arm)
     assert cabinet.cabinet.power.mode == "PowerOff"
 
 

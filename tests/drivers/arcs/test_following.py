@@ -22,8 +22,8 @@ from brushloop.drivers.errors import (
     RobotNotSafe,
 )
 from brushloop.drivers.geometry import brush_pose, distance
-from brushloop.drivers.limits import Limits
 from brushloop.drivers.sim.arcs_server import ArcsServer
+from tests.drivers.arcs.conftest import LIMITS
 from tests.drivers.failing import cut
 
 WAY = {"speed_mm_s": 40.0, "acc_mm_s2": 800.0, "blend_mm": 1.0}
@@ -219,10 +219,10 @@ async def test_a_queue_without_a_size_is_a_violation(arm: AuboArcs, cabinet: Arc
         await arm.follow(LONG, **SLOW)
 
 
-def test_a_turn_slows_its_own_line_and_corners_are_never_rounded_by_less_than_the_controller_takes(limits: Limits):
+def test_a_turn_slows_its_own_line_and_corners_are_never_rounded_by_less_than_the_controller_takes():
     start = brush_pose(250.0, -230.0, 260.0)
     poses = [brush_pose(252.0, -230.0, 260.0), brush_pose(254.0, -230.0, 260.0, heading_deg=30.0), line(40)[-1]]
-    legs = legs_of(start, [QueuedLine(pose, 40.0) for pose in poses], limits, 800.0, blend_mm=5.0)
+    legs = legs_of(start, [QueuedLine(pose, 40.0) for pose in poses], LIMITS, 800.0, blend_mm=5.0)
     assert [leg.blend_mm for leg in legs] == [1.0, 1.0, 0.0]
     assert legs[1].speed_mm_s == pytest.approx(45.0 * 2.0 / 30.0)
     assert legs[0].speed_mm_s == 40.0

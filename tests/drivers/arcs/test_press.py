@@ -24,6 +24,7 @@ from brushloop.drivers.errors import (
 from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
+from tests.drivers.arcs.conftest import MakeArm
 from tests.drivers.failing import cut, mute
 
 X_MM, Y_MM = 250.0, -230.0
@@ -149,7 +150,7 @@ async def test_a_stop_on_the_way_down_or_at_depth_drops_the_lift(arm: AuboArcs, 
 
 @pytest.mark.parametrize("counted", [True, False], ids=["a held line counts as running", "or not"])
 async def test_lines_that_a_dead_process_left_held_are_dropped_and_do_not_hold_up_the_next_one(
-    arm: AuboArcs, cabinet: ArcsServer, arm_at: Callable[[int], AuboArcs], counted: bool
+    arm: AuboArcs, cabinet: ArcsServer, make_arm: MakeArm, counted: bool
 ):
     await arm.close()
     cabinet.cabinet.hold()
@@ -157,13 +158,12 @@ async def test_lines_that_a_dead_process_left_held_are_dropped_and_do_not_hold_u
     running = cabinet._methods["rob1.MotionControl.getExecId"]
     if not counted:
         cabinet._methods["rob1.MotionControl.getExecId"] = lambda p: -1 if cabinet.cabinet.motion.held else running(p)
-    other = arm_at(cabinet.port)
+    other = make_arm()
     await other.connect()
     await other.enable()
     assert z_mm(cabinet) == HOME.z_mm
     assert await nothing_is_left(cabinet)
     await other.move(TOP, speed_mm_s=100.0, acc_mm_s2=ACC)
-    await other.close()
 
 
 def drops_the_dwell(cabinet: ArcsServer, code: int) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 
 import pytest
 
@@ -27,6 +27,7 @@ from brushloop.drivers.errors import (
 from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.faults import ALWAYS, Fault
+from tests.drivers.arcs.conftest import MakeArm
 from tests.drivers.failing import mute_to
 from tests.waiting import until
 
@@ -34,11 +35,10 @@ NEAR = brush_pose(260.0, -220.0, 250.0)
 FAR = brush_pose(250.0, -30.0, 260.0)  # 200 mm from home: two seconds of the fast clock
 QUICK = {"speed_mm_s": 200.0, "acc_mm_s2": 800.0}
 SLOW = {"speed_mm_s": 5.0, "acc_mm_s2": 800.0}
-ArmAt = Callable[[int], AuboArcs]
 
 
-async def test_connecting_reports_who_answers_and_where_the_tool_is(cabinet: ArcsServer, arm_at: ArmAt):
-    arm = arm_at(cabinet.port)
+async def test_connecting_reports_who_answers_and_where_the_tool_is(cabinet: ArcsServer, make_arm: MakeArm):
+    arm = make_arm()
     assert isinstance(arm, Robot)
     with pytest.raises(NotConnected):
         arm.latest()
@@ -56,11 +56,10 @@ async def test_connecting_reports_who_answers_and_where_the_tool_is(cabinet: Arc
         await arm.stop()
 
 
-async def test_a_cabinet_of_another_make_is_not_taken_for_the_loopback_rig(cabinet: ArcsServer, arm_at: ArmAt):
+async def test_a_cabinet_of_another_make_is_not_taken_for_the_loopback_rig(cabinet: ArcsServer, make_arm: MakeArm):
     cabinet._methods["rob1.RobotConfig.getControlBoxType"] = lambda _: "cb_ISStation"
-    arm = arm_at(cabinet.port)
+    arm = make_arm()
     assert not (await arm.connect()).simulated
-    await arm.close()
 
 
 async def test_a_slow_turn_on_the_spot_is_given_the_time_it_takes(arm: AuboArcs):
@@ -78,21 +77,21 @@ async def test_a_safety_mode_that_nobody_knows_forbids_motion(arm: AuboArcs, cab
 
 
 async def test_a_cabinet_of_the_older_generation_is_named_as_such(
-    arm_at: ArmAt, unused_tcp_port: int, monkeypatch: pytest.MonkeyPatch
+    make_arm: MakeArm, unused_tcp_port: int, monkeypatch: pytest.MonkeyPatch
 ):
     async with await asyncio.start_server(lambda _, writer: writer.close(), "127.0.0.1", 0) as older:
         monkeypatch.setattr(wire, "AUBOPE_PORT", older.sockets[0].getsockname()[1])
         with pytest.raises(WrongGeneration, match="AUBOPE"):
-            await arm_at(unused_tcp_port).connect()
+            await make_arm(port=unused_tcp_port).connect()
     monkeypatch.setattr(wire, "AUBOPE_PORT", unused_tcp_port)
     with pytest.raises(ConnectionLost):
-        await arm_at(unused_tcp_port).connect()
+        await make_arm(port=unused_tcp_port).connect()
 
 
-async def test_a_connect_that_fails_half_way_leaves_nothing_open(cabinet: ArcsServer, arm_at: ArmAt):
+async def test_a_connect_that_fails_half_way_leaves_nothing_open(cabinet: ArcsServer, make_arm: MakeArm):
     del cabinet._methods["rob1.RobotConfig.getRobotType"]
     with pytest.raises(RpcError, match="-32601"):
-        await arm_at(cabinet.port).connect()
+        await make_arm().connect()
     await until(lambda: cabinet.clients == 0, "the connections to be closed")
 
 

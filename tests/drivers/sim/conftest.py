@@ -82,6 +82,12 @@ def on(off: Bench) -> Bench:
 
 
 @pytest.fixture
+def small_view() -> View:
+    """A camera image that renders in a few milliseconds."""
+    return View(width_px=640, height_px=480, px_per_mm=1.95)
+
+
+@pytest.fixture
 async def rig(small_view: View) -> AsyncIterator[LoopbackRig]:
     """Everything that a rig has, 20 times faster than life."""
     async with LoopbackRig(SimConfig(rate=20.0, view=small_view)) as it:
