@@ -74,23 +74,18 @@ async def nothing_is_left(cabinet: ArcsServer) -> bool:
     return queued(cabinet) == 0 and cabinet.cabinet.world.tool() == here
 
 
-async def test_the_arm_goes_down_dwells_and_comes_up_and_the_lowest_pose_is_seen(arm: AuboArcs, cabinet: ArcsServer):
+async def test_the_arm_goes_down_dwells_and_comes_up_once_the_controller_has_every_line(
+    arm: AuboArcs, cabinet: ArcsServer
+):
+    held: list[tuple[float, int]] = []
+    before_each(cabinet, START_MOVE, lambda _: held.append((z_mm(cabinet), queued(cabinet))))
     seen = await arm.sequence(PRESS, acc_mm_s2=ACC)
+    assert held == [(HOME.z_mm, 3)]
     assert distance(cabinet.cabinet.world.tool(), TOP)[0] <= 0.05
     assert min(pose.z_mm for pose in seen) == pytest.approx(200.0, abs=0.05)
     near, deep, top = list(cabinet.cabinet.world.motion.rests)[-3:]
     assert (near.pose.z_mm, deep.pose.z_mm, top.pose.z_mm) == pytest.approx((200.05, 200.0, 300.0))
     assert deep.at_s - near.at_s == pytest.approx(DWELL_S, abs=1e-3)
-
-
-async def test_nothing_moves_before_the_controller_has_every_line(arm: AuboArcs, cabinet: ArcsServer):
-    heights: list[float] = []
-    before_each(cabinet, LINE, lambda _: heights.append(z_mm(cabinet)))
-    held: list[int] = []
-    before_each(cabinet, START_MOVE, lambda _: held.append(queued(cabinet)))
-    await arm.sequence(PRESS, acc_mm_s2=ACC)
-    assert heights == [HOME.z_mm] * 3
-    assert held == [3]
 
 
 async def test_a_host_that_is_gone_once_the_path_was_let_go_is_not_needed(arm: AuboArcs, cabinet: ArcsServer):
@@ -110,31 +105,46 @@ async def test_a_host_that_is_gone_once_the_path_was_let_go_is_not_needed(arm: A
     cabinet.faults.clear()
 
 
-@pytest.mark.parametrize("number", [1, 3])
-async def test_a_connection_that_is_lost_before_the_path_is_let_go_leaves_the_arm_where_it_is(
-    arm: AuboArcs, cabinet: ArcsServer, number: int
+def cuts(arm: AuboArcs, _: ArcsServer) -> None:
+    cut(arm._motion.connection)
+
+
+def stops(arm: AuboArcs, _: ArcsServer) -> asyncio.Task[None]:
+    return asyncio.create_task(arm.stop())
+
+
+def sends_aside(_: AuboArcs, cabinet: ArcsServer) -> None:
+    """Another client's line reaches the controller now."""
+    assert cabinet.cabinet.world.motion.add(ASIDE, 200.0, ACC, cabinet.cabinet.now_s())
+
+
+@pytest.mark.parametrize(
+    ("act", "error", "words"),
+    [
+        (cuts, ConnectionLost, "closed the connection"),
+        (stops, MotionFailed, "was stopped|holds 0 of 3 lines"),
+        (sends_aside, PathDisturbed, r"holds 4 lines, 3 were sent.*nother client"),
+    ],
+)
+@pytest.mark.parametrize(("method", "number"), [(STOP_MOVE, 1), (LINE, 1), (LINE, 3), (SIZE, 1)])
+async def test_whatever_happens_before_the_path_is_let_go_drops_it_and_leaves_the_arm_where_it_is(
+    arm: AuboArcs,
+    cabinet: ArcsServer,
+    method: str,
+    number: int,
+    act: Callable[[AuboArcs, ArcsServer], asyncio.Task[None] | None],
+    error: type[Exception],
+    words: str,
 ):
-    def lose(now: int) -> None:
-        if now == number:
-            cut(arm._motion.connection)
-
-    before_each(cabinet, LINE, lose)
-    with pytest.raises(ConnectionLost):
+    tasks: list[asyncio.Task[None] | None] = []
+    before_each(cabinet, method, lambda now: tasks.append(act(arm, cabinet)) if now == number else None)
+    with pytest.raises(error, match=words):
         await arm.sequence(PRESS, acc_mm_s2=ACC)
+    await asyncio.gather(*filter(None, tasks))
     assert z_mm(cabinet) == HOME.z_mm
     assert await nothing_is_left(cabinet)
-
-
-@pytest.mark.parametrize("method", [STOP_MOVE, LINE, SIZE])
-async def test_a_stop_before_the_path_is_let_go_drops_it(arm: AuboArcs, cabinet: ArcsServer, method: str):
-    stops: list[asyncio.Task[None]] = []
-    before_each(cabinet, method, lambda now: stops.append(asyncio.create_task(arm.stop())) if now == 1 else None)
-    with pytest.raises(MotionFailed, match="was stopped"):
-        await arm.sequence(PRESS, acc_mm_s2=ACC)
-    await asyncio.gather(*stops)
-    assert z_mm(cabinet) == HOME.z_mm
-    assert await nothing_is_left(cabinet)
-    await arm.move(TOP, speed_mm_s=100.0, acc_mm_s2=ACC)  # the hold is over, too
+    if act is not cuts:
+        await arm.move(TOP, speed_mm_s=100.0, acc_mm_s2=ACC)  # the hold is over, too
 
 
 @pytest.mark.parametrize("below_mm", [250.0, 200.1])
@@ -201,26 +211,16 @@ async def test_what_cannot_be_carried_out_is_refused_before_anything_is_sent(arm
 
 
 @pytest.mark.parametrize("kind", ["malformed", "garbage", "mute", "wrong-id", "drop"])
-@pytest.mark.parametrize("method", ["getExecId", "getTcpPose", "getSafetyModeType"])
-async def test_an_answer_that_cannot_be_read_in_a_descent_is_asked_again(
+@pytest.mark.parametrize("method", ["startMove", "getExecId", "getTcpPose", "getSafetyModeType"])
+async def test_an_answer_that_cannot_be_read_once_the_path_was_let_go_does_not_stop_it(
     arm: AuboArcs, cabinet: ArcsServer, kind: str, method: str
 ) -> None:
-    press = asyncio.create_task(arm.sequence(PRESS, acc_mm_s2=ACC))
-    await below(cabinet, 255.0)
-    cabinet.faults.hang(Fault(device=Device.ROBOT, kind=kind, on=method, count=2))
-    await press
+    fault = Fault(device=Device.ROBOT, kind=kind, on=method, count=1 if method == "startMove" else 2)
+    before_each(cabinet, START_MOVE, lambda _: cabinet.faults.hang(fault))
+    await arm.sequence(PRESS, acc_mm_s2=ACC)
     _, deep, top = list(cabinet.cabinet.world.motion.rests)[-3:]
     assert (deep.pose.z_mm, top.pose.z_mm) == pytest.approx((DEEP.z_mm, TOP.z_mm))
     await arm.move(DEEP, speed_mm_s=100.0, acc_mm_s2=ACC)
-
-
-@pytest.mark.parametrize("kind", ["malformed", "mute", "drop"])
-async def test_a_release_whose_answer_cannot_be_read_is_carried_out(
-    arm: AuboArcs, cabinet: ArcsServer, kind: str
-) -> None:
-    cabinet.faults.hang(Fault(device=Device.ROBOT, kind=kind, on="startMove"))
-    await arm.sequence(PRESS, acc_mm_s2=ACC)
-    assert z_mm(cabinet) == pytest.approx(TOP.z_mm)
 
 
 async def test_a_controller_that_never_answers_again_is_given_the_time_of_the_press(
@@ -274,32 +274,10 @@ def strays_mm(cabinet: ArcsServer) -> list[float]:
     return strays
 
 
-def sends_aside(cabinet: ArcsServer) -> None:
-    """Another client's line reaches the controller now."""
-    assert cabinet.cabinet.world.motion.add(ASIDE, 200.0, ACC, cabinet.cabinet.now_s())
-
-
-@pytest.mark.parametrize(
-    ("method", "number"),
-    [(LINE, 1), (LINE, 3), (SIZE, 1)],
-    ids=["before our first line", "before the lift", "after all our lines"],
-)
-async def test_a_line_that_comes_while_the_path_is_held_is_never_carried_out(
-    arm: AuboArcs, cabinet: ArcsServer, method: str, number: int
-) -> None:
-    before_each(cabinet, method, lambda now: sends_aside(cabinet) if now == number else None)
-    here = cabinet.cabinet.world.tool()
-    with pytest.raises(PathDisturbed, match=r"holds 4 lines, 3 were sent.*nother client"):
-        await arm.sequence(PRESS, acc_mm_s2=ACC)
-    assert cabinet.cabinet.world.tool() == here
-    assert queued(cabinet) == 0
-    await arm.move(TOP, speed_mm_s=100.0, acc_mm_s2=ACC)
-
-
 async def test_a_line_that_comes_between_the_last_check_and_the_release_is_stopped(
     arm: AuboArcs, cabinet: ArcsServer, strays_mm: list[float]
 ) -> None:
-    before_each(cabinet, START_MOVE, lambda _: sends_aside(cabinet))
+    before_each(cabinet, START_MOVE, lambda _: sends_aside(arm, cabinet))
     with pytest.raises(PathDisturbed, match="nother client"):
         await arm.sequence(PRESS, acc_mm_s2=ACC)
     assert max(strays_mm) < 0.5
