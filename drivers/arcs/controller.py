@@ -104,10 +104,8 @@ UNKNOWN_CONDITION = (
 
 
 REFUSAL_REMEDY = {
-    ReturnCode.BAD_STATE: "Bring the safety mode to Normal on the pendant.",
     ReturnCode.QUEUE_FULL: "Another client is sending motion; close it.",
     ReturnCode.BUSY: "Another program has the arm; stop it on the pendant.",
-    ReturnCode.INVALID_ARGUMENT: "Report this as a defect: the controller refuses an argument of the driver.",
 }
 
 

@@ -79,7 +79,7 @@ def _with_another_id(answer: bytes) -> bytes:
     return json.dumps(body, separators=(",", ":")).encode()
 
 
-PARSE_ERROR, METHOD_NOT_FOUND, INVALID_PARAMS = -32700, -32601, -32602
+INVALID_REQUEST, METHOD_NOT_FOUND, INVALID_PARAMS = -32600, -32601, -32602
 
 
 class ArcsServer(LoopbackServer):
@@ -102,52 +102,49 @@ class ArcsServer(LoopbackServer):
         data = await reader.read(65536)
         bare = data[:1] in (b"{", b"[", b" ", b"\t", b"\r", b"\n")
         decoder = BareDecoder() if bare else FrameDecoder()
-        frame = bytes if bare else encode
         while data:
-            try:
-                payloads = decoder.feed(data)
-            except ProtocolViolation as error:
-                if bare:  # a peer that speaks JSON gets an error before the connection is closed
-                    writer.write(_error(None, PARSE_ERROR, f"parse error: {error.what}"))
-                raise
-            for payload in payloads:
-                op, carried_out = self._request(payload)
+            for payload in decoder.feed(data):
+                request = request_of(payload)
+                op = request.get("method", "")
                 if self.faults.meet(Device.ROBOT, op, LOST) is not None:
                     continue
-                answer = carried_out()
+                answer = b"SUCCEED" if op == "login" else self._answer(request)
                 fault = self.faults.meet(Device.ROBOT, op, KINDS[Device.ROBOT] - LOST)
                 if fault is not None and fault.kind in STOPS:
                     self.cabinet.safety_stop(STOPS[fault.kind])
-                await send(writer, frame, answer, fault)
+                await send(writer, bytes if bare else encode, answer, fault)
             data = await reader.read(65536)
 
-    def _request(self, payload: bytes) -> tuple[str, Callable[[], bytes]]:
-        """The method's name, as faults refer to it, and a function that carries the request out and replies."""
-        if payload.startswith(b"__login__"):
-            return "login", lambda: b"SUCCEED"
-        try:
-            request = json.loads(payload)
-        except (ValueError, RecursionError) as error:
-            parse_error = _error(None, PARSE_ERROR, f"parse error: {error}")
-            return "", lambda: parse_error
-        match request:
-            case {"method": str(name)}:
-                return name, lambda: self._call(request.get("id"), name, request.get("params"))
-            case _:
-                return "", lambda: _error(None, INVALID_PARAMS, "a request is an object with a method")
-
-    def _call(self, ident: object, name: str, params: Any) -> bytes:
-        method = self._methods.get(name)
-        if method is None:
+    def _answer(self, request: dict[str, Any]) -> bytes:
+        """Carry out a request, and reply."""
+        ident, name, params = (request.get(field) for field in ("id", "method", "params"))
+        if name is None:
+            return _error(ident, INVALID_REQUEST, "a request is a JSON object with a method")
+        if name not in self._methods:
             return _error(ident, METHOD_NOT_FOUND, f"method not found: {name}")
         try:
             by_name: dict[str, Any] = params or {}
             if isinstance(params, list):
                 by_name = dict(zip(parameters(name), params, strict=True))  # pyright: ignore[reportUnknownArgumentType]
-            result = method(by_name)
+            result = self._methods[name](by_name)
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             return _error(ident, INVALID_PARAMS, f"invalid params: {error!r}")
         return _reply(ident, result=result)
+
+
+def request_of(payload: bytes) -> dict[str, Any]:
+    """A request by its fields; none where it is no JSON object with a method. A login has only the method `login`."""
+    if payload.startswith(b"__login__"):
+        return {"method": "login"}
+    try:
+        request: Any = json.loads(payload)
+    except (ValueError, RecursionError):
+        return {}
+    match request:
+        case {"method": str()}:
+            return request  # pyright: ignore[reportUnknownVariableType]
+        case _:
+            return {}
 
 
 def _reply(ident: object, **body: object) -> bytes:

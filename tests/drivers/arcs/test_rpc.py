@@ -181,8 +181,8 @@ async def test_the_loopback_controller_answers_nonsense_with_the_codes_of_json_r
     await connection.close()
 
 
-@pytest.mark.parametrize(("sent", "answer"), [(b"{]", b"-32700"), (b"SOF\x00\x00\x09__login__", b"SUCCEED")])
-async def test_a_bare_client_that_sends_no_json_gets_an_error_and_a_frame_may_be_short(
+@pytest.mark.parametrize(("sent", "answer"), [(b"[1]", b"-32600"), (b"SOF\x00\x00\x09__login__", b"SUCCEED")])
+async def test_what_is_no_request_gets_an_error_and_a_frame_may_be_short(
     cabinet: ArcsServer, sent: bytes, answer: bytes
 ):
     reader, writer = await asyncio.open_connection(HOST, cabinet.port)
