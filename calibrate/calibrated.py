@@ -5,7 +5,6 @@ The page shows the corners over the photograph with residual arrows, and the sca
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import math
 from collections.abc import Iterator, Sequence
@@ -34,7 +33,6 @@ from brushloop.calibrate.report import (
     write_page,
 )
 from brushloop.calibrate.session import Calibration, board_of, rig_of
-from brushloop.calibrate.stroke import Params
 from brushloop.sessions.disk import file_sha256
 from brushloop.sessions.messages import decode_gray
 from brushloop.sessions.recording import Recording
@@ -102,7 +100,6 @@ def calibrate_session(request: CalibrateRequest, progress: Progress = unseen) ->
         source=recording.header.source,
         recording_sha256=recording.sha256,
         software=made_by(),
-        preprocess=dataclasses.asdict(Params()),
         board=spec,
         still_sha256=hashlib.sha256(still).hexdigest(),
     )

@@ -15,7 +15,6 @@ from brushloop.calibrate.board.pix2len import Plane
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.calibrate.errors import CalibrationError, invalid
 from brushloop.calibrate.files import read_bounded
-from brushloop.calibrate.stroke import Params
 from brushloop.calibrate.work import FOLDER as FINISHED
 from brushloop.calibrate.work import Store
 from brushloop.sessions.recording import Recording
@@ -36,22 +35,15 @@ class Calibration(Plane, Artefact):
     Equal inputs give an equal file.
     """
 
-    schema_version: Literal[3] = 3
+    schema_version: Literal[4] = 4
     session_id: str
     source: str
     """`loopback rig` or `real capture`, as the recording says."""
     recording_sha256: str
     software: str
-    preprocess: dict[str, float]
-    """Values of `Params`."""
     board: BoardSpec
     still_sha256: str
     """sha256 of the encoded photograph of the board that this was measured on."""
-
-    @property
-    def params(self) -> Params:
-        """The parameters by which strokes are found in the session's photographs."""
-        return Params(**self.preprocess)
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,7 +30,6 @@ from brushloop.calibrate.stroke import PX_PER_MM, Gray, Mask, Params
 from brushloop.calibrate.stroke.preprocess import (
     Measured,
     components,
-    fill_holes,
     measure,
     outline,
     touches_edge,
@@ -218,7 +217,7 @@ def _read(capture: Capture, command: tuple[float, ...] | None, grid: tuple[Float
     """
     raster, prepared = rectified(capture, None)
     mask, anchor = prepared.mask, prepared.anchor_px
-    whole = fill_holes(components(prepared.ink, anchor, WIDE)[0], WIDE)
+    whole = components(prepared.ink, anchor, WIDE)[0]
     glare = tuple(flag for flag in prepared.flags if flag.startswith("glare"))
     return Drag(
         capture.stroke,

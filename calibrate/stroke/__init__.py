@@ -20,7 +20,7 @@ PX_PER_MM = 20.0
 
 @dataclass(frozen=True, slots=True)
 class Params:
-    """Parameters of the preprocessing; they are stored in the calibration's artefact."""
+    """Parameters of the preprocessing."""
 
     background_mm: float = 32.0
     """Window for estimating the lighting; a stroke thicker than this would be mistaken for shadow."""
@@ -30,5 +30,3 @@ class Params:
     """Components below this share of the main one are specks."""
     join_mm: float = 1.5
     """Components farther than this from the main one belong to other strokes."""
-    hole_mm2: float = 0.0
-    """Largest hole to fill, such as glare on wet ink leaves; 0 keeps all holes, since dry ink has them too."""

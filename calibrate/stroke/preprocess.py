@@ -109,12 +109,11 @@ def prepare(
     _check_contrast(reflectance[window], where, params)
     otsu, _ = cv2.threshold(to_levels(reflectance[window]), 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
     ink = to_levels(reflectance) <= round(otsu)
-    stroke, others_mm2 = components(ink, anchor_px, params)
-    if not stroke.any():
+    mask, others_mm2 = components(ink, anchor_px, params)
+    if not mask.any():
         raise CaptureRefused(where, "holds no stroke after specks and neighbours were removed")
-    mask = fill_holes(stroke, params)
     flags = _flags(raster[window], mask[window], others_mm2)
-    return Prepared(mask, _soft_ink(reflectance, stroke), ink, anchor_px, touches_edge(mask[window]), flags)
+    return Prepared(mask, _soft_ink(reflectance, mask), ink, anchor_px, touches_edge(mask[window]), flags)
 
 
 def _check_contrast(reflectance: Soft, where: str, params: Params) -> None:
@@ -191,28 +190,12 @@ def components(ink: Mask, anchor_px: tuple[float, float] | None, params: Params)
         candidates = near if near.size else candidates
     main = int(candidates[np.argmax(areas[candidates - 1])])
     others = [k for k in range(1, count) if k != main and areas[k - 1] >= params.speck_share * areas[main - 1]]
-    near = parts_near(labels, main, others, params.join_mm * PX_PER_MM)
+    near: list[int] = []
+    if others:
+        away_px = np.asarray(cv2.distanceTransform((labels != main).astype(np.uint8), cv2.DIST_L2, 5), np.float32)
+        near = [k for k in others if float(away_px[labels == k].min()) <= params.join_mm * PX_PER_MM]
     others_mm2 = [float(areas[label - 1]) / PX_PER_MM**2 for label in others if label not in near]
     return np.isin(labels, [main, *near]), others_mm2
-
-
-def parts_near(labels: cv2.typing.MatLike, main: int, others: list[int], reach_px: float) -> list[int]:
-    """Those of the `others` that come within `reach_px` of the component `main`; `labels` (h, w) numbers them all."""
-    if not others:
-        return []
-    away = np.asarray(cv2.distanceTransform((labels != main).astype(np.uint8), cv2.DIST_L2, 5), np.float32)
-    return [label for label in others if float(away[labels == label].min()) <= reach_px]
-
-
-def fill_holes(mask: Mask, params: Params) -> Mask:
-    """The mask with its holes of up to `hole_mm2` filled."""
-    if params.hole_mm2 <= 0.0:
-        return mask
-    count, labels, stats, _ = cv2.connectedComponentsWithStats((~np.pad(mask, 1)).astype(np.uint8), connectivity=4)
-    small = np.zeros(count, np.bool_)
-    small[1:] = stats[1:, cv2.CC_STAT_AREA] <= params.hole_mm2 * PX_PER_MM**2
-    filled = small[np.asarray(labels, np.int64)]
-    return mask | filled[1:-1, 1:-1]
 
 
 def _within(labels: NDArray[np.int32], point: tuple[float, float], radius: float) -> NDArray[np.int64]:

@@ -35,7 +35,6 @@ CALIBRATION = Calibration(
     source="loopback rig",
     recording_sha256="",
     software="",
-    preprocess={},
     board=BoardSpec(squares=(5, 7), square_mm=40.0, marker_mm=20.0, origin_mm=(0.0, 0.0)),
     still_sha256="",
 )

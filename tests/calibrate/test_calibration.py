@@ -137,7 +137,7 @@ def test_an_artefact_is_named_after_its_contents(tmp_path: Path) -> None:
     [
         ("no json", ": Invalid JSON"),
         ('{"session_id": "s"}', "image_to_paper: Field required"),
-        (CALIBRATION.model_dump_json().replace('"schema_version":3', '"schema_version":4'), "schema_version: Input"),
+        (CALIBRATION.model_dump_json().replace('"schema_version":4', '"schema_version":5'), "schema_version: Input"),
     ],
     ids=["words", "half", "of later"],
 )
