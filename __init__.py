@@ -16,9 +16,7 @@ if TYPE_CHECKING:
         Prediction,
         RecordedPress,
         Session,
-        Similarity,
         calibrate_session,
-        compare,
         fit,
         models,
         predict,
@@ -29,6 +27,7 @@ if TYPE_CHECKING:
     from brushloop.collect.start import collect_session
     from brushloop.drivers.loopback import LoopbackRig, simulate
     from brushloop.model.ccdbsm import Brush, DomainError
+    from brushloop.model.similarity import Similarity, compare
     from brushloop.sessions.errors import SessionDamaged, SessionError
     from brushloop.sessions.records import Condition
 
@@ -37,13 +36,14 @@ _NAMES = {
     "brushloop.calibrate.errors": ("CalibrationError", "CaptureRefused"),
     "brushloop.calibrate.fit.fit": ("BrushFit",),
     "brushloop.calibrate.notebook": (
-        *("Prediction", "RecordedPress", "Session", "Similarity"),
-        *("calibrate_session", "compare", "fit", "models", "predict", "recover", "validate"),
+        *("Prediction", "RecordedPress", "Session"),
+        *("calibrate_session", "fit", "models", "predict", "recover", "validate"),
     ),
     "brushloop.collect.errors": ("CollectAborted", "ConfigError"),
     "brushloop.collect.start": ("collect_session",),
     "brushloop.drivers.loopback": ("LoopbackRig", "simulate"),
     "brushloop.model.ccdbsm": ("Brush", "DomainError"),
+    "brushloop.model.similarity": ("Similarity", "compare"),
     "brushloop.sessions.records": ("Condition",),
     "brushloop.sessions.errors": ("SessionDamaged", "SessionError"),
 }

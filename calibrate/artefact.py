@@ -59,7 +59,7 @@ class Artefact(Frozen):
 class SessionFit(Artefact):
     """Base class of what is fitted to the strokes of one session."""
 
-    schema_version: Literal[1, 2] = 1
+    schema_version: Literal[1] = 1
     session_id: str
     source: str
     recording_sha256: str
@@ -87,12 +87,12 @@ def load_artefact(path: Path, kind: type[A]) -> A:
         what = f"is not a result of brushloop, whose name is {HASH_CHARS} hexadecimal digits and .json"
         raise CalibrationError(str(path), what)
     try:
-        made = kind.model_validate_json(data)
+        artefact = kind.model_validate_json(data)
     except ValidationError as error:
         raise invalid(str(path), error) from None
     if hashlib.sha256(data).hexdigest()[:HASH_CHARS] != path.stem:
         raise CalibrationError(str(path), "was edited: its name is not the hash of its contents")
-    return made
+    return artefact
 
 
 def put_to_use(artefact: Artefact, session: Path, folder: str = FOLDER) -> Path:
@@ -102,26 +102,20 @@ def put_to_use(artefact: Artefact, session: Path, folder: str = FOLDER) -> Path:
     return path
 
 
-def artefacts(session: Path, folder: str = FOLDER) -> list[Path]:
-    """Every artefact in `folder` of a session, oldest first."""
-    paths = (path for path in (session / folder).glob("*.json") if path.is_file())
-    return sorted(paths, key=lambda path: (path.stat().st_mtime_ns, path.name))
-
-
 def current(session: Path, folder: str = FOLDER) -> Path | None:
     """Path of the artefact in use in `folder` of a session; None if it has no artefact.
 
     Raises `CalibrationError` where no pointer says which of the artefacts it is, or names one that is not there.
     """
-    pointer, found = session / folder / POINTER, artefacts(session, folder)
-    if not pointer.exists() and not pointer.is_symlink():
-        if found:
-            raise CalibrationError(str(pointer), f"is missing: {_choose(session, folder)}")
+    pointer = session / folder / POINTER
+    if not pointer.exists():
+        if any(pointer.parent.glob("*.json")):
+            raise CalibrationError(str(pointer), f"is missing: calibrate or fit {session} again")
         return None
     name = pointed(read_bounded(pointer, MAX_POINTER_BYTES), str(pointer))
     path = pointer.with_name(name)
-    if path not in found:
-        raise CalibrationError(str(pointer), f"names {name}, which is not there: {_choose(session, folder)}")
+    if not path.is_file():
+        raise CalibrationError(str(pointer), f"names {name}, which is not there: calibrate or fit {session} again")
     return path
 
 
@@ -131,9 +125,3 @@ def pointed(data: bytes, where: str) -> str:
     if name is None:
         raise CalibrationError(where, f"holds no name of an artefact ({HASH_CHARS} hexadecimal digits and .json)")
     return name[1].decode()
-
-
-def _choose(session: Path, folder: str) -> str:
-    if folder == FOLDER:
-        return f"calibrate again with `brushloop calibrate {session}`"
-    return f"choose with `--fit {session / folder}/<hash>.json`, or fit again"

@@ -32,7 +32,7 @@ from brushloop.calibrate.report import (
     source_point,
     write_page,
 )
-from brushloop.calibrate.session import Calibration, board_of, rig_of
+from brushloop.calibrate.session import Calibration, rig_of
 from brushloop.sessions.disk import file_sha256
 from brushloop.sessions.messages import decode_gray
 from brushloop.sessions.recording import Recording
@@ -86,21 +86,21 @@ def calibrate_session(request: CalibrateRequest, progress: Progress = unseen) ->
     where = str(recording.path)
     if recording.header.source.imported:
         raise CalibrationError(where, "is an import and has its own scale: continue with `validate`")
-    spec, rig = board_of(recording), rig_of(recording)
+    rig = rig_of(recording)
     known = rig.lens if request.lens is None else read_lens(request.lens)
     stills = list(recording.stills_of("board"))
     if not stills:
         raise CalibrationError(where, "holds no view of the board (a `board` step)")
     *earlier, (last_ns, still) = stills
     image = decode_gray(still, where)
-    view, plane = see_board_and_lens(image, spec, known, where, rig.sheet_mm)
+    view, plane = see_board_and_lens(image, rig.board, known, where, rig.sheet_mm)
     calibration = Calibration(
         **plane.model_dump(),
         session_id=recording.header.session_id,
         source=recording.header.source,
         recording_sha256=recording.sha256,
         software=made_by(),
-        board=spec,
+        board=rig.board,
         still_sha256=hashlib.sha256(still).hexdigest(),
     )
     looked_at = counted(earlier, "earlier photographs of the board compared", len(earlier), progress)

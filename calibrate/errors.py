@@ -30,10 +30,5 @@ def invalid(where: str, error: ValidationError) -> CalibrationError:
     return CalibrationError(where, f"{field}: {first['msg']}" if field else first["msg"])
 
 
-def one_line(error: BaseException) -> str:
-    """The message of another package's error in one line, or else the error's name."""
-    return " ".join(str(error).split()) or type(error).__name__
-
-
 class CaptureRefused(CalibrationError):
     """This capture cannot be compared; it is listed by name, never dropped silently."""

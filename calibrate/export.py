@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 
 from brushloop.calibrate.commands import ExportRequest
 from brushloop.calibrate.errors import CaptureRefused
-from brushloop.calibrate.notebook import SAMPLE_COLUMNS, RecordedPress, Session
+from brushloop.calibrate.notebook import RecordedPress, Session
 from brushloop.calibrate.presses import Refused
 from brushloop.calibrate.stats import odd_waits
 from brushloop.calibrate.stroke import PX_PER_MM
@@ -88,9 +88,9 @@ def export(request: ExportRequest, progress: Progress = unseen) -> Exported:
             sampled = {"poses": session.poses}
             if recording.counts.get(Topic.WRENCH, 0):
                 sampled["forces"] = session.forces
-            for name, (columns, when, values) in sampled.items():
-                arrays = (*when.T.tolist(), *values.T.tolist())
-                _write_table(stage / f"{name}.{kind}", dict(zip((*SAMPLE_COLUMNS, *columns), arrays, strict=True)))
+            for name, samples in sampled.items():
+                fields = samples.dtype.names or ()
+                _write_table(stage / f"{name}.{kind}", {field: samples[field].tolist() for field in fields})
             origin = {"file": recording.path.name, "sha256": recording.sha256}
             header = recording.header.model_dump(mode="json") | {"exported_from": origin}
             (stage / "header.json").write_text(json.dumps(header, indent=2, ensure_ascii=False) + "\n", "utf-8")

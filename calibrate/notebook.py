@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
@@ -22,12 +22,11 @@ from brushloop.calibrate.artefact import current, load_artefact
 from brushloop.calibrate.commands import CalibrateRequest, FitRequest, RecoverRequest, ValidateRequest
 from brushloop.calibrate.compare import GRAY_MM, brush_of, simulated
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
-from brushloop.calibrate.presses import Refused, crop, read_presses
+from brushloop.calibrate.presses import Refused, read_presses, rectified
 from brushloop.calibrate.remote import local_path
 from brushloop.calibrate.session import Calibration, OpenSession, open_session
 from brushloop.calibrate.stroke.preprocess import Prepared
 from brushloop.model.ccdbsm import Brush
-from brushloop.model.similarity import csim, ssim
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.events import Begin, StepEvent, StepKind
 from brushloop.sessions.recording import Capture, Recording
@@ -47,41 +46,6 @@ GENERATOR = "ccd-bsmg"
 """The generator that comes with brushloop."""
 SAMPLE_COLUMNS = ("episode_index", "frame_index", "t_ns", "log_ns", "sequence")
 """Numbers of the stroke and of the sample within it; times at the device and the recorder; the sample's own number."""
-
-
-class Samples(NamedTuple):
-    """What was sampled on one topic during the presses of a session, in the order of the recording."""
-
-    columns: tuple[str, ...]
-    when: NDArray[np.int64]
-    """(n, 5) `SAMPLE_COLUMNS`."""
-    values: Floats
-    """(n, len(columns))."""
-
-    def of_press(self, number: int) -> tuple[NDArray[np.int64], Floats]:
-        """Device times (n,) and values (n, len(columns)) of the press of that number."""
-        its_own = self.when[:, SAMPLE_COLUMNS.index("episode_index")] == number
-        return self.when[its_own, SAMPLE_COLUMNS.index("t_ns")], self.values[its_own]
-
-
-class Poses(NamedTuple):
-    """Where the brush tip was during a press, in the base frame of the arm."""
-
-    t_ns: NDArray[np.int64]
-    """(n,) when the host received each sample."""
-    position_mm: Floats
-    """(n, 3)."""
-    quaternion: Floats
-    """(n, 4): x, y, z, w."""
-
-
-class Forces(NamedTuple):
-    """What the force sensor measured during a press, in its own frame; empty if the rig had none."""
-
-    t_ns: NDArray[np.int64]
-    """(n,)."""
-    wrench: Floats
-    """(n, 6): fx, fy, fz in N, mx, my, mz in N m."""
 
 
 class RecordedPress:
@@ -121,8 +85,12 @@ class RecordedPress:
 
     @cached_property
     def crop(self) -> tuple[Gray, NDArray[np.bool_], Prepared]:
-        """`image`, `mask`, and what else was found in them. Raises `CaptureRefused`."""
-        return crop(self.capture, self._session.opened.calibration)
+        """`image`, `mask`, and what else was found in them. Raises `CaptureRefused`.
+
+        The ink of a press is its largest connected ink; that of a stroke that travels is all in its cell.
+        """
+        raster, prepared = rectified(self.capture, self._session.opened.calibration)
+        return raster, prepared.ink if self.capture.stroke.kind == "drag" else prepared.mask, prepared
 
     @property
     def image(self) -> Gray:
@@ -143,15 +111,17 @@ class RecordedPress:
         raise CaptureRefused(*refused[0])
 
     @property
-    def poses(self) -> Poses:
-        """Path of the brush tip; empty for an import."""
-        t_ns, values = self._session.poses.of_press(self._number)
-        return Poses(t_ns, values[:, :3], values[:, 3:])
+    def poses(self) -> NDArray[np.void]:
+        """Path of the brush tip: the rows of `Session.poses` that belong to this press; none for an import."""
+        return self._own(self._session.poses)
 
     @property
-    def forces(self) -> Forces:
-        """Force during the press."""
-        return Forces(*self._session.forces.of_press(self._number))
+    def forces(self) -> NDArray[np.void]:
+        """Force during the press: its rows of `Session.forces`; none if the rig had no sensor."""
+        return self._own(self._session.forces)
+
+    def _own(self, samples: NDArray[np.void]) -> NDArray[np.void]:
+        return samples[samples["episode_index"] == self._number]
 
 
 class Session:
@@ -202,21 +172,23 @@ class Session:
         return (RecordedPress(self, capture, k) for k, capture in enumerate(self.recording.captures()))
 
     @cached_property
-    def poses(self) -> Samples:
-        """Poses of the brush tip during all presses, in the robot's base frame. Raises `SessionDamaged`."""
+    def poses(self) -> NDArray[np.void]:
+        """(n,) poses of the brush tip during all presses, in the robot's base frame: mm and a unit quaternion.
+
+        The fields are `SAMPLE_COLUMNS` and those of the value. Raises `SessionDamaged`.
+        """
         return self._sampled(Topic.TCP, ("x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw"), _pose)
 
     @cached_property
-    def forces(self) -> Samples:
-        """Forces during all presses, in the sensor's own frame. Raises `SessionDamaged`."""
+    def forces(self) -> NDArray[np.void]:
+        """(n,) forces during all presses, in the sensor's own frame: N and N m, with fields as `poses` has them."""
         return self._sampled(Topic.WRENCH, tuple(Wrench.model_fields), _wrench)
 
     def _sampled(
         self, topic: Topic, columns: tuple[str, ...], values_of: Callable[[bytes], tuple[float, ...]]
-    ) -> Samples:
+    ) -> NDArray[np.void]:
         numbers = {stroke.stroke_id: number for number, stroke in enumerate(self.recording.stroke_records())}
-        when: list[tuple[int, ...]] = []
-        values: list[tuple[float, ...]] = []
+        rows: list[tuple[float, ...]] = []
         current, frame, on = -1, 0, topic
         try:
             for _schema, channel, message in self.recording.messages(Topic.STEP, topic):
@@ -226,13 +198,13 @@ class Session:
                     pressed = step.press if isinstance(step, Begin) and step.kind != StepKind.CAPTURE else None
                     current, frame = -1 if pressed is None else numbers.get(pressed.stroke_id, -1), 0
                 elif current >= 0:
-                    when.append((current, frame, message.publish_time, message.log_time, message.sequence))
-                    values.append(values_of(message.data))
+                    times = message.publish_time, message.log_time, message.sequence
+                    rows.append((current, frame, *times, *values_of(message.data)))
                     frame += 1
         except (ValidationError, DecodeError):
             raise SessionDamaged(self.recording.path, f"a message on {on} does not fit its schema") from None
-        shape = -1, len(columns)
-        return Samples(columns, np.array(when, np.int64).reshape(-1, 5), np.array(values, np.float64).reshape(shape))
+        fields = [(name, np.int64) for name in SAMPLE_COLUMNS] + [(name, np.float64) for name in columns]
+        return np.array(rows, np.dtype(fields))
 
 
 def _pose(data: bytes) -> tuple[float, ...]:
@@ -292,18 +264,6 @@ def _model(brush: Brush | BrushFit, name: str) -> StrokeModel:
     from brushloop.model.strokes import stroke_model
 
     return stroke_model(name, brush)
-
-
-class Similarity(NamedTuple):
-    """How alike two images are, from 0 to 1."""
-
-    csim: float
-    ssim: float
-
-
-def compare(one: NDArray[Any], other: NDArray[Any]) -> Similarity:
-    """Compare two images of one shape with ink as 1 and paper as 0. Raises ValueError for a blank image."""
-    return Similarity(csim(one, other), ssim(one, other))
 
 
 Place = Session | str | os.PathLike[str]

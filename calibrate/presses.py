@@ -1,7 +1,7 @@
-"""The presses of a session, each found in its photograph once and laid on the millimetre field; and crops of strokes.
+"""The presses of a session, each found in its photograph once and laid on the millimetre field.
 
 Fit, validation, inversion, loop and twin read presses from the session's store of finished work; what is not there yet
-is prepared side by side and kept. A crop is the raster itself, too large to be kept.
+is prepared side by side and kept.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from brushloop.calibrate.compare import ANCHOR_MM, FIELD_MM, KEYS, Image, Pixels
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.report import source_label
 from brushloop.calibrate.session import Calibration, OpenSession
-from brushloop.calibrate.stroke import PX_PER_MM, Gray, Mask, Params
+from brushloop.calibrate.stroke import PX_PER_MM, Gray, Params
 from brushloop.calibrate.stroke.preprocess import Measured, Prepared, measure, prepare
 from brushloop.calibrate.stroke.rectify import cut_out, on_raster, on_window, rectify_by, rescale
 from brushloop.calibrate.work import Arrays, Scheduler, key_of, threads
@@ -94,25 +94,17 @@ def read_presses(
     store, bad = session.store, bad_stills(session.recording.path.parent)
     wanted = [k for k, stroke in enumerate(session.strokes) if chosen is None or stroke.stroke_id in chosen]
     keys = {k: key_of("press", session.sha256, session.calibration_digest, k) for k in wanted}
-
-    def prepare(numbers: Collection[int]) -> None:
-        jobs = (
-            (keys[k], PrepareJob(capture, session.calibration))
-            for k, capture in enumerate(session.recording.captures() if numbers else ())
-            if k in numbers
-        )
+    kept = {key: store.get(key) for key in keys.values()}
+    missing = {k for k, key in keys.items() if kept[key] is None}
+    if missing:
+        captures = enumerate(session.recording.captures())
+        jobs = ((keys[k], (capture, session.calibration)) for k, capture in captures if k in missing)
         with nullcontext(scheduler) if scheduler else threads() as used:
             finished = used.finished(prepare_job, jobs, store)
-            for _ in counted(finished, f"{session.header.session_id}: found", len(numbers), progress):
-                pass
-
-    prepare({k for k in wanted if keys[k] not in store})
+            kept.update(counted(finished, f"{session.header.session_id}: found", len(missing), progress))
     for k in wanted:
-        stroke, arrays = session.strokes[k], store.get(keys[k])
-        if arrays is None:  # damaged
-            prepare({k})
-            arrays = store.get(keys[k])
-            assert arrays is not None, "it was prepared"
+        stroke, arrays = session.strokes[k], kept[keys[k]]
+        assert arrays is not None, "it was prepared"
         press = None if "refused" in arrays else press_of(session.header, stroke, arrays)
         reasons = (why(press) for why in unless) if press is not None else (str(arrays["refused"]),)
         if reason := next(filter(None, (bad.get(stroke.still, ""), *reasons)), ""):
@@ -121,18 +113,13 @@ def read_presses(
             yield press
 
 
-@dataclass(frozen=True, slots=True)
-class PrepareJob:
-    """Find the stroke in its photograph and resample it to the images that are compared."""
+def prepare_job(job: tuple[Capture, Calibration | None]) -> Arrays:
+    """The entry of a press in the store, its stroke resampled to the images that are compared.
 
-    capture: Capture
-    calibration: Calibration | None
-
-
-def prepare_job(job: PrepareJob) -> Arrays:
-    """The entry of a press in the store; `refused` alone says why there is none."""
+    `refused` alone says why there is none.
+    """
     try:
-        prepared = prepare_press(job.capture, job.calibration)
+        prepared = prepare_press(*job)
     except (CaptureRefused, SessionDamaged) as error:
         return {"refused": np.array(error.what)}
     assert prepared.anchor_px is not None, "`prepare_press` refuses a stroke without one"
@@ -162,15 +149,6 @@ def press_of(header: Header, stroke: Stroke, arrays: Arrays) -> Press:
     )
 
 
-def crop(capture: Capture, calibration: Calibration | None) -> tuple[Gray, Mask, Prepared]:
-    """What surrounds a stroke at 20 px/mm, (h, w) gray, its ink, and what was found. Raises as `rectified` does.
-
-    The ink of a press is its largest connected ink, as everywhere; that of a stroke that travels is all in its cell.
-    """
-    raster, prepared = rectified(capture, calibration)
-    return raster, prepared.ink if capture.stroke.kind == "drag" else prepared.mask, prepared
-
-
 def rectified(capture: Capture, calibration: Calibration | None) -> tuple[Gray, Prepared]:
     """The surroundings of a stroke at 20 px/mm, (h, w) gray, and what was found in them.
 
@@ -179,7 +157,7 @@ def rectified(capture: Capture, calibration: Calibration | None) -> tuple[Gray, 
     travels, the photograph is rescaled whole. Raises `CaptureRefused` for a capture that cannot be used,
     `SessionDamaged` for a picture that cannot be read.
     """
-    stroke, image, params = capture.stroke, capture.image(), Params() if calibration is None else calibration.params
+    stroke, image, params = capture.stroke, capture.image(), Params()
     if calibration is not None and stroke.anchor_mm is not None:
         window, (left_mm, top_mm) = field_around(stroke.anchor_mm), ANCHOR_MM
         if stroke.kind == "drag" and stroke.cell_mm is not None:
@@ -243,5 +221,4 @@ def prepare_cell(capture: Capture, calibration: Calibration) -> Prepared:
     if cell_mm is None:
         raise CaptureRefused(capture.stroke.stroke_id, "has no paper cell")
     raster = rectify_by(capture.image(), calibration, cell_mm, capture.where)
-    whole = {"join_mm": math.hypot(*cell_mm[2:]), "speck_share": SPECK_SHARE}
-    return prepare(raster, None, capture.where, replace(calibration.params, **whole))
+    return prepare(raster, None, capture.where, Params(join_mm=math.hypot(*cell_mm[2:]), speck_share=SPECK_SHARE))

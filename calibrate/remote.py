@@ -9,10 +9,11 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from brushloop.calibrate.artefact import FOLDER, POINTER, pointed
-from brushloop.calibrate.errors import CalibrationError, one_line
+from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import replacing
 from brushloop.calibrate.fit.fit import FOLDER as FITS
 from brushloop.sessions.disk import file_sha256
+from brushloop.sessions.errors import in_one_line
 
 URL = re.compile(r"^[a-z][a-z0-9+.-]+://", re.IGNORECASE)
 SCHEMES = ("file", "memory", "http", "https", "s3", "gs")
@@ -37,9 +38,9 @@ def local_path(place: str) -> Path:
         raise
     except ImportError as error:
         extra = "remote" if scheme.startswith("http") else scheme
-        raise CalibrationError(address, f"{one_line(error)}: pip install 'brushloop[{extra}]'") from None
+        raise CalibrationError(address, f"{in_one_line(error)}: pip install 'brushloop[{extra}]'") from None
     except Exception as error:  # every backend of fsspec has errors of its own, most without a common base class
-        raise CalibrationError(address, f"cannot be read: {one_line(error)}") from None
+        raise CalibrationError(address, f"cannot be read: {in_one_line(error)}") from None
 
 
 def _fetched(address: str, scheme: str, fragment: str, folder: Path) -> Path:

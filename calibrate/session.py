@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -72,8 +71,8 @@ class OpenSession:
 def open_session(path: Path, kind: Kind | None = None) -> OpenSession:
     """Open a session by its folder or MCAP file, with the calibration in use.
 
-    Raises `InputError`, and `CalibrationError` for a session without strokes or with some of another kind, and as
-    `calibration_of` does.
+    Raises `InputError`, and `CalibrationError` for a session without strokes, with some of another kind, without a
+    calibration, or with that of another recording.
     """
     recording = Recording(path)
     sha256, strokes = recording.sha256, tuple(recording.stroke_records())
@@ -81,27 +80,16 @@ def open_session(path: Path, kind: Kind | None = None) -> OpenSession:
         raise CalibrationError(str(recording.path), "holds no strokes")
     if kind is not None and any(stroke.kind != kind for stroke in strokes):
         raise CalibrationError(str(recording.path), OTHER_KIND[kind])
-    used = calibration_of(recording, strokes[0])
-    return OpenSession(recording, sha256, strokes, used, Store(recording.path.parent / FINISHED))
-
-
-def calibration_of(recording: Recording, first: Stroke) -> Calibration | None:
-    """The calibration that a session uses; None for an import, which brings its own scale.
-
-    Raises `CalibrationError` where there is none, or it belongs to another recording.
-    """
-    if first.px_per_mm is not None:
-        return None
-    path = current(recording.path.parent)
-    if path is None:
-        raise CalibrationError(
-            str(recording.path), f"is not calibrated: run `brushloop calibrate {recording.path.parent}`"
-        )
-    calibration = load_artefact(path, Calibration)
-    if calibration.recording_sha256 != recording.sha256:
-        problem = f"belongs to another recording ({calibration.session_id}): `brushloop calibrate` makes its own"
-        raise CalibrationError(str(path), problem)
-    return calibration
+    folder, calibration = recording.path.parent, None
+    if strokes[0].px_per_mm is None:
+        used = current(folder)
+        if used is None:
+            raise CalibrationError(str(recording.path), f"is not calibrated: run `brushloop calibrate {folder}`")
+        calibration = load_artefact(used, Calibration)
+        if calibration.recording_sha256 != sha256:
+            problem = f"belongs to another recording ({calibration.session_id}): `brushloop calibrate` makes its own"
+            raise CalibrationError(str(used), problem)
+    return OpenSession(recording, sha256, strokes, calibration, Store(folder / FINISHED))
 
 
 def lens_in_use(folder: Path) -> Lens | None:
@@ -115,13 +103,13 @@ def lens_in_use(folder: Path) -> Lens | None:
 
 
 class RigView(BaseModel):
-    """What a session recorded of the rig; None if nothing."""
+    """What a session recorded of the rig."""
 
-    board: BoardSpec | None = None
+    board: BoardSpec
     sheet_mm: tuple[float, float] | None = Field(default=None, validation_alias=AliasPath("paper", "size_mm"))
-    """Width and height of the sheet that lies on the board."""
+    """Width and height of the sheet that lies on the board; None if not recorded."""
     lens: Lens | None = Field(default=None, validation_alias=AliasPath("camera", "optics"))
-    """The lens that the session was collected with."""
+    """The lens that the session was collected with, if any."""
 
 
 def rig_of(session: Recording | Path) -> RigView:
@@ -130,17 +118,6 @@ def rig_of(session: Recording | Path) -> RigView:
     where = f"{session.path} {EFFECTIVE}" if inside else str(session / EFFECTIVE)
     data = session.attachment(EFFECTIVE) if inside else read_bounded(session / EFFECTIVE)
     try:
-        return RigView.model_validate(json.loads(data))
+        return RigView.model_validate_json(data)
     except ValidationError as error:
         raise invalid(where, error) from None
-    except (ValueError, RecursionError):
-        raise CalibrationError(where, "holds no board") from None
-
-
-def board_of(session: Recording | Path) -> BoardSpec:
-    """The board of a session's rig. Raises `CalibrationError` where the session names none."""
-    board = rig_of(session).board
-    if board is None:
-        where = session.path if isinstance(session, Recording) else session
-        raise CalibrationError(f"{where} {EFFECTIVE}", "holds no board")
-    return board

@@ -28,8 +28,9 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.errors import CalibrationError, one_line
+from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import replacing
+from brushloop.sessions.errors import in_one_line
 
 J = TypeVar("J")
 VERSION = "8"
@@ -71,9 +72,6 @@ class Store:
             total += stat.st_size
             if total > MAX_BYTES:
                 path.unlink(missing_ok=True)
-
-    def __contains__(self, key: str) -> bool:
-        return key in self._unwritten or self._path(key).is_file()
 
     def get(self, key: str) -> Arrays | None:
         """The arrays of an entry; None where there is none, or it is damaged: it is then put again."""
@@ -179,7 +177,7 @@ def cluster(address: str) -> Generator[Scheduler]:
     try:
         client: Any = untyped(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TypeError, ImportError) as error:
-        raise CalibrationError(where, f"no Dask scheduler there ({one_line(error)})") from None
+        raise CalibrationError(where, f"no Dask scheduler there ({in_one_line(error)})") from None
     try:
         threads_of: dict[str, int] = client.nthreads()
         if not threads_of:
@@ -187,8 +185,8 @@ def cluster(address: str) -> Generator[Scheduler]:
         answers: dict[str, Any] = client.run(software, on_error="return")
         for worker, answer in answers.items():
             if answer != software():
-                words = one_line(answer) if isinstance(answer, BaseException) else f"has {answer}"
-                raise CalibrationError(where, f"worker {worker} {words}; {software()} is needed there")
+                says = " ".join(str(answer).split())
+                raise CalibrationError(where, f"worker {worker} says {says!r}; {software()} is needed there")
         yield Scheduler(client.get_executor(pure=False), sum(threads_of.values()))
     finally:
         client.close()

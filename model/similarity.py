@@ -5,7 +5,7 @@ Ink is 1 and paper 0: with paper as 1, a blank page would score .94.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -88,3 +88,15 @@ def inked_window(image: Image, others: Image, margin: int) -> tuple[slice, slice
 def _check(a: Image, b: Image) -> None:
     if a.shape != b.shape or a.ndim != 2:
         raise ValueError(f"images must be (h, w) and of one shape, got {a.shape} and {b.shape}")
+
+
+class Similarity(NamedTuple):
+    """How alike two images are, from 0 to 1."""
+
+    csim: float
+    ssim: float
+
+
+def compare(image: Image, other: Image) -> Similarity:
+    """Compare two images of one shape with ink as 1 and paper as 0. Raises ValueError for a blank image."""
+    return Similarity(csim(image, other), ssim(image, other))

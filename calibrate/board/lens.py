@@ -12,11 +12,11 @@ from typing import Literal, cast
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from brushloop.calibrate.artefact import Artefact, Frozen, load_artefact, made_by
 from brushloop.calibrate.board.spec import BoardView
-from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.stats import student_95
 
 Gray = NDArray[np.uint8]
@@ -61,14 +61,6 @@ class Lens(Frozen):
     distortion: tuple[float, float, float, float, float]
     """k1, k2, p1, p2, k3 of OpenCV's model."""
 
-    @classmethod
-    def of_opencv(cls, camera: ArrayLike, distortion: ArrayLike, size_px: tuple[int, int]) -> Lens:
-        """A lens from OpenCV's (3, 3) camera matrix and its coefficients, of which the first five count."""
-        m = np.asarray(camera, np.float64)
-        k1, k2, p1, p2, k3 = np.asarray(distortion, np.float64).ravel()[:5].tolist()
-        matrix = (float(m[0, 0]), float(m[1, 1]), float(m[0, 2]), float(m[1, 2]))
-        return cls(size_px=size_px, matrix=matrix, distortion=(k1, k2, p1, p2, k3))
-
     @property
     def camera(self) -> Floats:
         """OpenCV's camera matrix, (3, 3)."""
@@ -81,11 +73,10 @@ class Lens(Frozen):
         return np.array(self.distortion)
 
     def check_size(self, image: Gray, where: str) -> None:
-        """Raise `CalibrationError` for an (h, w) photograph of another size: the lens does not apply to it."""
-        size_px = (image.shape[1], image.shape[0])
-        if size_px != self.size_px:
-            is_px, was_px = (f"{width} x {height} px" for width, height in (size_px, self.size_px))
-            raise CalibrationError(where, f"is {is_px}, the lens was calibrated at {was_px}")
+        """Raise `CaptureRefused` for an (h, w) photograph of another size: the lens does not apply to it."""
+        if image.shape[::-1] != self.size_px:
+            is_px, was_px = ("{} x {} px".format(*size) for size in (image.shape[::-1], self.size_px))
+            raise CaptureRefused(where, f"is {is_px}, the lens was calibrated at {was_px}")
 
     def undistorted(self, pixels: Floats) -> Floats:
         """(n, 2) pixels of a photograph -> where they lie in the undistorted one."""
@@ -157,7 +148,10 @@ def solve(views: Sequence[BoardView], where: str) -> Solved:
         raise CalibrationError(where, f"no lens explains these views: {error.err}") from None
     normals = np.stack([np.asarray(cv2.Rodrigues(turn)[0], np.float64)[:, 2] for turn in turns])
     normals = np.asarray(np.where(normals[:, 2:] < 0.0, -normals, normals), np.float64)
-    return Solved(Lens.of_opencv(matrix, distortion, size), float(rms), np.ravel(per_view).astype(np.float64), normals)
+    fx, fy, cx, cy = matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    k1, k2, p1, p2, k3 = np.ravel(distortion)[:5].tolist()
+    lens = Lens(size_px=size, matrix=(fx, fy, cx, cy), distortion=(k1, k2, p1, p2, k3))
+    return Solved(lens, float(rms), np.ravel(per_view).astype(np.float64), normals)
 
 
 class LensFile(Artefact):

@@ -33,8 +33,6 @@ VISIBLE_PX = 0.5
 """A lens that distorts the board by more (root mean square) needs a lens file: one flat view cannot calibrate it."""
 REMAINING_PX = 1.5
 """Distortion left by the lens file: more means another camera; less is a small change of focus, which k1 describes."""
-DISTORTED_SHARE = 0.85
-"""Share of squared residuals that one radial term explains: 0.7 for a board curled lengthwise, more for a lens."""
 NO_LENS_FILE = (
     "the lens bends straight lines: calibrate it with `brushloop camera intrinsics`, then name the lens file as "
     "camera.lens_file in rig.toml, or with --lens"
@@ -99,9 +97,8 @@ def see_board(image: Gray, spec: BoardSpec, where: str = "camera", lens: Lens | 
     corners_mm = paper_mm(view, spec)
     try:
         plane = fit_plane(view.pixels, corners_mm, through, where, radial_terms=0)
-    except CalibrationError as error:
-        if distorted_share(view.pixels, corners_mm, through, where) > DISTORTED_SHARE:
-            raise CalibrationError(where, f"{error.what}; {NO_LENS_FILE if lens is None else OTHER_LENS}") from None
+    except CalibrationError:
+        _check_distortion(fit_plane(view.pixels, corners_mm, through, where), lens, where)
         raise
     return plane.model_copy(update={"flags": view.flags})
 
@@ -116,10 +113,15 @@ def see_board_and_lens(
     """
     view, through = _find(image, spec, where, lens, sheet_mm)
     plane = fit_plane(view.pixels, paper_mm(view, spec), through, where)
+    _check_distortion(plane, lens, where)
+    return view, plane.model_copy(update={"flags": view.flags})
+
+
+def _check_distortion(plane: Plane, lens: Lens | None, where: str) -> None:
+    """Raise `CalibrationError` for a plane that was fitted with k1, if the known lens distorts more than allowed."""
     if plane.distortion_px > (VISIBLE_PX if lens is None else REMAINING_PX):
         advice = NO_LENS_FILE if lens is None else OTHER_LENS
         raise CalibrationError(where, f"the board is bent by {plane.distortion_px:.1f} px: if it lies flat, {advice}")
-    return view, plane.model_copy(update={"flags": view.flags})
 
 
 def paper_mm(view: BoardView, spec: BoardSpec) -> Floats:
@@ -198,19 +200,6 @@ def fit_plane(pixels: Floats, paper_mm: Floats, lens: Lens, where: str, radial_t
         middle_px=(float(middle[0]), float(middle[1])),
         distortion_px=float(np.sqrt(max(flat_rms_px**2 - rms_px**2, 0.0))),
     )
-
-
-def distorted_share(pixels: Floats, paper_mm: Floats, lens: Lens, where: str) -> float:
-    """Share of a flat board's squared residuals with this lens that refitting k1 would explain; outliers included."""
-    from scipy.optimize import least_squares
-
-    def cost(radial_terms: int) -> float:
-        model = _Model.of(lens, paper_mm, radial_terms)
-        start = model.start(pixels, paper_mm, where)
-        return float(least_squares(model.residuals, start, args=(pixels, paper_mm), x_scale="jac").cost)
-
-    flat = cost(0)
-    return 1.0 - cost(1) / flat if flat > 0.0 else 0.0
 
 
 def _spread(pull: Floats, left: Floats, paper_mm: Floats, variance: float) -> float:

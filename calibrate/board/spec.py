@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any
 
 import cv2
@@ -121,24 +120,18 @@ def named_board(options: BoardOptions) -> Board:
 
 
 def print_board(request: PrintRequest, _progress: Progress = unseen) -> Written:
-    """Write a board as a PDF. Raises as `write_pdf` does."""
-    board = named_board(request)
-    path = write_pdf(board, request.out, request.page)
-    return Written(path, (f"{path}: {describe(board)}",))
+    """Write a board as a PDF of one page, turned if it only fits that way.
 
-
-def write_pdf(board: Board, path: Path, page: str = "a4") -> Path:
-    """Write the board on one page, turned if it only fits that way.
-
-    Raises `CalibrationError` if it does not fit, or if `path` is not that of a PDF: no other file is overwritten.
+    Raises `CalibrationError` if it does not fit, or if `out` is not that of a PDF: no other file is overwritten.
     """
+    board, path = named_board(request), request.out
     check_target(path, ".pdf")
     if not path.parent.is_dir():
         raise CalibrationError(str(path), f"there is no folder {path.parent}")
     if path.exists() and not (path.is_file() and path.read_bytes().startswith(b"%PDF")):
         raise CalibrationError(str(path), "exists and is not a PDF; it is not overwritten")
-    drawn(board, page).savefig(path, format="pdf", metadata={"CreationDate": None})
-    return path
+    drawn(board, request.page).savefig(path, format="pdf", metadata={"CreationDate": None})
+    return Written(path, (f"{path}: {describe(board)}",))
 
 
 def rectangles(board: Board) -> list[Rectangle]:

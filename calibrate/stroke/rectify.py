@@ -75,9 +75,7 @@ def rectify_by(image: Gray, plane: Plane, window_mm: tuple[float, float, float, 
     The photograph is as it was taken; the lens distortion is removed here. Raises `CaptureRefused` if its size is not
     that of the photograph that the plane was seen in.
     """
-    if image.shape[::-1] != plane.lens.size_px:
-        is_px, seen_px = ("{} x {} px".format(*size) for size in (image.shape[::-1], plane.lens.size_px))
-        raise CaptureRefused(where, f"is {is_px}, the calibration is for {seen_px}")
+    plane.lens.check_size(image, where)
     x, y, width, height = window_mm
     columns, rows = round(width * PX_PER_MM), round(height * PX_PER_MM)
     across, along = np.arange(0, columns + KNOTS, KNOTS), np.arange(0, rows + KNOTS, KNOTS)

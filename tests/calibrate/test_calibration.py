@@ -18,12 +18,11 @@ from brushloop.calibrate.board.lens import FITTED
 from brushloop.calibrate.calibrated import calibrate_session
 from brushloop.calibrate.commands import CalibrateRequest
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.session import Calibration, calibration_of
+from brushloop.calibrate.session import Calibration, open_session
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.config import SimConfig, Table, View
 from brushloop.drivers.sim.scene import Scene
 from brushloop.drivers.sim.world import World
-from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Stroke
 from tests.calibrate.given import CALIBRATION
 from tests.calibrate.simulated_rigs import board_of
@@ -93,9 +92,8 @@ def test_the_calibration_of_another_session_is_refused(
     one, other = (photographed(tmp_path / name, SPEC, [board], [(stroke, board)]) for name in ("one", "other"))
     made = calibrate_session(CalibrateRequest(one))
     shutil.copytree(made.path.parent, other / "calibration")
-    recording = Recording(other)
     with pytest.raises(CalibrationError, match=r"belongs to another recording \(one\)"):
-        calibration_of(recording, stroke)
+        open_session(other)
 
 
 def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
@@ -165,12 +163,12 @@ def test_what_was_put_to_use_last_is_in_use_and_no_artefact_changes(tmp_path: Pa
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (None, "is missing: calibrate again"),
+        (None, "is missing: calibrate or fit"),
         ("", "holds no name of an artefact"),
         ("../../secret.json", "holds no name of an artefact"),
         ("0123456789abcdef.json\n0123456789abcdef.json", "holds no name of an artefact"),
         ("x" * 1000, "is larger than 256 bytes"),
-        ("0123456789abcdef.json", "names 0123456789abcdef.json, which is not there: calibrate again"),
+        ("0123456789abcdef.json", "names 0123456789abcdef.json, which is not there: calibrate"),
     ],
     ids=["none", "empty", "elsewhere", "two", "long", "missing"],
 )

@@ -18,7 +18,7 @@ from brushloop.calibrate.loop import (
     score_pairs,
     verdicts,
 )
-from brushloop.calibrate.presses import PrepareJob, Press, prepare_job, press_of
+from brushloop.calibrate.presses import Press, prepare_job, press_of
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.raster import coverage
 from brushloop.model.strokes import stroke_model
@@ -52,7 +52,7 @@ def press(name: str, shown: tuple[float, float], asked: tuple[float, float], of:
         again_of=of,
     )
     capture = Capture(stroke, encode_png(photograph(*shown)), f"test {name}")
-    return press_of(HEADER, stroke, prepare_job(PrepareJob(capture, CALIBRATION)))
+    return press_of(HEADER, stroke, prepare_job((capture, CALIBRATION)))
 
 
 def paired(originals: Iterable[Press], again: Iterable[Press]) -> tuple[list[Pair], dict[str, str]]:

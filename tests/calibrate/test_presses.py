@@ -175,7 +175,7 @@ def test_a_press_is_cut_out_of_its_page_before_the_page_is_resampled(session: Pa
     assert whole.measured.area_mm2 == pytest.approx(near.measured.area_mm2, rel=0.01)
     assert np.abs(whole.coverage - near.coverage).mean() < 0.001
     [capture] = Recording(page).captures()
-    raster, _, prepared = presses.crop(capture, None)
+    raster, prepared = presses.rectified(capture, None)
     side = round(20.0 * (FIELD_MM + 32.0))
     assert raster.shape == pytest.approx((side, side), abs=40), "its field, and what its light is estimated from"
     assert prepared.anchor_px == pytest.approx([20.0 * (at + 16.0) for at in ANCHOR_MM], abs=20.0)
@@ -183,8 +183,8 @@ def test_a_press_is_cut_out_of_its_page_before_the_page_is_resampled(session: Pa
 
 def test_a_start_outside_its_page_is_refused_and_a_photograph_that_cannot_be_read(session: Path) -> None:
     capture = next(Recording(session).captures())
-    torn = presses.PrepareJob(replace(capture, still_png=capture.still_png[:100]), None)
+    torn = replace(capture, still_png=capture.still_png[:100]), None
     assert list(presses.prepare_job(torn)) == ["refused"]
     stroke = capture.stroke.model_copy(update={"anchor_px": (9000.0, 150.0)})
     with pytest.raises(CaptureRefused, match="none of it is in the field"):
-        presses.crop(replace(capture, stroke=stroke), None)
+        presses.rectified(replace(capture, stroke=stroke), None)

@@ -14,7 +14,7 @@ import pytest
 
 from brushloop.calibrate.commands import RecoverRequest
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.presses import PrepareJob, prepare_job
+from brushloop.calibrate.presses import prepare_job
 from brushloop.calibrate.recover import (
     NO_MODEL_ERROR,
     NOT_INFORMATIVE,
@@ -103,7 +103,7 @@ def test_what_cannot_be_inverted_is_refused_and_writes_nothing(tmp_path: Path) -
 def test_a_capture_without_any_scale_is_refused() -> None:
     stroke = Stroke(stroke_id="s", kind="press", still=0, anchor_mm=(3.0, 4.0))
     capture = Capture(stroke, encode_png(photograph(12.0, 3.0)), "s")
-    [(name, why)] = prepare_job(PrepareJob(capture, None)).items()
+    [(name, why)] = prepare_job((capture, None)).items()
     assert (name, str(why)) == ("refused", "has neither a calibration nor a scale of its own")
 
 

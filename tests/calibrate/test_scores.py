@@ -18,7 +18,7 @@ from brushloop.calibrate.compare import (
     similarity,
     simulated,
 )
-from brushloop.calibrate.presses import PrepareJob, Press, prepare_job
+from brushloop.calibrate.presses import Press, prepare_job
 from brushloop.calibrate.scores import Scores, similarities
 from brushloop.calibrate.stroke.preprocess import Measured
 from brushloop.calibrate.validate.run import score_job
@@ -143,7 +143,7 @@ def page_of(depth_mm: float, tilt_deg: float, model: str = "ccd-bsm") -> np.ndar
 def images_of(page: np.ndarray) -> np.ndarray:
     """(KEYS, 128, 128): the press of a page, as it is compared."""
     stroke = Stroke(stroke_id="a", kind="press", still=0, cell_mm=CELL, anchor_mm=ANCHOR)
-    return prepare_job(PrepareJob(Capture(stroke, encode_png(page), "test"), CALIBRATION))["images"]
+    return prepare_job((Capture(stroke, encode_png(page), "test"), CALIBRATION))["images"]
 
 
 def scores_of(page: np.ndarray, depth_mm: float, tilt_deg: float) -> dict[str, np.ndarray]:

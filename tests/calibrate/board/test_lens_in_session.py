@@ -119,7 +119,7 @@ def test_a_lens_file_makes_scale_anchors_and_masks_right(
         # The cell of the model's field may end in the middle of the stroke's neighbour; here there is none.
         assert (mask & truth).sum() / (mask | truth).sum() >= 0.95
     small = made.model_copy(update={"lens": made.lens.model_copy(update={"size_px": (1024, 768)})})
-    with pytest.raises(CaptureRefused, match="is 2048 x 1536 px, the calibration is for 1024 x 768 px"):
+    with pytest.raises(CaptureRefused, match="is 2048 x 1536 px, the lens was calibrated at 1024 x 768 px"):
         prepare_press(capture, small)
 
 

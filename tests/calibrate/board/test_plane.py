@@ -13,8 +13,17 @@ from pydantic import ValidationError
 
 from brushloop.calibrate.board.detect import find_board
 from brushloop.calibrate.board.lens import apply, unknown_lens
-from brushloop.calibrate.board.pix2len import DISTORTED_SHARE, Plane, distorted_share, fit_plane, local_scale, paper_mm
-from brushloop.calibrate.board.spec import MM_PER_INCH, Board, BoardSpec, Checkerboard, charuco_board, drawn, write_pdf
+from brushloop.calibrate.board.pix2len import Plane, fit_plane, local_scale, paper_mm
+from brushloop.calibrate.board.spec import (
+    MM_PER_INCH,
+    Board,
+    BoardSpec,
+    Checkerboard,
+    charuco_board,
+    drawn,
+    print_board,
+)
+from brushloop.calibrate.commands import PrintRequest
 from brushloop.calibrate.errors import CalibrationError
 
 SPEC = BoardSpec(squares=(7, 5), square_mm=20.0, marker_mm=15.0, dictionary="DICT_5X5_50", origin_mm=(-10.0, 5.0))
@@ -61,22 +70,6 @@ def test_a_misnamed_corner_is_dropped_and_corners_on_no_plane_are_refused(seen) 
         flat(pixels + np.random.default_rng(1).normal(0, 4, pixels.shape), paper)
 
 
-def test_a_lens_is_distinguished_from_a_board_that_is_curled_misread_or_noisy() -> None:
-    grid = np.array([(x, y) for x in range(0, 281, 20) for y in range(0, 201, 20)], np.float64)
-    ring = (grid[:, 0] < 40) | (grid[:, 0] > 240) | (grid[:, 1] < 40) | (grid[:, 1] > 160)
-    paper, middle = grid[ring], np.array([640.0, 480.0])
-    pixels = middle + 4.0 * (paper - np.array([140.0, 100.0])) * np.array([1.0, -1.0])
-    away = (pixels - middle) / 1280.0
-    r2 = (away**2).sum(axis=1, keepdims=True)
-    bent = middle + 1280.0 * away * (1.0 - 0.1 * r2)
-    curled = middle + 1280.0 * away * (1.0 + 0.1 * away[:, :1] ** 2)
-    noisy = pixels + np.random.default_rng(3).normal(0.0, 3.0, pixels.shape)
-    lens = unknown_lens((1281, 961))
-    assert distorted_share(bent, paper, lens, "lens") > 0.99 > DISTORTED_SHARE
-    assert distorted_share(curled, paper, lens, "board") < DISTORTED_SHARE
-    assert distorted_share(noisy, paper, lens, "noise") < 0.1
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [({"dictionary": "DICT_NONE"}, "not one of OpenCV's"), ({"marker_mm": 20.0}, "must be less than")],
@@ -105,20 +98,23 @@ def test_a_printed_board_is_seen_whole_and_at_true_scale(board: Board) -> None:
 
 
 def test_a_page_is_a4_holds_its_board_and_overwrites_nothing_but_a_pdf(tmp_path: Path) -> None:
-    data = write_pdf(SPEC, tmp_path / "board.pdf").read_bytes()
+    def written(name: str, charuco: str = "7x5") -> bytes:
+        request = PrintRequest(charuco=charuco, square_mm=12.0, out=tmp_path / name)
+        return print_board(request).path.read_bytes()
+
+    data = written("board.pdf")
     points = [float(v) for v in re.search(rb"MediaBox \[ *0 0 ([\d.]+) ([\d.]+) *\]", data).groups()]
     assert np.array(points) / 72.0 * MM_PER_INCH == pytest.approx([210.0, 297.0])
-    assert write_pdf(SPEC, tmp_path / "board.pdf").read_bytes() == data
+    assert written("board.pdf") == data
     recording = tmp_path / "s.pdf"
     recording.write_bytes(b"\x89MCAP0\r\n")
-    large = BoardSpec(squares=(26, 20), square_mm=12, marker_mm=9, origin_mm=(0, 0))
-    for board, path, why in (
-        (large, tmp_path / "x.pdf", "has no room for a board of 312 x 240 mm"),
-        (SPEC, tmp_path / "s.mcap", "must end in .pdf"),
-        (SPEC, tmp_path / "no" / "board.pdf", "there is no folder"),
-        (SPEC, recording, "is not a PDF; it is not overwritten"),
+    for name, charuco, why in (
+        ("x.pdf", "26x20", "has no room for a board of 312 x 240 mm"),
+        ("s.mcap", "7x5", "must end in .pdf"),
+        ("no/board.pdf", "7x5", "there is no folder"),
+        ("s.pdf", "7x5", "is not a PDF; it is not overwritten"),
     ):
         with pytest.raises(CalibrationError, match=why):
-            write_pdf(board, path)
+            written(name, charuco)
     assert recording.read_bytes() == b"\x89MCAP0\r\n"
     assert not (tmp_path / "x.pdf").exists()

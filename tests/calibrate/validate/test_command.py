@@ -187,11 +187,11 @@ def test_jobs_come_back_whole_and_alike_though_a_worker_dies(cluster: Cluster, s
     program = f"""
 import os, signal
 from pathlib import Path
-from brushloop.calibrate.presses import PrepareJob, prepare_job
+from brushloop.calibrate.presses import prepare_job
 from brushloop.calibrate.work import cluster, threads
 from brushloop.sessions.recording import Recording
 captures = list(Recording(Path({str(session)!r})).captures()) * 3
-jobs = [(str(k), PrepareJob(one, None)) for k, one in enumerate(captures)]
+jobs = [(str(k), (one, None)) for k, one in enumerate(captures)]
 def plain(results):
     return {{name: {{part: array.tolist() for part, array in arrays.items()}} for name, arrays in results}}
 there = {{}}
