@@ -17,8 +17,8 @@ from brushloop.calibrate.compare import ANCHOR_MM, FIELD_MM, KEYS, Image, Pixels
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.report import source_label
 from brushloop.calibrate.session import Calibration, OpenSession
-from brushloop.calibrate.stroke import PX_PER_MM, Gray, Params
-from brushloop.calibrate.stroke.preprocess import Measured, Prepared, measure, prepare
+from brushloop.calibrate.stroke import PX_PER_MM, Gray
+from brushloop.calibrate.stroke.preprocess import BACKGROUND_MM, Measured, Prepared, measure, prepare
 from brushloop.calibrate.stroke.rectify import cut_out, on_raster, on_window, rectify_by, rescale
 from brushloop.calibrate.work import Arrays, Scheduler, key_of, threads
 from brushloop.sessions.errors import SessionDamaged
@@ -157,7 +157,7 @@ def rectified(capture: Capture, calibration: Calibration | None) -> tuple[Gray, 
     travels, the photograph is rescaled whole. Raises `CaptureRefused` for a capture that cannot be used,
     `SessionDamaged` for a picture that cannot be read.
     """
-    stroke, image, params = capture.stroke, capture.image(), Params()
+    stroke, image = capture.stroke, capture.image()
     if calibration is not None and stroke.anchor_mm is not None:
         window, (left_mm, top_mm) = field_around(stroke.anchor_mm), ANCHOR_MM
         if stroke.kind == "drag" and stroke.cell_mm is not None:
@@ -166,18 +166,18 @@ def rectified(capture: Capture, calibration: Calibration | None) -> tuple[Gray, 
         raster = rectify_by(image, calibration, window, capture.where)
         cell_px = None if stroke.cell_mm is None else on_window(stroke.cell_mm, window)
         anchor = (left_mm * PX_PER_MM, top_mm * PX_PER_MM)
-        return raster, prepare(raster, anchor, capture.where, params, cell_px)
+        return raster, prepare(raster, anchor, capture.where, cell_px)
     if stroke.px_per_mm is None:
         raise CaptureRefused(stroke.stroke_id, "has neither a calibration nor a scale of its own")
     anchor_px = stroke.anchor_px
     if anchor_px is not None and stroke.kind == "press":
-        around, (left_mm, top_mm) = 0.5 * params.background_mm, ANCHOR_MM
+        around, (left_mm, top_mm) = 0.5 * BACKGROUND_MM, ANCHOR_MM
         right_mm, bottom_mm = FIELD_MM - left_mm, FIELD_MM - top_mm
         reach_mm = (left_mm + around, top_mm + around, right_mm + around, bottom_mm + around)
         image, anchor_px = cut_out(image, anchor_px, stroke.px_per_mm, reach_mm, capture.where)
     raster = rescale(image, stroke.px_per_mm, capture.where)
     anchor = None if anchor_px is None else on_raster(anchor_px, stroke.px_per_mm)
-    return raster, prepare(raster, anchor, capture.where, params)
+    return raster, prepare(raster, anchor, capture.where)
 
 
 def prepare_press(capture: Capture, calibration: Calibration | None) -> Prepared:
@@ -221,4 +221,4 @@ def prepare_cell(capture: Capture, calibration: Calibration) -> Prepared:
     if cell_mm is None:
         raise CaptureRefused(capture.stroke.stroke_id, "has no paper cell")
     raster = rectify_by(capture.image(), calibration, cell_mm, capture.where)
-    return prepare(raster, None, capture.where, Params(join_mm=math.hypot(*cell_mm[2:]), speck_share=SPECK_SHARE))
+    return prepare(raster, None, capture.where, join_mm=math.hypot(*cell_mm[2:]), speck_share=SPECK_SHARE)

@@ -26,7 +26,7 @@ from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.presses import Refused, rectified
 from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.calibrate.stats import Line, fit_line
-from brushloop.calibrate.stroke import PX_PER_MM, Gray, Mask, Params
+from brushloop.calibrate.stroke import PX_PER_MM, Gray, Mask
 from brushloop.calibrate.stroke.preprocess import (
     Measured,
     components,
@@ -48,7 +48,7 @@ MARGIN_MM = 16.0
 NODES = 28
 COMMANDS = ("length_mm", "bend_mm", "depth_mm", "depth_ends_mm", "tilt_deg")
 ENDS, SHARE_ENDS, SHARE_MID = "depth_ends_mm", "z_frac_ends", "z_frac_mid"
-WIDE = Params(join_mm=6.0)
+JOIN_MM = 6.0
 """Parts this close to the stroke belong to it."""
 TORN_SHARE = 0.03
 """Share of the ink outside the largest part from which a stroke is torn."""
@@ -217,7 +217,7 @@ def _read(capture: Capture, command: tuple[float, ...] | None, grid: tuple[Float
     """
     raster, prepared = rectified(capture, None)
     mask, anchor = prepared.mask, prepared.anchor_px
-    whole = components(prepared.ink, anchor, WIDE)[0]
+    whole = components(prepared.ink, anchor, JOIN_MM)[0]
     glare = tuple(flag for flag in prepared.flags if flag.startswith("glare"))
     return Drag(
         capture.stroke,

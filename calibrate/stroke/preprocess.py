@@ -14,8 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.errors import CaptureRefused
-from brushloop.calibrate.stroke import PX_PER_MM, Floats, Gray, Mask, Params, Soft
+from brushloop.calibrate.stroke import PX_PER_MM, Floats, Gray, Mask, Soft
 
+BACKGROUND_MM = 32.0
+"""Window for estimating the lighting; a stroke thicker than this would be mistaken for shadow."""
+CONTRAST_GATE = 0.25
+"""Least contrast of the darkest ink; below it the capture is blank, and Otsu would call paper ink."""
+SPECK_SHARE = 0.01
+"""Components below this share of the main one are specks."""
+JOIN_MM = 1.5
+"""Components farther than this from the main one belong to other strokes."""
 LIGHT_ROUNDS = 5
 PAPER_ABOVE = 0.85
 """Share of the fitted light above which a pixel counts as paper."""
@@ -49,7 +57,7 @@ class Prepared:
     """Defects of the capture, although a stroke was found."""
 
 
-def flatten(raster: Gray, params: Params) -> Soft:
+def flatten(raster: Gray, px_per_mm: float = PX_PER_MM) -> Soft:
     """Return reflectance relative to the surrounding paper: 1 is paper under any lighting."""
     # At an eighth of the size: the light is smooth, and a window of 32 mm is 640 px at full size.
     shrink = 8
@@ -57,7 +65,7 @@ def flatten(raster: Gray, params: Params) -> Soft:
     # Remove the gradient first: closing alone would mistake its dark end for a stroke at the edge.
     slope = light_surface(cast("Gray", small))
     level = (cv2.medianBlur(small, 5) / slope).astype(np.float32)
-    side = round(params.background_mm * PX_PER_MM / shrink) | 1
+    side = round(BACKGROUND_MM * px_per_mm / shrink) | 1
     # Closing fills whatever is darker than its surroundings and thinner than the window.
     kernel = np.ones((side, side), np.uint8)
     closed = cv2.morphologyEx(level, cv2.MORPH_CLOSE, kernel, borderType=cv2.BORDER_REPLICATE)
@@ -95,35 +103,37 @@ def prepare(
     raster: Gray,
     anchor_px: tuple[float, float] | None,
     where: str,
-    params: Params,
     cell_px: tuple[int, int, int, int] | None = None,
+    join_mm: float = JOIN_MM,
+    speck_share: float = SPECK_SHARE,
 ) -> Prepared:
     """Find the stroke on a 20 px/mm raster. `cell_px` (x, y, w, h) hides everything outside the paper cell.
 
-    Raises `CaptureRefused` if the raster is blank or nothing is left after cleaning.
+    `join_mm` and `speck_share` say which components belong to the stroke. Raises `CaptureRefused` if the raster is
+    blank or nothing is left after cleaning.
     """
     window = _cell_window(raster, cell_px, where)
     # Only the cell: neighbours' ink and the table's edge would distort the estimated lighting.
     reflectance = np.ones(raster.shape, np.float32)
-    reflectance[window] = flatten(raster[window], params)
-    _check_contrast(reflectance[window], where, params)
+    reflectance[window] = flatten(raster[window])
+    _check_contrast(reflectance[window], where)
     otsu, _ = cv2.threshold(to_levels(reflectance[window]), 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
     ink = to_levels(reflectance) <= round(otsu)
-    mask, others_mm2 = components(ink, anchor_px, params)
+    mask, others_mm2 = components(ink, anchor_px, join_mm, speck_share)
     if not mask.any():
         raise CaptureRefused(where, "holds no stroke after specks and neighbours were removed")
     flags = _flags(raster[window], mask[window], others_mm2)
     return Prepared(mask, _soft_ink(reflectance, mask), ink, anchor_px, touches_edge(mask[window]), flags)
 
 
-def _check_contrast(reflectance: Soft, where: str, params: Params) -> None:
+def _check_contrast(reflectance: Soft, where: str) -> None:
     """Raise `CaptureRefused` if the contrast is too low."""
     # The darkest GATE_MM2 is an area rather than a share, so that the picture's size does not matter.
     pixels = reflectance.ravel()
     kth = min(round(GATE_MM2 * PX_PER_MM**2), pixels.size - 1)
     contrast = 1.0 - float(np.partition(pixels, kth)[kth])
-    if contrast < params.contrast_gate:
-        raise CaptureRefused(where, f"is blank: darkest ink {contrast:.2f} below paper, gate {params.contrast_gate}")
+    if contrast < CONTRAST_GATE:
+        raise CaptureRefused(where, f"is blank: darkest ink {contrast:.2f} below paper, gate {CONTRAST_GATE}")
 
 
 def to_levels(reflectance: Soft) -> Gray:
@@ -174,7 +184,9 @@ def touches_edge(mask: Mask) -> bool:
     return bool(mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
 
 
-def components(ink: Mask, anchor_px: tuple[float, float] | None, params: Params) -> tuple[Mask, list[float]]:
+def components(
+    ink: Mask, anchor_px: tuple[float, float] | None, join_mm: float = JOIN_MM, speck_share: float = SPECK_SHARE
+) -> tuple[Mask, list[float]]:
     """The stroke, (h, w): the main component, and parts close to it that are not specks; and the areas of others, mm2.
 
     The main component is the largest; with an anchor, the largest of those that come within `join_mm` of it, if any.
@@ -185,17 +197,17 @@ def components(ink: Mask, anchor_px: tuple[float, float] | None, params: Params)
     areas = np.asarray(stats[1:, cv2.CC_STAT_AREA], np.int64)
     candidates = np.arange(1, count)
     if anchor_px is not None:
-        near = _within(labels.astype(np.int32), anchor_px, params.join_mm * PX_PER_MM)
-        near = near[areas[near - 1] >= params.speck_share * areas.max()]
+        near = _within(labels.astype(np.int32), anchor_px, join_mm * PX_PER_MM)
+        near = near[areas[near - 1] >= speck_share * areas.max()]
         candidates = near if near.size else candidates
     main = int(candidates[np.argmax(areas[candidates - 1])])
-    others = [k for k in range(1, count) if k != main and areas[k - 1] >= params.speck_share * areas[main - 1]]
-    near: list[int] = []
+    others = [k for k in range(1, count) if k != main and areas[k - 1] >= speck_share * areas[main - 1]]
+    joined: list[int] = []
     if others:
         away_px = np.asarray(cv2.distanceTransform((labels != main).astype(np.uint8), cv2.DIST_L2, 5), np.float32)
-        near = [k for k in others if float(away_px[labels == k].min()) <= params.join_mm * PX_PER_MM]
-    others_mm2 = [float(areas[label - 1]) / PX_PER_MM**2 for label in others if label not in near]
-    return np.isin(labels, [main, *near]), others_mm2
+        joined = [k for k in others if float(away_px[labels == k].min()) <= join_mm * PX_PER_MM]
+    others_mm2 = [float(areas[label - 1]) / PX_PER_MM**2 for label in others if label not in joined]
+    return np.isin(labels, [main, *joined]), others_mm2
 
 
 def _within(labels: NDArray[np.int32], point: tuple[float, float], radius: float) -> NDArray[np.int64]:

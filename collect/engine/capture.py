@@ -12,7 +12,7 @@ from brushloop.calibrate.board.pix2len import Plane, see_board
 from brushloop.calibrate.compare import ANCHOR_MM, MM_PER_PX, SIZE_PX, covered, field_around
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.stats import odd_waits, wait_limit_s, waits_of
-from brushloop.calibrate.stroke import PX_PER_MM, Gray, Params
+from brushloop.calibrate.stroke import PX_PER_MM, Gray
 from brushloop.calibrate.stroke.preprocess import prepare
 from brushloop.calibrate.stroke.rectify import on_window, rectify
 from brushloop.collect.engine.recorder import RunContext, StepContext, meanwhile, uninterrupted
@@ -373,7 +373,7 @@ def pictures_of(image: Gray, plane: Plane, patch: Patch) -> tuple[NDArray[np.uin
     raster = rectify(image, plane.homography, window)
     anchor_px = left * PX_PER_MM, top * PX_PER_MM
     try:
-        prepared = prepare(raster, anchor_px, "the capture", Params(), on_window(patch.rect_mm, window))
+        prepared = prepare(raster, anchor_px, "the capture", on_window(patch.rect_mm, window))
     except CaptureRefused:
         return raster, None
     return raster, covered(prepared) > 0.5

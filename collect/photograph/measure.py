@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from brushloop.calibrate.board.lens import Floats, apply
 from brushloop.calibrate.board.pix2len import Plane
-from brushloop.calibrate.stroke import PX_PER_MM, Gray, Mask, Params, Soft
+from brushloop.calibrate.stroke import PX_PER_MM, Gray, Mask, Soft
 from brushloop.calibrate.stroke.preprocess import flatten
 from brushloop.calibrate.stroke.rectify import rectify
 
@@ -75,8 +75,7 @@ def take(image: Gray, plane: Plane, window_mm: Rect, px_per_mm: float = PX_PER_M
         shown[[0, -1]] = 0
         shown[:, [0, -1]] = 0
         in_view = rectify(shown, plane.homography, window_mm, px_per_mm) > 127
-    params = Params(background_mm=Params().background_mm * px_per_mm / PX_PER_MM)  # `flatten` takes it for 20 px/mm
-    dark = np.where(in_view, 1.0 - flatten(raster, params), 0.0).astype(np.float32)
+    dark = np.where(in_view, 1.0 - flatten(raster, px_per_mm), 0.0).astype(np.float32)
     pixel_mm = math.sqrt(width * height / cv2.contourArea(seen.astype(np.float32)))
     return Window(window_mm, dark, in_view, pixel_mm, px_per_mm)
 

@@ -8,7 +8,7 @@ import pytest
 from brushloop.calibrate.board.detect import find_board
 from brushloop.calibrate.board.lens import unknown_lens
 from brushloop.calibrate.board.pix2len import Plane, fit_plane, paper_mm
-from brushloop.calibrate.stroke import PX_PER_MM, Params
+from brushloop.calibrate.stroke import PX_PER_MM
 from brushloop.calibrate.stroke.preprocess import prepare
 from brushloop.calibrate.stroke.rectify import rectify_by
 from tests.calibrate.simulated_rigs import (
@@ -56,7 +56,7 @@ def overlap(shot: Shot, plane: Plane, anchor: tuple[float, float]) -> float:
     window = heading_free_window(anchor)
     raster = rectify_by(shot.image, plane, window, "rig")
     at = ((anchor[0] - window[0]) * PX_PER_MM, (window[1] + window[3] - anchor[1]) * PX_PER_MM)
-    mask = prepare(raster, at, "rig", Params()).mask
+    mask = prepare(raster, at, "rig").mask
     truth = true_mask(shot, window, PX_PER_MM)
     return float((mask & truth).sum() / (mask | truth).sum())
 

@@ -8,12 +8,11 @@ import pytest
 
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.stats import fit_line
-from brushloop.calibrate.stroke import PX_PER_MM, Params
+from brushloop.calibrate.stroke import PX_PER_MM
 from brushloop.calibrate.stroke.preprocess import measure, prepare
 from brushloop.calibrate.stroke.rectify import rectify, rescale
 
 PAGE = (800, 800)
-PARAMS = Params()
 
 
 def stroke(length_mm: float = 20.0, width_mm: float = 8.0, centre: tuple[int, int] = (400, 400)) -> np.ndarray:
@@ -37,39 +36,39 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
 def test_the_stroke_is_found_whatever_the_light_does(shade: float, length_mm: float, width_mm: float) -> None:
     """A thick stroke is not taken for shadow."""
     truth = stroke(length_mm, width_mm)
-    assert iou(prepare(page(truth, shade=shade), None, "page", PARAMS).mask, truth) > 0.98
+    assert iou(prepare(page(truth, shade=shade), None, "page").mask, truth) > 0.98
 
 
 @pytest.mark.parametrize("shade", [0.0, 0.5])
 def test_a_blank_page_is_refused_where_otsu_would_call_paper_ink(shade: float) -> None:
     with pytest.raises(CaptureRefused, match=r"capture 7: is blank"):
-        prepare(page(np.zeros(PAGE, np.bool_), shade=shade), None, "capture 7", PARAMS)
+        prepare(page(np.zeros(PAGE, np.bool_), shade=shade), None, "capture 7")
 
 
 def test_of_what_lies_on_the_page_the_stroke_is_kept() -> None:
     truth, dirty = stroke(), stroke()
     dirty |= stroke(6.0, 4.0, (90, 120))  # a neighbour's end
     dirty[700:704, 500:504] = True  # a speck
-    assert iou(prepare(page(dirty), None, "page", PARAMS).mask, truth) > 0.98
+    assert iou(prepare(page(dirty), None, "page").mask, truth) > 0.98
     broken = truth.copy()
     broken[:, 400:412] = False  # a dry gap of .6 mm
-    assert iou(prepare(page(broken), (400.0, 400.0), "page", PARAMS).mask, broken) > 0.97
+    assert iou(prepare(page(broken), (400.0, 400.0), "page").mask, broken) > 0.97
     small, large = stroke(5.0, 3.0, (400, 400)), stroke(16.0, 8.0, (400, 700))
-    assert iou(prepare(page(small | large), (420.0, 400.0), "page", PARAMS).mask, small) > 0.95
+    assert iou(prepare(page(small | large), (420.0, 400.0), "page").mask, small) > 0.95
 
 
 def test_what_lies_outside_the_cell_is_not_seen_and_what_reaches_its_edge_is_cut() -> None:
     truth, neighbour = stroke(), stroke(20.0, 8.0, (400, 620))
-    inside = prepare(page(truth | neighbour), None, "page", PARAMS, (0, 200, 800, 330))
+    inside = prepare(page(truth | neighbour), None, "page", (0, 200, 800, 330))
     assert iou(inside.mask, truth) > 0.98
     assert not inside.cut
-    assert prepare(page(truth), None, "page", PARAMS, (0, 0, 500, 800)).cut
-    assert prepare(page(stroke(30.0, 8.0, (700, 400))), None, "page", PARAMS).cut
+    assert prepare(page(truth), None, "page", (0, 0, 500, 800)).cut
+    assert prepare(page(stroke(30.0, 8.0, (700, 400))), None, "page").cut
 
 
 def test_soft_ink_is_one_inside_and_zero_away_from_the_stroke() -> None:
     truth = stroke()
-    soft = prepare(page(truth), None, "page", PARAMS).soft
+    soft = prepare(page(truth), None, "page").soft
     assert soft[380:420, 380:420].mean() > 0.95
     assert soft[:100].max() == 0.0
 
@@ -90,7 +89,7 @@ def test_a_photograph_of_known_scale_keeps_its_millimetres() -> None:
     image = np.full((350, 480), 255, np.uint8)
     image[100:150, 200:300] = 30  # 100 x 50 px at 5 x 10 px/mm: 20 x 5 mm
     raster = rescale(image, (5.0, 10.0), "photo")
-    measured = measure(prepare(raster, None, "photo", PARAMS).mask)
+    measured = measure(prepare(raster, None, "photo").mask)
     assert measured.length_mm == pytest.approx(20.0, abs=0.2)
     assert measured.width_mm == pytest.approx(5.0, abs=0.15)
     assert measured.area_mm2 == pytest.approx(100.0, rel=0.03)
