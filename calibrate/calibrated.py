@@ -107,7 +107,25 @@ def calibrate_session(request: CalibrateRequest, progress: Progress = unseen) ->
     compared = [_moved(calibration, before, (last_ns - t_ns) / 60e9, where) for t_ns, before in looked_at]
     moved = tuple(filter(None, compared))
     path = put_to_use(calibration, recording.path.parent)
-    return Calibrated(calibration, path, _write_page(recording, calibration, path, image, view, moved), moved)
+    sheet = [] if rig.sheet_mm is None else _outline(calibration, rig.sheet_mm).round(1).tolist()
+    page = write_page(
+        path.with_suffix(".html"),
+        "calibration.html.j2",
+        **about(recording.header),
+        calibration=calibration,
+        picture=_picture(calibration, image, view),
+        sheet=sheet,
+        trust=[source_point(recording.header.source), *_trust(calibration, moved)],
+        contours=_contours(calibration, image.shape[1], image.shape[0]),
+        facts=[
+            *recording_facts(recording.header, recording.path.name, recording.sha256, calibration),
+            ("board", describe(calibration.board)),
+            ("photograph of the board", f"sha256 {calibration.still_sha256}"),
+            ("lens in use", f"{calibration.lens.source}; k1 {calibration.lens.distortion[0]:+.4f}"),
+            ("calibrated with", calibration.software),
+        ],
+    )
+    return Calibrated(calibration, path, page, moved)
 
 
 def calibrate_lens(request: LensRequest, progress: Progress = unseen) -> Written:
@@ -141,33 +159,7 @@ def _moved(calibration: Calibration, still: bytes, minutes: float, where: str) -
     return f"{before}, it lay {off_px:.1f} px ({off_mm:.2f} mm) away: camera or board was touched, and strokes are off"
 
 
-def _write_page(
-    recording: Recording, calibration: Calibration, path: Path, image: Gray, view: BoardView, moved: Sequence[str]
-) -> Path:
-    """Write the page of the calibration at `path`, which was measured on this photograph, beside it."""
-    sheet_mm = rig_of(recording).sheet_mm
-    sheet = None if sheet_mm is None else _outline(calibration, sheet_mm)
-    lens = f"{calibration.lens.source}; k1 {calibration.lens.distortion[0]:+.4f}"
-    return write_page(
-        path.with_suffix(".html"),
-        "calibration.html.j2",
-        **about(recording.header),
-        session=recording.header.session_id,
-        picture=_picture(calibration, image, view, sheet),
-        verdict=list(_verdict(calibration)),
-        trust=[source_point(recording.header.source), *_trust(calibration, moved)],
-        contours=_contours(calibration, image.shape[1], image.shape[0]),
-        facts=[
-            *recording_facts(recording.header, recording.path.name, recording.sha256, calibration),
-            ("board", describe(calibration.board)),
-            ("photograph of the board", f"sha256 {calibration.still_sha256}"),
-            ("lens in use", lens),
-            ("calibrated with", calibration.software),
-        ],
-    )
-
-
-def _picture(calibration: Calibration, image: Gray, view: BoardView, sheet: Floats | None) -> dict[str, Any]:
+def _picture(calibration: Calibration, image: Gray, view: BoardView) -> dict[str, Any]:
     """What the template draws over the photograph, in its pixels."""
     height, width = image.shape
     expected = calibration.to_image(paper_mm(view, calibration.board))
@@ -188,7 +180,6 @@ def _picture(calibration: Calibration, image: Gray, view: BoardView, sheet: Floa
         "unit": round(width / 1000, 2),
         "times": f"{times:g}",
         "corners": corners,
-        "sheet": [] if sheet is None else sheet.round(1).tolist(),
     }
 
 
@@ -210,25 +201,12 @@ def _outline(calibration: Calibration, sheet_mm: tuple[float, float]) -> Floats:
     return calibration.to_image(np.concatenate(sides))
 
 
-def _verdict(calibration: Calibration) -> Iterator[str]:
-    reach = _reach(calibration)
-    yield (
-        f"One pixel is {calibration.mm_per_px:.5f} mm of paper in the middle of the board, known to "
-        f"±{100 * reach:.3f} % (95 %, if the board is printed to scale): 20 mm are known to ±{20 * reach:.4f} mm."
-    )
-    yield (
-        f"{calibration.corners} corners lie {calibration.rms_px:.2f} px "
-        f"({calibration.rms_px * calibration.mm_per_px:.3f} mm) from where the fitted plane puts them "
-        "(root mean square)."
-    )
-
-
 def _trust(calibration: Calibration, moved: Sequence[str]) -> Iterator[Point]:
     flat = "a flat, sharp, still board gives 0.1 to 0.3 px"
     residual = f"The residual is {calibration.rms_px:.2f} px, at most {RMS_LIMIT_PX:g} px are good; {flat}."
     yield Point(calibration.rms_px <= RMS_LIMIT_PX, residual)
-    reach = _reach(calibration)
-    yield Point(reach <= WORST_INTERVAL, f"Scale known to ±{100 * reach:.3f} %, goal ±{100 * WORST_INTERVAL:g} %.")
+    known = calibration.relative_reach
+    yield Point(known <= WORST_INTERVAL, f"Scale known to ±{100 * known:.3f} %, goal ±{100 * WORST_INTERVAL:g} %.")
     sharp = 1.0 / calibration.mm_per_px
     yield Point(sharp >= LEAST_PX_PER_MM, f"{sharp:.1f} px/mm; at least {LEAST_PX_PER_MM:g} are needed.")
     out = calibration.corners_dropped
@@ -242,10 +220,6 @@ def _trust(calibration: Calibration, moved: Sequence[str]) -> Iterator[Point]:
         yield Point(False, f"{problem[0].upper()}{problem[1:]}.")
     if not moved:
         yield Point(True, "The board lay in the same place in every photograph of it.")
-
-
-def _reach(calibration: Calibration) -> float:
-    return (calibration.mm_per_px_high - calibration.mm_per_px_low) / (2.0 * calibration.mm_per_px)
 
 
 def _contours(calibration: Calibration, width: int, height: int) -> list[tuple[str, list[list[float]]]]:

@@ -75,6 +75,11 @@ class Plane(Frozen):
     explain. It is not written to files."""
 
     @property
+    def relative_reach(self) -> float:
+        """Half the width of pix2len's interval, as a share of pix2len."""
+        return (self.mm_per_px_high - self.mm_per_px_low) / (2.0 * self.mm_per_px)
+
+    @property
     def homography(self) -> Floats:
         """`image_to_paper` as (3, 3)."""
         return np.array(self.image_to_paper).reshape(3, 3)
