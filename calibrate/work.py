@@ -185,8 +185,8 @@ def cluster(address: str) -> Generator[Scheduler]:
         answers: dict[str, Any] = client.run(software, on_error="return")
         for worker, answer in answers.items():
             if answer != software():
-                says = " ".join(str(answer).split())
-                raise CalibrationError(where, f"worker {worker} says {says!r}; {software()} is needed there")
+                version_there = " ".join(str(answer).split())
+                raise CalibrationError(where, f"worker {worker} has {version_there}; {software()} is needed there")
         yield Scheduler(client.get_executor(pure=False), sum(threads_of.values()))
     finally:
         client.close()
