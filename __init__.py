@@ -13,12 +13,10 @@ if TYPE_CHECKING:
     from brushloop.calibrate.errors import CalibrationError, CaptureRefused
     from brushloop.calibrate.fit.fit import BrushFit
     from brushloop.calibrate.notebook import (
-        Prediction,
         RecordedPress,
         Session,
         calibrate_session,
         fit,
-        models,
         predict,
         recover,
         validate,
@@ -27,7 +25,9 @@ if TYPE_CHECKING:
     from brushloop.collect.start import collect_session
     from brushloop.drivers.loopback import LoopbackRig, simulate
     from brushloop.model.ccdbsm import Brush, DomainError
+    from brushloop.model.generator.stroke import models
     from brushloop.model.similarity import Similarity, compare
+    from brushloop.model.strokes import Prediction
     from brushloop.sessions.errors import SessionDamaged, SessionError
     from brushloop.sessions.records import Condition
 
@@ -36,14 +36,15 @@ _NAMES = {
     "brushloop.calibrate.errors": ("CalibrationError", "CaptureRefused"),
     "brushloop.calibrate.fit.fit": ("BrushFit",),
     "brushloop.calibrate.notebook": (
-        *("Prediction", "RecordedPress", "Session"),
-        *("calibrate_session", "fit", "models", "predict", "recover", "validate"),
+        *("RecordedPress", "Session", "calibrate_session", "fit", "predict", "recover", "validate"),
     ),
     "brushloop.collect.errors": ("CollectAborted", "ConfigError"),
     "brushloop.collect.start": ("collect_session",),
     "brushloop.drivers.loopback": ("LoopbackRig", "simulate"),
     "brushloop.model.ccdbsm": ("Brush", "DomainError"),
+    "brushloop.model.generator.stroke": ("models",),
     "brushloop.model.similarity": ("Similarity", "compare"),
+    "brushloop.model.strokes": ("Prediction",),
     "brushloop.sessions.records": ("Condition",),
     "brushloop.sessions.errors": ("SessionDamaged", "SessionError"),
 }

@@ -107,14 +107,16 @@ def calibrate_session(request: CalibrateRequest, progress: Progress = unseen) ->
     compared = [_moved(calibration, before, (last_ns - t_ns) / 60e9, where) for t_ns, before in looked_at]
     moved = tuple(filter(None, compared))
     path = put_to_use(calibration, recording.path.parent)
-    sheet = [] if rig.sheet_mm is None else _outline(calibration, rig.sheet_mm).round(1).tolist()
+    edge: list[list[float]] = []
+    if rig.sheet_mm is not None:
+        edge = _outline(calibration, rig.sheet_mm).round(1).tolist()
     page = write_page(
         path.with_suffix(".html"),
         "calibration.html.j2",
         **about(recording.header),
         calibration=calibration,
         picture=_picture(calibration, image, view),
-        sheet=sheet,
+        sheet=edge,
         trust=[source_point(recording.header.source), *_trust(calibration, moved)],
         contours=_contours(calibration, image.shape[1], image.shape[0]),
         facts=[

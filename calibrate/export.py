@@ -74,7 +74,7 @@ def export(request: ExportRequest, progress: Progress = unseen) -> Exported:
     if recording.counts[Topic.STROKE] == 0:
         raise InputError(recording.path, "holds no strokes to export")
     if crops:
-        _ = session.opened  # refused here if it was not calibrated
+        _ = session.calibration  # refused here if it was not calibrated
     left_out: list[Refused] = []
     try:
         out.parent.mkdir(parents=True, exist_ok=True)

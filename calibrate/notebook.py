@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +17,6 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from brushloop.calibrate.artefact import current, load_artefact
 from brushloop.calibrate.commands import CalibrateRequest, FitRequest, RecoverRequest, ValidateRequest
 from brushloop.calibrate.compare import GRAY_MM, brush_of, simulated
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
@@ -27,6 +25,7 @@ from brushloop.calibrate.remote import local_path
 from brushloop.calibrate.session import Calibration, OpenSession, open_session
 from brushloop.calibrate.stroke.preprocess import Prepared
 from brushloop.model.ccdbsm import Brush
+from brushloop.model.strokes import Prediction
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.events import Begin, StepEvent, StepKind
 from brushloop.sessions.recording import Capture, Recording
@@ -38,12 +37,8 @@ if TYPE_CHECKING:
     from brushloop.calibrate.fit.fit import BrushFit, FitResult
     from brushloop.calibrate.recover import Recovered
     from brushloop.calibrate.validate.command import ValidationOutput
-    from brushloop.model.strokes import StrokeModel
 
 Gray = NDArray[np.uint8]
-Floats = NDArray[np.float64]
-GENERATOR = "ccd-bsmg"
-"""The generator that comes with brushloop."""
 SAMPLE_COLUMNS = ("episode_index", "frame_index", "t_ns", "log_ns", "sequence")
 """Numbers of the stroke and of the sample within it; times at the device and the recorder; the sample's own number."""
 
@@ -89,7 +84,7 @@ class RecordedPress:
 
         The ink of a press is its largest connected ink; that of a stroke that travels is all in its cell.
         """
-        raster, prepared = rectified(self.capture, self._session.opened.calibration)
+        raster, prepared = rectified(self.capture, self._session.calibration)
         return raster, prepared.ink if self.capture.stroke.kind == "drag" else prepared.mask, prepared
 
     @property
@@ -145,21 +140,12 @@ class Session:
 
     @property
     def calibration(self) -> Calibration | None:
-        """The calibration in use; None if there is none, as for an import."""
-        path = current(self.recording.path.parent)
-        return None if path is None else load_artefact(path, Calibration)
-
-    @property
-    def fit(self) -> BrushFit | None:
-        """The brush fit in use."""
-        from brushloop.calibrate.fit.fit import FOLDER, BrushFit
-
-        path = current(self.recording.path.parent, FOLDER)
-        return None if path is None else load_artefact(path, BrushFit)
+        """The calibration in use; None for an import. Raises `CalibrationError` where it is missing."""
+        return self.opened.calibration
 
     @cached_property
     def opened(self) -> OpenSession:
-        """The session with the calibration that crops use. Raises `CalibrationError` where it is missing."""
+        """The session as calculations read it. Raises `CalibrationError` where its calibration is missing."""
         return open_session(self.recording.path)
 
     @cached_property
@@ -217,53 +203,20 @@ def _wrench(data: bytes) -> tuple[float, ...]:
     return tuple(Wrench.model_validate_json(data).model_dump().values())
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Prediction:
-    """The mark that a model predicts for a press."""
-
-    model: str
-    image: NDArray[np.float32]
-    """(128, 128) share of each pixel that is ink, at .3 mm/px, with the zero-touch point at .76 of the width."""
-    outline_mm: Floats
-    """(n, 2) points along its edge, from where the brush axis meets the paper; the ferrule leans toward positive x."""
-
-    def _repr_html_(self) -> str:
-        points = " ".join(f"{x:.2f},{-y:.2f}" for x, y in self.outline_mm)
-        return f'<svg viewBox="-40 -20 60 40" width="360"><polygon points="{points}"/></svg>'
-
-
-def models() -> tuple[str, ...]:
-    """Names of the models that `predict` draws."""
-    from brushloop.model.strokes import stroke_models
-
-    return (*stroke_models(Brush()), GENERATOR)
-
-
 def predict(condition: Condition, brush: Brush | BrushFit | None = None, model: str = "ccd-bsm") -> Prediction:
     """Draw a press; a fitted brush draws itself, whatever the model, and None is the published brush.
 
     Raises `UnknownModelError`, and `DomainError` for a press that the model does not predict.
     """
-    chosen = _model(brush or Brush(), model)
-    images = simulated(chosen, condition.depth_mm, condition.tilt_deg)
+    from brushloop.model.fitted import fitted_model
+    from brushloop.model.generator.stroke import named_model
+
+    chosen = brush or Brush()
+    drawn = named_model(model, chosen) if isinstance(chosen, Brush) else fitted_model(chosen.press())
+    images = simulated(drawn, condition.depth_mm, condition.tilt_deg)
     image = np.asarray(images[GRAY_MM] / 255.0, np.float32)
-    edge = chosen.profile(condition.depth_mm, condition.tilt_deg).polyline()[0]
-    return Prediction(chosen.name, image, edge)
-
-
-def _model(brush: Brush | BrushFit, name: str) -> StrokeModel:
-    if not isinstance(brush, Brush):
-        from brushloop.model.fitted import fitted_model
-
-        return fitted_model(brush.press())
-    if name == GENERATOR:
-        from brushloop.model.generator import SHIPPED_GENERATOR
-        from brushloop.model.generator.stroke import load_generator
-
-        return load_generator(SHIPPED_GENERATOR, brush)
-    from brushloop.model.strokes import stroke_model
-
-    return stroke_model(name, brush)
+    edge = drawn.profile(condition.depth_mm, condition.tilt_deg).polyline()[0]
+    return Prediction(drawn.name, image, edge)
 
 
 Place = Session | str | os.PathLike[str]

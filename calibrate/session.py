@@ -92,16 +92,6 @@ def open_session(path: Path, kind: Kind | None = None) -> OpenSession:
     return OpenSession(recording, sha256, strokes, calibration, Store(folder / FINISHED))
 
 
-def lens_in_use(folder: Path) -> Lens | None:
-    """The lens of the calibration that a session uses, else the one that it was collected with.
-
-    Raises `CalibrationError`.
-    """
-    path = current(folder)
-    lens = None if path is None else load_artefact(path, Calibration).lens
-    return lens if lens is not None else rig_of(folder).lens
-
-
 class RigView(BaseModel):
     """What a session recorded of the rig."""
 

@@ -301,16 +301,14 @@ def guidance(views: Sequence[BoardView], slants_deg: Sequence[float], ways: int 
     """Instructions for further photographs: what these views, in `ways` orientations of the board, do not cover."""
     wanted: list[str] = []
     if len(views) < GOOD_VIEWS:
-        left = GOOD_VIEWS - len(views)
-        wanted.append(f"take {left} more photograph{'s' * (left > 1)} ({len(views)} used, {GOOD_VIEWS} are good)")
+        wanted.append(f"take more photographs ({len(views)} used, {GOOD_VIEWS} are good)")
     width, height = views[0].size_px
     places = np.concatenate([view.pixels for view in views])
     counts, _, _ = np.histogram2d(places[:, 1], places[:, 0], bins=(GRID[1], GRID[0]), range=((0, height), (0, width)))
     empty = [GRID_WORDS[r][c] for r in range(GRID[1]) for c in range(GRID[0]) if counts[r, c] == 0]
     if ways < EARNED_WAYS:
-        left = EARNED_WAYS - ways
-        more = f"{left} more way{'s' * (left > 1)} ({ways} so far)"
-        wanted.append(f"hold the board in {more}: {EARNED_WAYS} are needed before an error can be stated")
+        needed = f"{EARNED_WAYS} are needed before an error can be stated"
+        wanted.append(f"hold the board in more ways ({ways} so far): {needed}")
     if empty:
         wanted.append(f"bring the board into the {', '.join(empty)} of the image: no corner was seen there")
     slanted = sum(slant >= LEAST_SLANT_DEG for slant in slants_deg)

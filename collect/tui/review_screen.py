@@ -25,7 +25,7 @@ from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.fit import FOLDER as FITS
 from brushloop.calibrate.fit.fit import BrushFit
-from brushloop.calibrate.session import lens_in_use, rig_of
+from brushloop.calibrate.session import rig_of
 from brushloop.calibrate.stats import odd_waits, waits_of
 from brushloop.collect.engine.capture import mark_of, pictures_of
 from brushloop.collect.engine.snapshot import LastCapture
@@ -108,8 +108,8 @@ class Review:
         self._lens: Lens | None = None
         try:
             # As the session recorded them: lens files lie beside the rig's own rig.toml, not beside its snapshot here.
-            self._lens = lens_in_use(folder)
-            self._board = rig_of(folder).board
+            rig = rig_of(folder)
+            self._lens, self._board = rig.lens, rig.board
         except CalibrationError as error:
             self.not_compared = str(error)
         self.read()

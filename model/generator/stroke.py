@@ -16,13 +16,15 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 
 from brushloop.model.ccdbsm import Brush
-from brushloop.model.generator import TrainError
+from brushloop.model.generator import SHIPPED_GENERATOR, TrainError
 from brushloop.model.generator.config import INPUTS, MAX_WEIGHTS, Target, TrainConfig, checked
 from brushloop.model.outline import Array, Outline, as_batch
-from brushloop.model.strokes import StrokeModel
+from brushloop.model.strokes import StrokeModel, stroke_model, stroke_models
 
 Singles = NDArray[np.float32]
 FORMAT = "brushloop-generator-2"
+SHIPPED = "ccd-bsmg"
+"""Name of the generator that comes with brushloop."""
 MAX_CONFIG_CHARS = 64 * 1024
 
 
@@ -101,6 +103,16 @@ def load_generator(path: Path | str, brush: Brush | None = None) -> GeneratorMod
         fitted=is_tuned or target.fitted_brush,
         file=file,
     )
+
+
+def models() -> tuple[str, ...]:
+    """Names of the stroke models of any brush, and of the generator that comes with brushloop."""
+    return (*stroke_models(Brush()), SHIPPED)
+
+
+def named_model(name: str, brush: Brush) -> StrokeModel:
+    """The model of that name for one brush. Raises `UnknownModelError`, and `TrainError` as `load_generator` does."""
+    return load_generator(SHIPPED_GENERATOR, brush) if name == SHIPPED else stroke_model(name, brush)
 
 
 def traced(images: Singles, origin_mm: Array, px_mm: float) -> Outline:

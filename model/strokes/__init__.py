@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brushloop.model.ccdbsm import Brush, CcdBsm, ccdbsm
 from brushloop.model.outline import Array, Outline, as_batch
@@ -45,6 +46,21 @@ class StrokeModel:
     profile: Profile
     fitted: bool = False
     """Whether any parameter was fitted to captures; a report must state this with each score."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """The mark that a model predicts for a press."""
+
+    model: str
+    image: NDArray[np.float32]
+    """(128, 128) share of each pixel that is ink, at .3 mm/px, with the zero-touch point at .76 of the width."""
+    outline_mm: Array
+    """(n, 2) points along its edge, from where the brush axis meets the paper; the ferrule leans toward positive x."""
+
+    def _repr_html_(self) -> str:
+        points = " ".join(f"{x:.2f},{-y:.2f}" for x, y in self.outline_mm)
+        return f'<svg viewBox="-40 -20 60 40" width="360"><polygon points="{points}"/></svg>'
 
 
 @dataclass(frozen=True, slots=True)
