@@ -1,9 +1,9 @@
-"""`python -m bench.pictures screens|first-day|report [REPORT.html]`: the pictures of the documentation.
+"""`python -m bench.pictures screens|first-day|frames|report REPORT.html`: the pictures of the documentation.
 
 `screens` are those of a session that the loopback rig really runs, in the operator's app, and a moving picture made of
 them; `first-day` those of a first day in an unknown lab: the wizard is the real one, the person's hand is that of the
-simulated lab, and every answer is pressed as a key. Both are textual's own SVG export. `report` is the top of a report,
-drawn by headless Chromium: by default of the one that `make demo` ends with. All show the loopback rig, and say so.
+simulated lab, and every answer is pressed as a key. Both are textual's own SVG export. `frames` shows what H, alpha and
+heading are. `report` is the top of a report, drawn by headless Chromium. All but `frames` show the loopback rig.
 """
 
 from __future__ import annotations
@@ -23,9 +23,11 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from textual.app import App
 from textual.pilot import Pilot
 
+import brushloop
 from bench.harness import ROOT
 from brushloop.collect.commission.step import Guide, Visit
 from brushloop.collect.commission.wizard import Wizard
@@ -47,7 +49,6 @@ from brushloop.drivers.sim.rig import LoopbackRig
 
 FOLDER = ROOT / "docs" / "screens"
 REPORT = ROOT / "docs" / "report.png"
-DEMO_REPORT = ROOT / "demo-run" / "report" / "report.html"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 WINDOW_PX, MOST_S = (900, 1150), 120.0
 SIZE = (120, 40)
@@ -78,9 +79,12 @@ SVG = re.compile(r"<svg[^>]*viewBox=\"([^\"]+)\"[^>]*>(.*)</svg>\s*$", re.S)
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     parser = argparse.ArgumentParser(prog="python -m bench.pictures", description="Draw the pictures of docs/.")
-    parser.add_argument("what", choices=("screens", "first-day", "report"))
-    parser.add_argument("page", nargs="?", type=Path, default=DEMO_REPORT, help="report.html, for `report`")
+    parser.add_argument("what", choices=("screens", "first-day", "frames", "report"))
+    parser.add_argument("page", nargs="?", type=Path, default=Path("report.html"), help="report.html, for `report`")
     options = parser.parse_args(arguments)
+    if options.what == "frames":
+        frames_picture(ROOT / "docs" / "frames.svg")
+        return 0
     if options.what == "report":
         try:
             report_picture(options.page, REPORT)
@@ -349,6 +353,37 @@ def session_picture() -> str:
         "@media (prefers-reduced-motion:reduce){.frame{animation:none}.frame:last-child{visibility:visible}}"
         f"</style>{''.join(frames)}</svg>\n"
     )
+
+
+def frames_picture(out: Path) -> None:
+    """Draw a press from the side and its mark from above, with H, alpha, heading and the axes of the paper."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    condition, heading, length_mm = brushloop.Condition(depth_mm=15.0, tilt_deg=20.0), np.radians(30.0), 48.0
+    lean, tip_mm = np.radians(condition.tilt_deg), np.array([0.0, -condition.depth_mm])
+    mpl.rcParams["svg.hashsalt"] = out.name  # equal pictures are equal files
+    figure: Any = Figure(figsize=(9.0, 4.4), layout="constrained")
+    side, above = figure.subplots(1, 2)
+    side.plot([-20.0, 40.0], [0.0, 0.0], color="black", label="paper")
+    side.plot([0.0, 0.0], [0.0, length_mm], "--", color="0.5", label="zero touch: the upright tip just touches")
+    axis_mm = np.array([tip_mm, tip_mm + length_mm * np.array([np.sin(lean), np.cos(lean)])])
+    side.plot(*axis_mm.T, color="C0", lw=4, label="press: H deeper, tilted by α")
+    side.annotate("", (-5.0, 0.0), (-5.0, tip_mm[1]), arrowprops={"arrowstyle": "<->"})
+    side.text(-11.0, -10.0, "H", fontsize=14)
+    side.text(2.5, 18.0, "α", fontsize=14)
+    ahead, aside = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
+    edge_mm = brushloop.predict(condition).outline_mm @ np.array([ahead, aside])
+    above.fill(*(edge_mm + condition.depth_mm * np.tan(lean) * ahead).T, color="0.8", label="mark by CCD-BSM")
+    above.plot(0.0, 0.0, "o", color="C0", label="anchor, where the upright tip touches")
+    for name, tip in (("x", [30.0, 0.0]), ("y", [0.0, 30.0]), ("heading: the ferrule leans there", 30.0 * ahead)):
+        above.annotate("", tip, (0.0, 0.0), arrowprops={"arrowstyle": "->", "shrinkA": 0})
+        above.text(*np.multiply(1.06, tip), name, fontsize=11, va="center")
+    for axes, title, low in ((side, "from the side", -25.0), (above, "from above, in the axes of the paper", -30.0)):
+        axes.set(title=title, aspect="equal", xlim=(low, low + 75.0), ylim=(-20.0, 50.0))
+        axes.axis("off")
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, 0.02), frameon=False)
+    figure.savefig(out, metadata={"Date": None})
 
 
 def find_browser() -> str | None:
