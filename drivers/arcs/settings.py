@@ -200,24 +200,22 @@ class Departure:
         Raises `ArmMoved` while it moves, `SettingsChanged` if a pose would refer to another tool, `RobotNotSafe`,
         `NotPowered`.
         """
-        await self._require_rest("take up")
+        here = await self._resting("take up")
         await self._require_settings("take up")
-        self.left = await self._controller.pose()
-        return self.left
+        self.left = here
+        return here
 
     async def confirm(self) -> None:
         """Check that all is as it was left. Raises `RobotNotSafe`, `NotPowered`, `SettingsChanged`, then `ArmMoved`."""
         await self._require_settings("confirm")
-        await self._require_rest("confirm")
-        self._require_place("confirm", await self._controller.pose())
+        self._require_place("confirm", await self._resting("confirm"))
 
     async def ready(self, op: str, limits: Limits, poses: Sequence[Pose]) -> Pose:
         """Return where the arm is, once it may go from there through `poses`.
 
         Raises as `confirm` does, and `LimitExceeded` if a line would leave the limits.
         """
-        await self._require_rest(op)
-        start = await self._controller.pose()
+        start = await self._resting(op)
         lines = list(itertools.pairwise([start, *poses]))
         if self._moved(start) or any(b.z_mm < a.z_mm - DOWN_MM for a, b in lines):
             await self._require_settings(op)  # with another tool, the same place would look like another
@@ -233,14 +231,16 @@ class Departure:
             raise NotPowered(DEVICE, op)
         require_same(op, self._settings, current)
 
-    async def _require_rest(self, op: str) -> None:
+    async def _resting(self, op: str) -> Pose:
+        """Where the arm rests. Raises `ArmMoved` if it moves, `RobotNotSafe` if a safety stop holds its path."""
         loop = asyncio.get_running_loop()
         until_s = loop.time() + RESTS_S
         while not await self._controller.at_rest():
             if loop.time() > until_s:
-                await self._controller.require_safe(op)  # a safety stop holds its path: that is the cause to report
+                await self._controller.require_safe(op)
                 raise ArmMoved(DEVICE, op, *self._off(await self._controller.pose()), moving=True)
             await asyncio.sleep(POLL_S)
+        return await self._controller.pose()
 
     def _require_place(self, op: str, here: Pose) -> None:
         if self._moved(here):

@@ -87,12 +87,22 @@ async def test_a_brush_that_is_not_square_to_the_flange_is_pressed_upright(make_
     assert lean(pose_of(forward(cabinet.cabinet.joints())))[0] == pytest.approx(2.5, abs=0.05)
 
 
-@pytest.mark.parametrize("method", ["setTcpOffset", "setPayload", "setCollisionLevel"])
+@pytest.mark.parametrize(
+    ("method", "code", "error", "words"),
+    [
+        *((method, -5, MotionRefused, method) for method in ("setTcpOffset", "setPayload", "setCollisionLevel")),
+        *(
+            # a return code is no proof
+            ("setTcpOffset", code, SettingsChanged, r"tool offset is \(0, 0, 0\) mm, .*, not \(0, 0, 180\) mm")
+            for code in (0, 13)
+        ),
+    ],
+)
 async def test_what_the_controller_does_not_take_keeps_the_power_off(
-    make_arm: MakeArm, cabinet: ArcsServer, method: str
+    make_arm: MakeArm, cabinet: ArcsServer, method: str, code: int, error: type[Exception], words: str
 ):
-    cabinet._methods[f"rob1.RobotConfig.{method}"] = lambda _: -5
-    with pytest.raises(MotionRefused, match=method):
+    cabinet._methods[f"rob1.RobotConfig.{method}"] = lambda _: code
+    with pytest.raises(error, match=words):
         await enabled(make_arm, payload_kg=0.4, collision_level=8)
     assert cabinet.cabinet.power.mode == RobotMode.POWER_OFF
 
@@ -258,14 +268,6 @@ async def test_an_arm_without_power_is_not_as_it_was_left_and_enabling_it_powers
             await refused
     await arm.enable()
     await arm.move(LOW, **QUICK)
-
-
-@pytest.mark.parametrize("code", [0, 13])
-async def test_a_return_code_is_no_proof_that_the_tool_was_set(make_arm: MakeArm, cabinet: ArcsServer, code: int):
-    cabinet._methods["rob1.RobotConfig.setTcpOffset"] = lambda _: code
-    with pytest.raises(SettingsChanged, match=r"tool offset is \(0, 0, 0\) mm, .*, not \(0, 0, 180\) mm"):
-        await enabled(make_arm)
-    assert cabinet.cabinet.power.mode == "PowerOff"
 
 
 def test_a_tool_that_is_read_back_in_other_angles_is_the_same_tool_and_one_turned_a_little_is_another():
