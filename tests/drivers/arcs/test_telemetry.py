@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import math
 import random
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -24,7 +23,7 @@ from brushloop.drivers.arcs.wire import FrameDecoder, encode
 from brushloop.drivers.devices import Pose, PoseSample, QueuedLine, Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, ProtocolViolation, Stale
 from brushloop.drivers.geometry import brush_pose, distance
-from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
+from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer, topic_of
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 from brushloop.drivers.sim.rig import HOST
 from tests.drivers.arcs.conftest import MakeArm
@@ -36,14 +35,19 @@ POSE = ["R1_actual_TCP_pose"]
 Serve = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 
 
-def test_a_topic_is_the_one_that_the_makers_client_sends():
-    theirs = cbor2.loads(
-        b"\x82\x18d\xa5fchanel\x00ifrequency\xfaBH\x00\x00hsegments\x82kR1_actual_qrR1_actual_TCP_poseito_server\xf4gtrigger\x1aAAAA"
-    )
-    [ours] = FrameDecoder().feed(encode_topic(0, ["R1_actual_q", "R1_actual_TCP_pose"], 50.0))
-    command, topic = cbor2.loads(ours)
-    assert (command, {**topic, "trigger": 0x41414141}) == (100, theirs[1])
+MAKERS_TOPIC = (
+    b"\x82\x18d\xa5fchanel\x00ifrequency\xfaBH\x00\x00hsegments\x82kR1_actual_qrR1_actual_TCP_pose"
+    b"ito_server\xf4gtrigger\x1aAAAA"
+)
+
+
+def test_a_topic_is_the_one_that_the_makers_client_sends_and_is_understood():
+    names = ["R1_actual_q", "R1_actual_TCP_pose"]
+    [payload] = FrameDecoder().feed(encode_topic(0, names, 50.0))
+    command, topic = cbor2.loads(payload)
+    assert [command, {**topic, "trigger": 0x41414141}] == cbor2.loads(MAKERS_TOPIC)
     assert type(topic["frequency"]) is float
+    assert topic_of(MAKERS_TOPIC) == (0, 50.0, names)
 
 
 def says(*pieces: bytes, then: str = "silence") -> Serve:
@@ -214,59 +218,20 @@ async def test_where_both_ways_are_silent_the_pose_goes_stale(rtde: RtdeServer, 
     arm.latest()  # fresh again by itself
 
 
-# ---------------------------------------------------------------- what the loopback controller pushes
-
-
-class Client:
-    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self.reader, self.writer = reader, writer
-        self.decoder = FrameDecoder()
-
-    async def pushes(self, seconds: float) -> list[Any]:
-        got: list[Any] = []
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(seconds):
-                while data := await self.reader.read(65536):
-                    got += [cbor2.loads(p) for p in self.decoder.feed(data)]
-        return got
-
-
-@pytest.fixture
-async def client(rtde: RtdeServer) -> AsyncIterator[Client]:
-    """A client that has been greeted."""
-    client = Client(*await asyncio.open_connection(HOST, rtde.port))
-    await client.reader.readuntil(b"}\n\n")
-    yield client
-    client.writer.close()
-    await client.writer.wait_closed()
-
-
-async def test_the_makers_own_bytes_subscribe(client: Client):
-    client.writer.write(
-        b"SOF\x00\x00\\\x82\x18d\xa5fchanel\x00ifrequency\xfaBH\x00\x00hsegments\x82kR1_actual_qrR1_actual_TCP_poseito_server\xf4gtrigger\x1aAAAA"
-    )
-    chanel, q, pose = (await client.pushes(0.3))[-1]
-    assert (chanel, len(q)) == (0, 6)
-    assert pose[:3] == pytest.approx([0.25, -0.23, 0.44])
-    client.writer.write(
-        b"SOF\x00\x009\x82\x18d\xa5fchanel\x00ifrequency\xfa\x00\x00\x00\x00hsegments\x80ito_server\xf4gtrigger\x00"
-    )
-    await client.pushes(0.05)
-    assert await client.pushes(0.1) == []
-
-
 async def test_where_the_arm_rested_between_two_pushes_is_reported_where_time_runs_fast(
-    client: Client, cabinet: ArcsServer
+    rtde: RtdeServer, cabinet: ArcsServer
 ):
-    client.writer.write(encode_topic(0, ["R1_actual_TCP_pose", "timestamp"], 10.0))
-    await client.pushes(0.15)
+    stream = RtdeStream(HOST, rtde.port)
+    await stream.open(["R1_actual_TCP_pose", "timestamp"], 10.0)
+    await stream.samples()
     motion, now_s = cabinet.cabinet.world.motion, cabinet.cabinet.now_s()
     # The flange moves for a second of the arm's time, which is half of what lies between two pushes.
     for z_mm in (250.0, 260.0):
         motion.add(brush_pose(250.0, -230.0, z_mm), 100.0, 1000.0, now_s)
-    got = [(round(pose[2], 6), at_s) for _, pose, at_s in await client.pushes(0.3)]
-    assert 0.43 in [z_m for z_m, _ in got]
-    assert got == sorted(got, key=lambda sample: sample[1])
+    pushed = [sample for _ in range(3) for sample in await stream.samples()]
+    await stream.close()
+    assert 0.43 in [round(pose[2], 6) for pose, _ in pushed]
+    assert pushed == sorted(pushed, key=lambda sample: sample[1])
 
 
 # ---------------------------------------------------------------- the lag
