@@ -7,7 +7,6 @@ changed to make a figure better; a new set gets a new name.
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -15,6 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from brushloop.calibrate.board.lens import apply
+from brushloop.calibrate.board.pix2len import local_scale
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.brush.brush import BrushSpec
@@ -108,57 +109,15 @@ def sheet(rig: int, presses: int, seed: int = 0) -> Shot:
     return _photographed(world, tuple(anchors))
 
 
-def lens_views(rig: int, count: int, seed: int = 0) -> list[Gray]:
-    """Photographs of the rig's board held at many slants before this camera's lens, for its intrinsics."""
-    rng = np.random.default_rng([seed, rig, 20_000])
-    view = CAMERAS[rig]
-    optics, table = Optics(view, 1), Table()
-    board = board_of(table)
-    px = 5.0
-    size = (round(board.squares[0] * board.square_mm * px), round(board.squares[1] * board.square_mm * px))
-    drawn = cv2.aruco.CharucoBoard(
-        board.squares,
-        board.square_mm,
-        board.marker_mm,
-        cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary)),
-    )
-    picture = cv2.copyMakeBorder(drawn.generateImage(size), 40, 40, 40, 40, cv2.BORDER_CONSTANT, value=255)
-    middle_mm = np.array([board.squares[0], board.squares[1]]) * board.square_mm / 2
-    # picture pixel (centres on integers) -> mm from the board's middle
-    to_mm = np.array(
-        [[1 / px, 0, (0.5 - 40) / px - middle_mm[0]], [0, 1 / px, (0.5 - 40) / px - middle_mm[1]], [0, 0, 1]]
-    )
-    views: list[Gray] = []
-    for _ in range(count):
-        turn, _jacobian = cv2.Rodrigues(np.array([rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), rng.uniform(-3, 3)]))
-        away_mm = np.array([rng.uniform(-60, 60), rng.uniform(-50, 50), rng.uniform(330, 480)])
-        pose = np.column_stack([turn[:, 0], turn[:, 1], away_mm])
-        straight = cv2.warpPerspective(
-            picture, optics.camera_matrix @ pose @ to_mm, (view.width_px, view.height_px), borderValue=150
-        )
-        bent = cv2.GaussianBlur(optics.distort(straight.astype(np.uint8)), (0, 0), view.blur_px).astype(np.float32)
-        noisy = bent * 0.85 + rng.normal(0.0, view.noise, bent.shape)
-        views.append(np.clip(noisy, 0, 255).astype(np.uint8))
-    return views
-
-
 def true_scale(shot: Shot, pixel: tuple[float, float]) -> float:
     """True mm per pixel at one pixel of the photograph as it was taken, by finite differences of the true optics."""
-    step = 0.5
-    start = shot.optics.homography
-    around = np.array(pixel) + step * np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
-    straight = cv2.undistortPointsIter(
-        around[:, None],
-        shot.optics.camera_matrix,
-        shot.optics.distortion,
-        np.eye(3),
-        shot.optics.camera_matrix,
-        (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12),
-    ).reshape(-1, 2)
-    mapped = np.column_stack([straight, np.ones(4)]) @ np.linalg.inv(start).T
-    left, right, up, down = mapped[:, :2] / mapped[:, 2:]
-    across, along = right - left, down - up
-    return float(np.sqrt(abs(across[0] * along[1] - across[1] * along[0]))) / (2 * step)
+    camera, until = shot.optics.camera_matrix, (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+
+    def to_paper(pixels: Floats) -> Floats:
+        straight = cv2.undistortPointsIter(pixels[:, None], camera, shot.optics.distortion, np.eye(3), camera, until)
+        return apply(np.linalg.inv(shot.optics.homography), straight.reshape(-1, 2))
+
+    return local_scale(to_paper, np.array(pixel))
 
 
 def true_mask(shot: Shot, window_mm: tuple[float, float, float, float], px_per_mm: float) -> NDArray[np.bool_]:
@@ -172,17 +131,9 @@ def true_mask(shot: Shot, window_mm: tuple[float, float, float, float], px_per_m
     return np.asarray(window, np.float32) >= INK
 
 
-def heading_free_window(anchor_mm: tuple[float, float]) -> tuple[float, float, float, float]:
-    """38 x 38 mm around a press: the field that strokes are compared on."""
-    side = 38.0
-    return anchor_mm[0] - 0.76 * side, anchor_mm[1] - 0.5 * side, side, side
-
-
 def _photographed(world: World, anchors: tuple[tuple[float, float], ...]) -> Shot:
     scene = Scene(world)
     world.version += 1
     table = world.config.table
-    image = scene.render(brush_pose(*world.config.home_mm))
-    # The arm stands where it hides no corner.
-    assert math.isfinite(float(image.mean()))
+    image = scene.render(brush_pose(*world.config.home_mm))  # the arm stands where it hides no corner
     return Shot(image, scene.optics, board_of(table), anchors, world.paper.density, table.sheet_mm)

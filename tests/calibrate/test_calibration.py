@@ -8,7 +8,6 @@ import hashlib
 import re
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -24,13 +23,10 @@ from brushloop.drivers.sim.config import SimConfig, Table, View
 from brushloop.drivers.sim.scene import Scene
 from brushloop.drivers.sim.world import World
 from brushloop.sessions.records import Stroke
-from tests.calibrate.given import CALIBRATION
+from tests.calibrate.given import CALIBRATION, photographed
 from tests.calibrate.simulated_rigs import board_of
 from tests.command import brushloop
 from tests.photographed import imported_presses
-
-if TYPE_CHECKING:
-    from conftest import Photographed
 
 VIEW = View(width_px=1024, height_px=768, px_per_mm=3.125)
 SPEC, SHEET_MM = board_of(Table()), Table().sheet_mm
@@ -46,9 +42,7 @@ def board() -> np.ndarray:
     return sheet(VIEW)
 
 
-def test_half_a_board_is_flagged_and_a_mirrored_one_is_refused(
-    photographed: Photographed, tmp_path: Path, board: np.ndarray
-) -> None:
+def test_half_a_board_is_flagged_and_a_mirrored_one_is_refused(tmp_path: Path, board: np.ndarray) -> None:
     half = board.copy()
     half[:, :614] = 70
     for image, warned in ((half, True), (board, False)):
@@ -64,9 +58,7 @@ def test_half_a_board_is_flagged_and_a_mirrored_one_is_refused(
     assert not (session / "calibration").exists()
 
 
-def test_a_camera_that_was_touched_before_the_last_view_of_the_board_is_said(
-    photographed: Photographed, tmp_path: Path, board: np.ndarray
-) -> None:
+def test_a_camera_that_was_touched_before_the_last_view_of_the_board_is_said(tmp_path: Path, board: np.ndarray) -> None:
     moved = sheet(dataclasses.replace(VIEW, centre_mm=(VIEW.centre_mm[0] + 2.0, VIEW.centre_mm[1])))
     blank = np.full_like(board, 220)
     session = photographed(tmp_path / "moved", SPEC, [moved, blank, board, board], sheet_mm=SHEET_MM)
@@ -76,7 +68,7 @@ def test_a_camera_that_was_touched_before_the_last_view_of_the_board_is_said(
     assert unseen.startswith("2 min before the last view of the board, it is not seen: is blank")
 
 
-def test_what_has_no_board_cannot_be_calibrated(photographed: Photographed, tmp_path: Path) -> None:
+def test_what_has_no_board_cannot_be_calibrated(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match="holds no view of the board"):
         calibrate_session(CalibrateRequest(photographed(tmp_path / "none", SPEC, [])))
     (tmp_path / "photos").mkdir()
@@ -85,9 +77,7 @@ def test_what_has_no_board_cannot_be_calibrated(photographed: Photographed, tmp_
         calibrate_session(CalibrateRequest(pressed))
 
 
-def test_the_calibration_of_another_session_is_refused(
-    photographed: Photographed, tmp_path: Path, board: np.ndarray
-) -> None:
+def test_the_calibration_of_another_session_is_refused(tmp_path: Path, board: np.ndarray) -> None:
     stroke = Stroke(stroke_id="s", kind="press", still=0, anchor_mm=(100.0, 80.0))
     one, other = (photographed(tmp_path / name, SPEC, [board], [(stroke, board)]) for name in ("one", "other"))
     made = calibrate_session(CalibrateRequest(one))
@@ -97,7 +87,7 @@ def test_the_calibration_of_another_session_is_refused(
 
 
 def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
-    photographed: Photographed, tmp_path: Path, board: np.ndarray, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, board: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     session = photographed(tmp_path / "s", SPEC, [board], sheet_mm=SHEET_MM)
     write_bytes = Path.write_bytes

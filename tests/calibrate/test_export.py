@@ -6,7 +6,6 @@ import csv
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -26,10 +25,8 @@ from brushloop.sessions.imports import ImportOptions
 from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Check, Quality, Stroke, Topic, Wrench
+from tests.calibrate.given import photographed
 from tests.calibrate.simulated_rigs import sheet, true_mask
-
-if TYPE_CHECKING:
-    from conftest import Photographed
 
 
 @pytest.fixture
@@ -138,7 +135,7 @@ def test_names_that_a_file_system_would_refuse_become_names(make, tmp_path, to):
 # Crops
 
 
-def test_crops_and_masks_lie_over_the_true_marks(photographed: Photographed, tmp_path: Path, to: Path) -> None:
+def test_crops_and_masks_lie_over_the_true_marks(tmp_path: Path, to: Path) -> None:
     shot = sheet(0, 2)
     strokes = [
         Stroke(stroke_id=f"s{k}", kind="press", still=0, depth_mm=13.0, tilt_deg=5.0, anchor_mm=anchor)

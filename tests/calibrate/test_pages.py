@@ -6,7 +6,7 @@ import base64
 import re
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from xml.etree import ElementTree
 
 import cv2
@@ -28,12 +28,9 @@ from brushloop.calibrate.writing.compare import Character, WritingComparison, wr
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 from brushloop.sessions.records import Header, Source, Stroke
 from tests.browser import BROWSER, content_widths_px
-from tests.calibrate.given import CALIBRATION
+from tests.calibrate.given import CALIBRATION, photographed
 from tests.calibrate.records import loop_record
 from tests.photographed import imported, photograph
-
-if TYPE_CHECKING:
-    from conftest import Photographed
 
 SPEC = BoardSpec(squares=(9, 7), square_mm=20.0, marker_mm=15.0, dictionary="DICT_5X5_100", origin_mm=(0.0, 0.0))
 TWIN = "simulated bristle bundle (twin of 2026-03-02-grid-01)"
@@ -60,7 +57,7 @@ def run(*arguments: object) -> str:
 
 
 @pytest.fixture(scope="module")
-def pages(photographed: Photographed, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """A page of every command but `train` (tests/model/test_train.py), by the command's name."""
     folder = tmp_path_factory.mktemp("pages")
     session = photographed(folder / "2026-03-02-board-01", SPEC, [board()], sheet_mm=(100.0, 80.0))

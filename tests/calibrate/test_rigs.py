@@ -8,6 +8,7 @@ import pytest
 from brushloop.calibrate.board.detect import find_board
 from brushloop.calibrate.board.lens import unknown_lens
 from brushloop.calibrate.board.pix2len import Plane, fit_plane, paper_mm
+from brushloop.calibrate.compare import field_around
 from brushloop.calibrate.stroke import PX_PER_MM
 from brushloop.calibrate.stroke.preprocess import prepare
 from brushloop.calibrate.stroke.rectify import rectify_by
@@ -16,7 +17,6 @@ from tests.calibrate.simulated_rigs import (
     CAMERAS,
     Shot,
     boards,
-    heading_free_window,
     sheet,
     true_mask,
     true_scale,
@@ -53,7 +53,7 @@ def strokes(rig: int, presses: int) -> tuple[list[float], float]:
 
 
 def overlap(shot: Shot, plane: Plane, anchor: tuple[float, float]) -> float:
-    window = heading_free_window(anchor)
+    window = field_around(anchor)
     raster = rectify_by(shot.image, plane, window, "rig")
     at = ((anchor[0] - window[0]) * PX_PER_MM, (window[1] + window[3] - anchor[1]) * PX_PER_MM)
     mask = prepare(raster, at, "rig").mask

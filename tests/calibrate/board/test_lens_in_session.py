@@ -6,7 +6,6 @@ Loopback rig, its barrel camera (k1 = -0.15).
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -14,8 +13,7 @@ from typer.testing import CliRunner
 
 from brushloop.__main__ import app
 from brushloop.calibrate.artefact import current, load_artefact
-from brushloop.calibrate.board.detect import find_board
-from brushloop.calibrate.board.lens import Lens, fit_lens, read_lens
+from brushloop.calibrate.board.lens import Lens, read_lens
 from brushloop.calibrate.board.pix2len import see_board
 from brushloop.calibrate.calibrated import calibrate_session as calibrate
 from brushloop.calibrate.commands import CalibrateRequest
@@ -27,11 +25,8 @@ from brushloop.calibrate.stroke import PX_PER_MM
 from brushloop.collect.tui.review_screen import Review
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Condition, Stroke
-from tests.calibrate.given import kept_lens
-from tests.calibrate.simulated_rigs import CAMERAS, Shot, lens_views, sheet, true_mask, true_scale
-
-if TYPE_CHECKING:
-    from conftest import Photographed
+from tests.calibrate.given import kept_lens, photographed
+from tests.calibrate.simulated_rigs import CAMERAS, Shot, sheet, true_mask, true_scale
 
 BARREL = 3
 WORST_SCALE = 2e-4
@@ -57,7 +52,7 @@ def calibrate_session(session: Path, lens: Path | None = None) -> Calibration:
     return calibrate(CalibrateRequest(session, lens)).calibration
 
 
-def collected(photographed: Photographed, folder: Path, shot: Shot, optics: Lens | None = None) -> Path:
+def collected(folder: Path, shot: Shot, optics: Lens | None = None) -> Path:
     strokes = [
         Stroke(
             stroke_id=f"s{k}",
@@ -84,10 +79,8 @@ def holds(made: Calibration, shot: Shot) -> None:
     assert off_px.max() * truth <= WORST_ANCHOR_MM
 
 
-def test_without_its_lens_a_bent_session_is_refused_with_the_remedy(
-    photographed: Photographed, tmp_path: Path, shot: Shot
-) -> None:
-    session = collected(photographed, tmp_path / "bent", shot)
+def test_without_its_lens_a_bent_session_is_refused_with_the_remedy(tmp_path: Path, shot: Shot) -> None:
+    session = collected(tmp_path / "bent", shot)
     with pytest.raises(CalibrationError, match=r"bent by .* px: .*`brushloop camera intrinsics`.*--lens") as refused:
         calibrate_session(session)
     assert refused.value.exit_code == 2
@@ -95,10 +88,8 @@ def test_without_its_lens_a_bent_session_is_refused_with_the_remedy(
     assert not (session / "calibration").exists()
 
 
-def test_a_lens_file_makes_scale_anchors_and_masks_right(
-    photographed: Photographed, tmp_path: Path, shot: Shot, lens: Path
-) -> None:
-    session = collected(photographed, tmp_path / "bent", shot)
+def test_a_lens_file_makes_scale_anchors_and_masks_right(tmp_path: Path, shot: Shot, lens: Path) -> None:
+    session = collected(tmp_path / "bent", shot)
     ran = CliRunner().invoke(app, ["calibrate", str(session), "--lens", str(lens)])
     assert ran.exit_code == 0, ran.output
     assert f"lens: lens file {lens.stem}" in ran.output
@@ -123,10 +114,8 @@ def test_a_lens_file_makes_scale_anchors_and_masks_right(
         prepare_press(capture, small)
 
 
-def test_a_session_that_was_collected_with_a_lens_needs_no_other(
-    photographed: Photographed, tmp_path: Path, shot: Shot, lens: Path
-) -> None:
-    session = collected(photographed, tmp_path / "own", shot, read_lens(lens))
+def test_a_session_that_was_collected_with_a_lens_needs_no_other(tmp_path: Path, shot: Shot, lens: Path) -> None:
+    session = collected(tmp_path / "own", shot, read_lens(lens))
     holds(calibrate_session(session), shot)
     for given, why in (
         (rig_lens(tmp_path / "wrong", 0.08), r"bent by .* of another camera, or of another focus"),
@@ -152,10 +141,8 @@ def test_the_quick_look_at_a_board_knows_a_lens_too(tmp_path: Path, shot: Shot, 
         see_board(np.ascontiguousarray(shot.image[:, :-8]), shot.board, lens=known)
 
 
-def test_the_review_looks_through_the_lens_that_the_session_recorded(
-    photographed: Photographed, tmp_path: Path, shot: Shot, lens: Path
-) -> None:
-    session = collected(photographed, tmp_path / "own", shot, read_lens(lens))
+def test_the_review_looks_through_the_lens_that_the_session_recorded(tmp_path: Path, shot: Shot, lens: Path) -> None:
+    session = collected(tmp_path / "own", shot, read_lens(lens))
     review = Review(session)
     assert review.not_compared == ""
     for seen in review.captures:
@@ -170,19 +157,9 @@ def test_the_review_looks_through_the_lens_that_the_session_recorded(
     assert alike[1] == 2
 
 
-def test_the_review_says_why_it_compares_nothing(photographed: Photographed, tmp_path: Path, shot: Shot) -> None:
-    session = collected(photographed, tmp_path / "damaged", shot)
+def test_the_review_says_why_it_compares_nothing(tmp_path: Path, shot: Shot) -> None:
+    session = collected(tmp_path / "damaged", shot)
     (session / "rig.effective.json").write_text('{"board": 7}')
     review = Review(session)
     assert "rig.effective.json: board: Input should be" in review.not_compared
     assert review.pictures(review.captures[0]).photo.shape == shot.image.shape
-
-
-@pytest.mark.soak
-@pytest.mark.timeout(900)
-@pytest.mark.parametrize("rig", [1, 2, 3, 4])
-def test_a_lens_from_slanted_boards_carries_a_session(photographed: Photographed, tmp_path: Path, rig: int) -> None:
-    views = [find_board(image, sheet(rig, 1).board, f"{k}") for k, image in enumerate(lens_views(rig, 12))]
-    lens = fit_lens(views, "a board", {}, {}).save(tmp_path)
-    seen = sheet(rig, 15)
-    holds(calibrate_session(collected(photographed, tmp_path / "s", seen), lens), seen)
