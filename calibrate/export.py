@@ -27,7 +27,6 @@ from brushloop.sessions.messages import PNG_START, encode_png
 from brushloop.sessions.records import Header, Stroke, Topic
 from brushloop.sessions.terminal import Progress, counted, unseen
 
-FORMATS = ("csv", "parquet")
 PATCH_COLUMNS = ("cell_x_mm", "cell_y_mm", "cell_width_mm", "cell_height_mm")
 Row = dict[str, Any]
 
@@ -65,8 +64,8 @@ def export(request: ExportRequest, progress: Progress = unseen) -> Exported:
     be read; nothing is left behind then.
     """
     out, kind, crops = request.out, request.kind, request.crops
-    if kind not in FORMATS:
-        raise InputError("--format", f"{kind!r}, allowed: {', '.join(FORMATS)}")
+    if kind not in ("csv", "parquet"):
+        raise InputError("--format", f"{kind!r}, allowed: csv, parquet")
     session = Session(request.session)
     recording = session.recording
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -114,8 +113,7 @@ def _write_pictures(
             continue
         row = {"episode_index": index, "file": ""} | _row(session.header, press.capture.stroke)
         row["dip_to_touch_unlike"] = float(press.name in odd) if press.name in waits else None
-        row["quality"] = session.verdicts.get(press.name, "")
-        row |= {"marked_bad": press.capture.bad} | values
+        row |= {"quality": session.verdicts.get(press.name, ""), "marked_bad": press.capture.bad} | values
         for name, data in pictures.items():
             path = _file_name(index, press.name, name, data)
             (folder / path).parent.mkdir(exist_ok=True)
@@ -144,14 +142,11 @@ def _row(header: Header, stroke: Stroke) -> Row:
         "reached_mm": stroke.reached_mm,
         "tilt_deg": stroke.tilt_deg,
         "dip_to_touch_s": stroke.dip_to_touch_s,
-        "dip_to_touch_unlike": None,
         "heading_deg": stroke.heading_deg,
         **_pair("anchor_{}_mm", stroke.anchor_mm),
         **_pair("anchor_{}_px", stroke.anchor_px),
         **_pair("px_per_mm_{}", stroke.px_per_mm),
         **dict(zip(PATCH_COLUMNS, stroke.cell_mm or (None,) * len(PATCH_COLUMNS), strict=True)),
-        "quality": "",
-        "marked_bad": "",
         "licence": header.licence,
         **{f"commanded_{name}": value for name, value in stroke.commanded.items()},
     }

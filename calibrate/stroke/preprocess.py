@@ -75,16 +75,11 @@ def flatten(raster: Gray, px_per_mm: float = PX_PER_MM) -> Soft:
     return cast("Soft", raster.astype(np.float32) / np.maximum(paper, 1.0))
 
 
-def quadratic(shape: tuple[int, ...]) -> Floats:
-    """The terms of a quadratic surface over an image, (h, w, 6); x and y run from -1 to 1."""
-    height, width = shape
-    y, x = np.mgrid[-1.0 : 1.0 : height * 1j, -1.0 : 1.0 : width * 1j]
-    return np.asarray(np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1), np.float64)
-
-
 def light_surface(small: Gray) -> Floats:
     """Fit a quadratic surface to the paper, (h, w), at least 1; pixels well below it are ink and are left out."""
-    basis = quadratic(small.shape).reshape(-1, 6)
+    height, width = small.shape
+    y, x = np.mgrid[-1.0 : 1.0 : height * 1j, -1.0 : 1.0 : width * 1j].reshape(2, -1)
+    basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
     values = small.astype(np.float64).ravel()
     paper = np.ones(values.size, np.bool_)
     surface = values

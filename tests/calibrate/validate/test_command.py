@@ -183,12 +183,12 @@ def test_a_worker_with_other_software_is_refused(cluster: Cluster) -> None:
 
 @needs_dask
 @pytest.mark.xdist_group("cluster")
-def test_jobs_come_back_whole_and_alike_though_a_worker_dies(cluster: Cluster, session: Path) -> None:
+def test_jobs_come_back_whole_and_alike_though_a_worker_dies(cluster: Cluster, session: Path, tmp_path: Path) -> None:
     program = f"""
 import os, signal
 from pathlib import Path
 from brushloop.calibrate.presses import prepare_job
-from brushloop.calibrate.work import cluster, threads
+from brushloop.calibrate.work import Store, cluster, threads
 from brushloop.sessions.recording import Recording
 captures = list(Recording(Path({str(session)!r})).captures()) * 3
 jobs = [(str(k), (one, None)) for k, one in enumerate(captures)]
@@ -196,12 +196,12 @@ def plain(results):
     return {{name: {{part: array.tolist() for part, array in arrays.items()}} for name, arrays in results}}
 there = {{}}
 with cluster({cluster.address!r}) as pool:
-    for name, press in pool.finished(prepare_job, iter(jobs)):
+    for name, press in pool.finished(prepare_job, iter(jobs), Store(Path({str(tmp_path)!r}, "there"))):
         there[name] = press
         if len(there) == 5:
             os.kill({cluster.workers[0].pid}, signal.SIGKILL)
 with threads(1) as pool:
-    here = dict(pool.finished(prepare_job, iter(jobs)))
+    here = dict(pool.finished(prepare_job, iter(jobs), Store(Path({str(tmp_path)!r}, "here"))))
 print(len(there), plain(there.items()) == plain(here.items()))
 """
     ran = subprocess.run(
