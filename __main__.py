@@ -177,7 +177,8 @@ def sim(
     """
     from brushloop.drivers.sim.brush.spec import load_brush
     from brushloop.drivers.sim.config import SimConfig, View
-    from brushloop.drivers.sim.serve import LabRefused, serve, serve_unknown
+    from brushloop.drivers.sim.lab import LabRefused, serve_unknown
+    from brushloop.drivers.sim.rig import serve
 
     if unknown is not None:
         if write_rig is not None or brush != Path("loopback") or arcs_port or camera_port:
@@ -197,7 +198,7 @@ def sim(
         head=pressed.head,
         view=View(fps=fps) if pressed.noise_gray is None else View(fps=fps, noise=pressed.noise_gray),
     )
-    serve(config, write_rig, idle_exit, say, control=control)
+    serve(config, write_rig, idle_exit, say, control)
 
 
 @groups["sim"].command()

@@ -298,7 +298,7 @@ class _Person:
             "r: radius": f"{brush.radius_mm:g}",
             "l: length": f"{brush.length_mm:g}",
             "can bus": lab.can_bus,
-            "serial line": "" if lab.rig.ink is None else lab.rig.ink.path,
+            "serial line": "" if lab.ink is None else lab.ink.path,
         }
         return next((answer for part, answer in answers.items() if part in words), "")
 

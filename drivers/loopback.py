@@ -133,16 +133,6 @@ TURNS_TO_BEGIN = 3
 """Turns of the event loop from accepting a connection to the first step of its task."""
 
 
-class NotLoopback(ValueError):
-    """A simulated device was asked to listen where other machines could reach it."""
-
-    exit_code: ClassVar[int] = 2
-
-    def __init__(self, host: str) -> None:
-        self.host = host
-        super().__init__(f"host = {host!r}: a loopback rig is served on a loopback address only, such as 127.0.0.1")
-
-
 class LoopbackServer:
     """A TCP server whose clients are tasks; `converse` speaks to one of them."""
 
@@ -159,10 +149,11 @@ class LoopbackServer:
     async def start(self, host: str, port: int) -> None:
         """Listen; with `port` 0 the system chooses `self.port`.
 
-        Raises `NotLoopback` unless `host` is a loopback address; a host name could resolve to any address.
+        Raises ValueError unless `host` is a loopback address, so that no other machine can reach a simulated device; a
+        host name could resolve to any address.
         """
-        if not _is_loopback(host):
-            raise NotLoopback(host)
+        if not ipaddress.ip_address(host).is_loopback:
+            raise ValueError(f"host = {host!r}: a loopback rig is served on a loopback address only, such as 127.0.0.1")
         self._server = await asyncio.start_server(self._serve, host, port)
         self.port = self._server.sockets[0].getsockname()[1]
 
@@ -195,9 +186,9 @@ class LoopbackServer:
         self._clients.add(task)
         try:
             await self.converse(reader, writer)
-        except (ConnectionError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
+        except (ConnectionError, TimeoutError, asyncio.IncompleteReadError):
             pass  # the client disconnected
-        except ProtocolViolation:
+        except (ProtocolViolation, asyncio.LimitOverrunError):
             pass  # the client does not speak the protocol
         except asyncio.CancelledError:
             pass  # `stop`: the streams module would report a cancelled handler as an error
@@ -206,10 +197,3 @@ class LoopbackServer:
             writer.close()
             with contextlib.suppress(ConnectionError, asyncio.CancelledError):
                 await writer.wait_closed()
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False

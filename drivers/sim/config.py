@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from dataclasses import dataclass, field
 from typing import Literal
@@ -41,7 +40,9 @@ class Table:
     @property
     def normal(self) -> tuple[float, float, float]:
         """Unit vector out of the sheet, in the paper frame (whose z is the base frame's)."""
-        return _normal(self.slope_deg)
+        about_x, about_y = (math.tan(math.radians(v)) for v in self.slope_deg)
+        length = math.sqrt(1.0 + about_x**2 + about_y**2)
+        return about_y / length, -about_x / length, 1.0 / length
 
     def to_paper(self, x_mm: float, y_mm: float) -> tuple[float, float]:
         """Convert x and y from the base frame to the paper frame."""
@@ -66,13 +67,6 @@ class Table:
     def above_mm(self, x_mm: float, y_mm: float, z_mm: float) -> float:
         """Distance from the sheet along its normal; negative below."""
         return (z_mm - self.surface_z_mm(x_mm, y_mm)) * self.normal[2]
-
-
-@functools.lru_cache
-def _normal(slope_deg: tuple[float, float]) -> tuple[float, float, float]:
-    about_x, about_y = (math.tan(math.radians(v)) for v in slope_deg)
-    length = math.sqrt(1.0 + about_x**2 + about_y**2)
-    return about_y / length, -about_x / length, 1.0 / length
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import itertools
 import math
-from collections import deque
 from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass
 from enum import StrEnum
@@ -18,7 +17,6 @@ from typing import Annotated, Any
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from brushloop.drivers.arcs.controller import SafetyMode
-from brushloop.drivers.devices import Pose
 from brushloop.drivers.sim.brush.spec import complaint
 from brushloop.drivers.sim.world import World
 
@@ -52,27 +50,21 @@ class Phase(StrEnum):
 
 def phase_of(world: World) -> Phase:
     """What the arm does now. Use it in the thread that owns the world."""
-    config, here, to = world.config, world.tool(), world.target()
-
-    def on_paper(pose: Pose) -> tuple[float, float, float]:
-        x_mm, y_mm = world.to_paper(pose.x_mm, pose.y_mm)
-        return x_mm, y_mm, config.table.above_mm(x_mm, y_mm, pose.z_mm)
-
-    x_mm, y_mm, above_mm = on_paper(here)
-    (size_x_mm, size_y_mm), end_mm = config.table.sheet_mm, above_mm if to is None else on_paper(to)[2]
-    over_well = math.dist((x_mm, y_mm), config.table.well_mm) <= config.table.well_radius_mm
-    over_sheet = 0.0 <= x_mm <= size_x_mm and 0.0 <= y_mm <= size_y_mm
-    if over_well and min(above_mm, end_mm) < config.table.well_depth_mm:
+    tip, to = world.tool(), world.target()
+    x_mm, y_mm, depth_mm = world.on_sheet(tip)
+    end_depth_mm = depth_mm if to is None else world.on_sheet(to)[2]
+    over_sheet = world.is_over_sheet(x_mm, y_mm)
+    if world.is_over_well(x_mm, y_mm) and max(depth_mm, end_depth_mm) > -world.config.table.well_depth_mm:
         return Phase.DIPPING
     if to is None:
-        if over_sheet and above_mm <= ON_PAPER_MM:
+        if over_sheet and depth_mm >= -ON_PAPER_MM:
             return Phase.PRESSED
-        return Phase.PARKED if math.dist(here.position_mm, config.home_mm) <= HOME_MM else Phase.RESTING
-    if over_sheet and above_mm < 0.0 and 0.0 <= above_mm - end_mm <= ALL_BUT_THERE_MM:
+        return Phase.PARKED if math.dist(tip.position_mm, world.config.home_mm) <= HOME_MM else Phase.RESTING
+    if over_sheet and depth_mm > 0.0 and 0.0 <= end_depth_mm - depth_mm <= ALL_BUT_THERE_MM:
         return Phase.PRESSED
-    if over_sheet and end_mm < above_mm and end_mm <= ON_PAPER_MM:
+    if over_sheet and end_depth_mm > depth_mm and end_depth_mm >= -ON_PAPER_MM:
         return Phase.DESCENDING
-    if over_sheet and end_mm > above_mm and above_mm <= LIFT_MM:
+    if over_sheet and end_depth_mm < depth_mm and depth_mm >= -LIFT_MM:
         return Phase.LIFTING
     return Phase.TRAVELLING
 
@@ -131,9 +123,9 @@ class Fault(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     press: Annotated[int, Field(ge=0, le=ALWAYS)] | None = None
     """Begins only while this many presses are on the paper: from lifting off one to lifting off the next."""
     count: Annotated[int, Field(ge=1, le=ALWAYS)] | None = None
-    """Number of strikes; 1 where neither this nor `for_s` is given."""
+    """Largest number of strikes; without `for_s` 1 by default."""
     for_s: Annotated[float, Field(gt=0.0, le=86_400.0)] | None = None
-    """Duration in real seconds from its beginning; the timeouts of drivers are in real time too."""
+    """Longest duration in real seconds from its beginning; the timeouts of drivers are in real time too."""
     late_s: Annotated[float, Field(ge=0.001, le=60.0)] = 0.3
     """How late a `late` reply or push of the robot comes, in real seconds."""
 
@@ -142,22 +134,21 @@ class Fault(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
         kinds = KINDS[self.device]
         if self.kind not in kinds:
             raise ValueError(f"kind = {self.kind!r} is not one of {self.device}'s: {', '.join(sorted(kinds))}")
-        if self.count is not None and self.for_s is not None:
-            raise ValueError("count and for_s exclude each other")
         if self.on is not None and self.device is not Device.ROBOT:
             raise ValueError(f"on = {self.on!r}: only the robot has methods")
-        if self.kind in STOPS and (self.for_s is not None or self.count not in (None, 1)):
-            raise ValueError(f"{self.kind} happens once and lasts until a person ends it: no count, no for_s")
         if self.by_itself and self.nth != 1:
             raise ValueError(f"nth = {self.nth} counts nothing here: {self.kind} of {self.device} waits for no request")
-        if "late_s" in self.model_fields_set and (self.kind != "late" or self.device is Device.INK):
-            raise ValueError("late_s goes with kind = 'late' of robot and telemetry only")
         return self
 
     @property
     def by_itself(self) -> bool:
         """True if it begins without a request."""
         return self.device is Device.INK or (self.kind in STOPS and self.on is None)
+
+    @property
+    def most_strikes(self) -> int:
+        """After this many it is over, if not before."""
+        return self.count or (1 if self.for_s is None else ALWAYS)
 
     def matches(self, op: str) -> bool:
         """Whether the fault waits for `op`, a method's full name."""
@@ -174,8 +165,6 @@ def fault_of(values: dict[str, Any]) -> Fault:
 
 
 TICK_S, IDLE_TICK_S = 0.002, 0.02
-KEPT = 100
-"""Finished faults that are still listed."""
 
 
 @dataclass(slots=True)
@@ -191,6 +180,11 @@ class Hung:
     until_s: float = math.inf
     """Real time at which `for_s` is over, once it has begun."""
 
+    def as_json(self) -> dict[str, Any]:
+        """Its number, its fault without defaults, and how often it has struck."""
+        fault = self.fault.model_dump(mode="json", exclude_defaults=True)
+        return {"id": self.ident, "fault": fault, "struck": self.struck}
+
 
 class FaultBoard:
     """Faults in the order in which they were added; of several that match one request the first strikes it."""
@@ -201,8 +195,8 @@ class FaultBoard:
         self._missing = missing
         self._idents = itertools.count(1)
         self._hanging: dict[int, Hung] = {}
-        self.over: deque[Hung] = deque(maxlen=KEPT)
-        """The newest finished faults."""
+        self.strikes = 0
+        """Of all faults so far."""
 
     def phase(self) -> Phase:
         """What the arm does now."""
@@ -228,9 +222,8 @@ class FaultBoard:
     @property
     def hanging(self) -> tuple[Hung, ...]:
         """Faults that are waiting or active."""
-        for hung in tuple(self._hanging.values()):
-            if self._world.clock.real_s() >= hung.until_s:
-                self._end(hung)
+        now_s = self._world.clock.real_s()
+        self._hanging = {ident: hung for ident, hung in self._hanging.items() if now_s < hung.until_s}
         return tuple(self._hanging.values())
 
     def meet(self, device: Device, op: str = "", kinds: Set[str] | None = None) -> Fault | None:
@@ -257,22 +250,20 @@ class FaultBoard:
         return None if fault is None else fault.kind
 
     async def watch(self, stop: Callable[[SafetyMode], None]) -> None:
-        """Begin faults that no request triggers, until cancelled; `stop` gets the mode of each safety stop."""
+        """Begin faults that no request triggers, until cancelled; `stop` as for `begin_due`."""
         while True:
-            for fault in self.due():
-                stop(STOPS[fault.kind])
+            self.begin_due(stop)
             await asyncio.sleep(TICK_S if self._hanging else IDLE_TICK_S)
 
-    def due(self) -> list[Fault]:
-        """Begin the faults that are due now without a request; return the stops among them, which are finished."""
-        stops: list[Fault] = []
+    def begin_due(self, stop: Callable[[SafetyMode], None]) -> None:
+        """Begin the faults that are due now without a request; `stop` gets the mode of a safety stop, over at once."""
         for hung in self.hanging:
             if hung.fault.by_itself and not hung.begun and self._holds(hung.fault):
                 self._begin(hung)
                 if hung.fault.kind in STOPS:
                     self._strike(hung)
-                    stops.append(hung.fault)
-        return stops
+                    self.take(hung.ident)
+                    stop(STOPS[hung.fault.kind])
 
     def _begin(self, hung: Hung) -> None:
         hung.begun = True
@@ -280,14 +271,11 @@ class FaultBoard:
             hung.until_s = self._world.clock.real_s() + hung.fault.for_s
 
     def _strike(self, hung: Hung) -> None:
+        self.strikes += 1
         hung.struck += 1
-        if hung.fault.for_s is None and hung.struck >= (hung.fault.count or 1):
-            self._end(hung)
+        if hung.struck >= hung.fault.most_strikes:
+            self.take(hung.ident)
 
     def _holds(self, fault: Fault) -> bool:
         on_paper = fault.press is None or len(self._world.presses) == fault.press
         return on_paper and (fault.phase is None or self.phase() is fault.phase)
-
-    def _end(self, hung: Hung) -> None:
-        if self.take(hung.ident):
-            self.over.append(hung)

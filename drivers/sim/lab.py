@@ -1,15 +1,6 @@
 """The unknown lab as a whole: the loopback rig on the ports of a real one, and a person with hands on its arm.
 
-| request, with `"do": "hand"` | what the person does |
-|---|---|
-| `{"act": "bring", "to": "pin", "index": 2}` | guides the tip to a thing, of `THINGS`, and lets go |
-| `{"act": "bring", "to": "board-corner", "corner": "lower left"}` | the same, for a corner of the board or sheet |
-| `{"act": "bring", "to": "hold-board", "index": 0}` | holds the print before the camera until the next act |
-| `{"act": "bring", "to": "push-sensor", "index": 0}` | pushes the tip: 0 toward the flange, 1 and 2 aside |
-| `{"act": "measure", "to": "square"}` | measures with calipers or a ruler: `square`, `marker`, `tool` |
-| `{"act": "mend"}` | corrects what is wrong, once the person was asked to: the trap's mistake ends |
-
-Every answer has `says`, what the person would say; `bring` has `reached` too.
+The person does what `brushloop sim hand` asks for, which docs/first-day.md and docs/loopback-controller.md explain.
 """
 
 from __future__ import annotations
@@ -20,11 +11,13 @@ import math
 import os
 import zlib
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, RobotMode
 from brushloop.drivers.arcs.wire import AUBOPE_PORT
@@ -49,13 +42,11 @@ from brushloop.drivers.sim.lab_facts import (
     over_sheet,
     trapped,
 )
-from brushloop.drivers.sim.rig import LoopbackRig
-from brushloop.drivers.sim.scene import Held, MjpegServer, Wall
+from brushloop.drivers.sim.rig import LoopbackRig, serve_until_over
+from brushloop.drivers.sim.scene import Held, MjpegServer
 
-TOUCHED = ("pin", "board-corner", "sheet-corner", "well-rim", "wash-rim")
-"""Things that the tip touches; it is brought to the others by eye."""
-BY_EYE_MM = 1.0
-"""Standard deviation of a tip that is brought near a thing by eye, along each axis."""
+HAND_MM, BY_EYE_MM = 0.3, 1.0
+"""Standard deviation of a tip that touches a thing, and of one that is brought near it by eye, along each axis."""
 SEEN_SIGMAS = 2.5
 """Errors beyond this many standard deviations are seen and corrected by the person."""
 UPRIGHT_DEG = 1.0
@@ -94,13 +85,16 @@ THINGS = (
     *("pin", "upright", "board-corner", "sheet-corner", "well", "well-rim", "wash-pot", "wash-rim"),
     *("park", "clear-view", "hold-board", "push-sensor"),
 )
+TOUCHED = ("pin", "board-corner", "sheet-corner", "well-rim", "wash-rim")
+"""Things that the tip touches; it is brought to the others by eye."""
+WALL_GRAY, WALL_NOISE = 185, 2.0
 ADDRESSES = 200
 """Labs of one seed that can be open at once on a machine."""
 _labs = itertools.count()
 
 
-class UnknownLab:
-    """`async with UnknownLab(seed) as lab:` serves until the block ends; `obey` asks the person for something.
+class UnknownLab(LoopbackRig):
+    """`async with UnknownLab(seed) as lab:` serves until the block ends; `hand` asks the person for something.
 
     An error of the hand depends on the seed, the thing, and how often it was asked for.
     """
@@ -117,7 +111,7 @@ class UnknownLab:
         """The addresses on the stickers of the cameras."""
         self.can_bus = f"{self.host}:{CAN_PORT}/{LOOPBACK_CHANNEL}"
         """The gateway and bus of the force sensor."""
-        config = replace(
+        served = replace(
             self.facts.config,
             arcs_port=ARCS_PORT,
             rtde_port=RTDE_PORT,
@@ -125,43 +119,32 @@ class UnknownLab:
             force_port=CAN_PORT,
             force_hz=self.facts.config.force_hz * min(max(rate, 1.0), MOST_ROUNDS),
         )
-        self.rig = LoopbackRig(config, self.host)
-        self.world = self.rig.world
-        self.cabinet = self.rig.arcs.cabinet
-        self.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
-        self.cabinet.payload = [self.facts.payload_kg, [0.0] * 3, [0.0] * 3, [0.0] * 6]
-        self._room = MjpegServer(Wall(self.world), View(fps=ROOM_FPS))
+        super().__init__(served, self.host)
+        self.arcs.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
+        self.arcs.cabinet.payload = [self.facts.payload_kg, [0.0] * 3, [0.0] * 3, [0.0] * 6]
+        self._noise = np.random.default_rng([seed, 17])
+        room = MjpegServer(self.world, self._wall, View(fps=ROOM_FPS))
+        self.servers[room] = CAMERA_PORTS[1 - self.facts.sheet_camera]
         self._older = LoopbackServer()
         """The software before ARCS: its port takes connections, and answers nothing that ARCS would."""
+        if trap is Trap.OLD_SOFTWARE:
+            del self.servers[self.arcs], self.servers[self.rtde]
+            self.servers[self._older] = AUBOPE_PORT
         self._asked: Counter[str] = Counter()
         self._touches = 0
         self._pulled: list[int] = []
         self._busy = asyncio.Lock()
         """The person does one thing at a time."""
 
-    async def __aenter__(self) -> UnknownLab:
-        await self.rig.__aenter__()
-        try:
-            await self._room.start(self.host, CAMERA_PORTS[1 - self.facts.sheet_camera])
-            if self.facts.trap is Trap.OLD_SOFTWARE:
-                await self.rig.arcs.stop()
-                await self.rig.rtde.stop()
-                await self._older.start(self.host, AUBOPE_PORT)
-        except BaseException:
-            await self.__aexit__()
-            raise
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        await self._older.stop()
-        await self._room.stop()
-        await self.rig.__aexit__()
+    def _wall(self, _tool: Pose) -> NDArray[np.uint8]:
+        """What the second camera sees: a wall, and no sheet."""
+        return self._noise.normal(WALL_GRAY, WALL_NOISE, (480, 640)).astype(np.uint8)
 
     def labels(self) -> list[str]:
         """What a person can read in the lab now: on labels, plugs, the print and the pendant."""
         facts, table, brush = self.facts, self.facts.config.table, self.facts.config.brush
         columns, rows = table.board_squares
-        ink = "none, a person pours" if self.rig.ink is None else f"{facts.config.ink_device} on {self.rig.ink.path}"
+        ink = "none, a person pours" if self.ink is None else f"{facts.config.ink_device} on {self.ink.path}"
         return [
             "an unknown lab; simulated: nothing measured in it is a result on paper",
             f"robot     the pendant shows the address {self.host}",
@@ -174,8 +157,8 @@ class UnknownLab:
             f"press at most {facts.max_depth_mm:g} mm",
         ]
 
-    async def obey(self, request: Mapping[str, object]) -> dict[str, Any]:
-        """Carry out a request as in the table above. Raises ValueError, with a one-line message, for an invalid one."""
+    async def hand(self, request: Mapping[str, object]) -> dict[str, Any]:
+        """What the person did: `says`, and for `bring` whether it was `reached`. Raises ValueError, with one line."""
         act, to = request.get("act"), str(request.get("to", ""))
         index, corner = request.get("index", 0), str(request.get("corner", ""))
         if type(index) is not int or not 0 <= index < 1000:
@@ -192,10 +175,10 @@ class UnknownLab:
                     raise ValueError(f"act = {act!r} is not one of bring, measure, mend")
 
     async def bring(self, to: str, index: int = 0, corner: str = "") -> dict[str, Any]:
-        """Carry out `bring`, as in the table above. Raises ValueError for a thing that the lab does not have."""
+        """Guide the tip to one of `THINGS`, or hold or push it. Raises ValueError for another thing or corner."""
         if to not in THINGS:
             raise ValueError(f"to = {to!r} is not one of {', '.join(THINGS)}")
-        self.rig.scene.held = self._grip(index) if to == "hold-board" else None
+        self.scene.held = self._grip(index) if to == "hold-board" else None
         if to == "hold-board":
             return {"reached": True, "says": "I hold the print before the camera."}
         if to == "push-sensor":
@@ -220,20 +203,21 @@ class UnknownLab:
             case Trap.CABLE_PULLED:
                 pulled, self._pulled = self._pulled, []
                 for ident in pulled:
-                    self.rig.faults.take(ident)
+                    self.faults.take(ident)
             case Trap.OLD_SOFTWARE:
                 await self._older.stop()
-                await self.rig.arcs.start(self.host, ARCS_PORT)
-                await self.rig.rtde.start(self.host, RTDE_PORT)
+                for server, port in ((self.arcs, ARCS_PORT), (self.rtde, RTDE_PORT)):
+                    self.servers[server] = port
+                    await server.start(self.host, port)
             case _:
-                self.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
+                self.arcs.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
                 if self.facts.config != was.config:
-                    self.rig.reconfigure(self.facts.config)
+                    self.reconfigure(self.facts.config)
         return f"I have seen to it: {was.trap.value}."
 
     def aim(self, to: str, index: int, name: str) -> Pose:
         """Pose of the tip for a thing. Raises ValueError for one that the lab does not have."""
-        rng, place = self._hand(to, index, name), self._place(to, name)
+        rng, place = self._luck(to, index, name), self._place(to, name)
         wrist_deg = azimuth_deg(place) + float(rng.normal(0.0, 5.0))
         tilt_deg, toward_deg = 0.0, 0.0
         if to == "pin":
@@ -244,7 +228,7 @@ class UnknownLab:
             wrist_deg += (0.0, 70.0, -70.0)[index // 4 % 3]
         elif to == "upright":
             wrist_deg += (0.0, 100.0, -100.0, 50.0, -50.0)[index % 5]
-        error_mm = _error_mm(rng, self.facts.hand_mm if to in TOUCHED else BY_EYE_MM)
+        error_mm = _error_mm(rng, HAND_MM if to in TOUCHED else BY_EYE_MM)
         x, y, z = (a + b for a, b in zip(place, error_mm, strict=True))
         aimed = held((x, y, z), wrist_deg=wrist_deg, tilt_deg=tilt_deg, toward_deg=toward_deg)
         about_x, about_y = np.radians(rng.normal(0.0, SQUARE_DEG if to == "upright" else UPRIGHT_DEG, 2)).tolist()
@@ -252,7 +236,7 @@ class UnknownLab:
 
     def _grip(self, index: int) -> Held:
         """How the board is held before the camera: each time at another slant and in another part of the picture."""
-        rng = self._hand("hold-board", index, "")
+        rng = self._luck("hold-board", index, "")
         view, table = self.facts.config.view, self.facts.config.table
         slant_deg, toward_deg, turn_deg, (x, y) = GRIPS[index % len(GRIPS)]
         size_x_mm, size_y_mm = board_size_mm(table)
@@ -281,38 +265,27 @@ class UnknownLab:
 
     def _place(self, to: str, name: str) -> Place:
         facts, table = self.facts, self.facts.config.table
-        match to:
-            case "pin":
-                return facts.pin_mm
-            case "board-corner" | "sheet-corner":
-                return corner(table, to.removesuffix("-corner"), self._meant(name))
-            case "well":
-                return table.to_base(*table.well_mm, DIP_ABOVE_BOTTOM_MM)
-            case "well-rim" | "wash-rim":
-                x, y = table.well_mm if to == "well-rim" else facts.wash_mm
-                return table.to_base(x, y + table.well_radius_mm, table.well_depth_mm)
-            case "wash-pot":
-                return table.to_base(*facts.wash_mm, DIP_ABOVE_BOTTOM_MM)
-            case "park" if facts.trap is Trap.PARK_IN_PICTURE:
-                return over_sheet(table, facts.park_mm[2] - table.paper_z_mm)
-            case "park":
-                return facts.park_mm
-            case "clear-view":
-                return facts.clear_mm
-            case "upright":
-                return over_sheet(table, UPRIGHT_ABOVE_MM)
-            case _:
-                raise ValueError(f"to = {to!r}: there is no such thing in this lab")
+        if to in ("board-corner", "sheet-corner"):  # the person may take one corner for another
+            if facts.swapped is not None and name in facts.swapped:
+                name = facts.swapped[1 - facts.swapped.index(name)]
+            return corner(table, to.removesuffix("-corner"), name)
+        places = {
+            "pin": facts.pin_mm,
+            "upright": over_sheet(table, UPRIGHT_ABOVE_MM),
+            "park": facts.park_mm,
+            "clear-view": facts.clear_mm,
+        }
+        for pot, (x, y) in (("well", table.well_mm), ("wash", facts.wash_mm)):
+            places[f"{pot}-rim"] = table.to_base(x, y + table.well_radius_mm, table.well_depth_mm)
+            places["well" if pot == "well" else "wash-pot"] = table.to_base(x, y, DIP_ABOVE_BOTTOM_MM)
+        if facts.trap is Trap.PARK_IN_PICTURE:
+            places["park"] = over_sheet(table, facts.park_mm[2] - table.paper_z_mm)
+        return places[to]
 
-    def _meant(self, name: str) -> str:
-        """The corner that the person takes for the one that was asked for."""
-        words, swapped = " ".join(name.replace("-", " ").replace("_", " ").split()), self.facts.swapped
-        return swapped[1 - swapped.index(words)] if swapped is not None and words in swapped else words
-
-    def _hand(self, to: str, index: int, name: str) -> np.random.Generator:
+    def _luck(self, to: str, index: int, name: str) -> np.random.Generator:
         key = f"{to} {index} {name}"
         self._asked[key] += 1
-        return np.random.default_rng([self.facts.seed, 31, zlib.crc32(key.encode()), self._asked[key]])
+        return np.random.default_rng([self.facts.config.seed, 31, zlib.crc32(key.encode()), self._asked[key]])
 
     async def _push(self, index: int) -> None:
         """Push the tip for `PUSH_S`, in the direction of this index of `PUSHES`."""
@@ -324,7 +297,7 @@ class UnknownLab:
 
     async def _take_hold(self) -> str | None:
         """Power the arm at the pendant; return why it cannot be guided."""
-        world, power = self.world, self.cabinet.power
+        world, power = self.world, self.arcs.cabinet.power
         if power.safety not in MOVING_ALLOWED:
             return f"The pendant shows {power.safety.value}: that has to be ended first."
         if world.target() is not None or world.motion.held:
@@ -368,7 +341,7 @@ class UnknownLab:
         self._touches += 1
         if self._touches == self.facts.cable_after:
             lost = ((Device.ROBOT, "deaf"), (Device.TELEMETRY, "mute"))
-            self._pulled = [self.rig.faults.hang(Fault(device=d, kind=kind, count=ALWAYS)) for d, kind in lost]
+            self._pulled = [self.faults.hang(Fault(device=d, kind=kind, count=ALWAYS)) for d, kind in lost]
 
 
 def _error_mm(rng: np.random.Generator, spread_mm: float) -> list[float]:
@@ -384,3 +357,27 @@ def _withdrawn(tip: Pose) -> Pose:
     back_mm = turned(unit(tip.quaternion), (0.0, 0.0, -LIFT_MM))
     x, y, z = (a + b for a, b in zip(tip.position_mm, back_mm, strict=True))
     return Pose(x, y, z, *tip.quaternion)
+
+
+class LabRefused(Exception):
+    """No such lab can be served."""
+
+    exit_code: ClassVar[int] = 2
+
+
+def serve_unknown(
+    seed: int, trap: str | None, rate: float, idle_exit_s: float, tell: Callable[..., None], control: Path | None
+) -> None:
+    """Serve the unknown lab of this seed and print what a person reads there.
+
+    Raises `LabRefused` for an unknown trap, and `SimFileError` for the control socket.
+    """
+    if trap is not None and trap not in [*Trap]:
+        raise LabRefused(f"--trap is {trap!r}, allowed: {', '.join(Trap)}")
+    lab = UnknownLab(seed, None if trap is None else Trap(trap), rate=rate)
+
+    def announce() -> None:
+        hand = [] if control is None else [f"hand      brushloop sim hand {control} bring pin"]
+        tell(*lab.labels(), *hand, "Ctrl-C ends")
+
+    asyncio.run(serve_until_over(lab, control, idle_exit_s, announce))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
 
@@ -110,7 +110,6 @@ class Trap(StrEnum):
 class Facts:
     """One lab. All numbers are the true ones; only tests may compare them with what was found."""
 
-    seed: int
     config: SimConfig
     pin_mm: Place
     """Upper end of a pin that stands on the table."""
@@ -128,8 +127,6 @@ class Facts:
     printed_square_mm: float = 12.0
     printed_marker_mm: float = 9.0
     """Sizes that the line below the print states, mm."""
-    hand_mm: float = 0.3
-    """Standard deviation, along each axis, of the place to which a hand brings the tip."""
     swapped: tuple[str, str] | None = None
     """Corners that the person takes for each other."""
     cable_after: int | None = None
@@ -175,25 +172,28 @@ def _guess(rng: np.random.Generator, seed: int, rate: float, picture_px: tuple[i
         table=table,
         view=view,
     )
-    typed = _typed_tcp(rng, config)
+    # The tool offset at the pendant is none, that of another tool, or this one measured with a ruler.
+    ruler_m, other_m = (config.tool_mm + float(rng.normal(0.0, 2.0))) / 1e3, float(rng.uniform(0.05, 0.2))
+    typed = ((0.0,) * 6, (0.0, 0.03, other_m, 0.0, 0.0, 0.5), (0.0, 0.0, ruler_m, 0.0, 0.0, 0.0))[rng.integers(3)]
     payload_kg, sheet_camera = float(rng.choice([0.0, 0.5])), int(rng.integers(2))
-    park = _park(rng, config)
+    park = next(_places_aside(rng, config, 40), None)
     if park is None or min(math.dist(pin, wash), math.dist(pin, table.well_mm), math.dist(wash, table.well_mm)) < 60.0:
         return None
-    if (clear := _park(np.random.default_rng([seed, 43]), config, away_from=park, tries=400)) is None:
+    others = _places_aside(np.random.default_rng([seed, 43]), config, 400)
+    clear = next((place for place in others if math.dist(park, place) >= CLEAR_APART_MM), None)
+    if clear is None:
         return None
     return Facts(
-        seed,
-        replace(config, home_mm=park),
-        table.to_base(*pin, float(rng.uniform(20, 60))),
-        wash,
-        park,
-        clear,
-        typed,
-        payload_kg,
-        sheet_camera,
-        table.board_square_mm,
-        table.board_marker_mm,
+        config=replace(config, home_mm=park),
+        pin_mm=table.to_base(*pin, float(rng.uniform(20, 60))),
+        wash_mm=wash,
+        park_mm=park,
+        clear_mm=clear,
+        cabinet_tcp=typed,
+        payload_kg=payload_kg,
+        sheet_camera=sheet_camera,
+        printed_square_mm=table.board_square_mm,
+        printed_marker_mm=table.board_marker_mm,
     )
 
 
@@ -261,29 +261,19 @@ def _beside(rng: np.random.Generator, table: Table, clear_mm: float) -> tuple[fl
     )[rng.integers(4)]
 
 
-def _typed_tcp(rng: np.random.Generator, config: SimConfig) -> tuple[float, ...]:
-    """The tool offset set on the pendant: none, that of another tool, or this one measured with a ruler."""
-    ruler_m = (config.tool_mm + float(rng.normal(0.0, 2.0))) / 1e3
-    other_m = float(rng.uniform(0.05, 0.2))
-    return ((0.0,) * 6, (0.0, 0.03, other_m, 0.0, 0.0, 0.5), (0.0, 0.0, ruler_m, 0.0, 0.0, 0.0))[rng.integers(3)]
-
-
-def _park(rng: np.random.Generator, config: SimConfig, away_from: Place | None = None, tries: int = 40) -> Place | None:
-    """A place that the arm reaches and the camera does not see, and a straight way from the sheet past the base."""
+def _places_aside(rng: np.random.Generator, config: SimConfig, tries: int) -> Iterator[Place]:
+    """Places that the arm reaches and the camera does not see, and a straight way from the sheet past the base."""
     table = config.table
     middle = over_sheet(table)
     for _ in range(tries):
         reach_mm = rng.uniform(300, 600)
         bearing = math.radians(azimuth_deg(middle) + rng.uniform(-80, 80))
-        z_mm = config.table.paper_z_mm + float(rng.uniform(110, 180))
+        z_mm = table.paper_z_mm + float(rng.uniform(110, 180))
         place = (float(reach_mm * math.cos(bearing)), float(reach_mm * math.sin(bearing)), z_mm)
         if in_picture(config, [place]) or _nearest_mm(middle, place) < BASE_CLEAR_MM:
             continue
-        if away_from is not None and math.dist(away_from, place) < CLEAR_APART_MM:
-            continue
         if abs(math.degrees(bearing)) < 150.0 and reaches(config, [brush_pose(*place)]):
-            return place
-    return None
+            yield place
 
 
 def _nearest_mm(start: Place, end: Place) -> float:
@@ -338,47 +328,38 @@ TOO_FAR_MM = 330.0
 """How much farther away the sheet lies."""
 
 
-def patched(facts: Facts, patch: Mapping[str, Any]) -> Facts:
-    """The same lab with other values in these fields of `Facts`, `SimConfig`, `Table` and `View`."""
-
-    def of(part: Facts | SimConfig | Table | View) -> dict[str, Any]:
-        return {field.name: patch[field.name] for field in fields(part) if field.name in patch}
-
-    table, view = facts.config.table, facts.config.view
-    config = replace(facts.config, table=replace(table, **of(table)), view=replace(view, **of(view)))
-    return replace(facts, config=replace(config, **of(config)), **of(facts))
-
-
 def trapped(facts: Facts, trap: Trap) -> tuple[Facts, Facts]:
     """The lab with the trap in it, and as it is once the person has corrected the mistake."""
-    wrong, mended = _patches(facts, trap)
-    return patched(facts, {"trap": trap, **wrong}), patched(facts, mended)
-
-
-def _patches(facts: Facts, trap: Trap) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What is otherwise with the trap, and still otherwise once it is mended, by field."""
-    table, rng = facts.config.table, np.random.default_rng([facts.seed, 18])
+    wrong, mended = facts, facts
+    table, view, rng = facts.config.table, facts.config.view, np.random.default_rng([facts.config.seed, 18])
     match trap:
         case Trap.SWAPPED_CORNER:
             first = int(rng.integers(4))
-            return {"swapped": (CORNERS[first], CORNERS[(first + 1) % 4])}, {}
+            wrong = replace(facts, swapped=(CORNERS[first], CORNERS[(first + 1) % 4]))
         case Trap.MIRRORED_CAMERA:
-            return {"mirrored": True}, {}
+            wrong = _with(facts, view=replace(view, mirrored=True))
         case Trap.WRONG_BOARD_SIZE:  # a board that was printed too small is measured
             square_mm, marker_mm = SHRUNK * table.board_square_mm, SHRUNK * table.board_marker_mm
-            small = {"board_square_mm": square_mm, "board_marker_mm": marker_mm}
-            return small, {**small, "printed_square_mm": square_mm, "printed_marker_mm": marker_mm}
+            wrong = _with(facts, table=replace(table, board_square_mm=square_mm, board_marker_mm=marker_mm))
+            mended = replace(wrong, printed_square_mm=square_mm, printed_marker_mm=marker_mm)
         case Trap.TCP_IN_METRES:
-            return {"cabinet_tcp": (0.0, 0.0, facts.config.tool_mm / 1e6, 0.0, 0.0, 0.0)}, {}
+            wrong = replace(facts, cabinet_tcp=(0.0, 0.0, facts.config.tool_mm / 1e6, 0.0, 0.0, 0.0))
         case Trap.SLOW_CAMERA:
-            return {"delay_s": SLOW_S}, {}
+            wrong = _with(facts, view=replace(view, delay_s=SLOW_S))
         case Trap.FORCE_SIGN:
-            return {"sensor_sign": -1}, {"sensor_sign": 1}
+            wrong, mended = _with(facts, sensor_sign=-1), _with(facts, sensor_sign=1)
         case Trap.SHEET_OUT_OF_REACH:  # with board, pots and camera; the pin stays within reach
             x, y, _ = over_sheet(table)
             stretch = TOO_FAR_MM / math.hypot(x, y)
-            return {"origin_mm": (table.origin_mm[0] + stretch * x, table.origin_mm[1] + stretch * y)}, {}
+            origin_mm = (table.origin_mm[0] + stretch * x, table.origin_mm[1] + stretch * y)
+            wrong = _with(facts, table=replace(table, origin_mm=origin_mm))
         case Trap.CABLE_PULLED:
-            return {"cable_after": int(rng.integers(2, 7))}, {}
+            wrong = replace(facts, cable_after=int(rng.integers(2, 7)))
         case Trap.PARK_IN_PICTURE | Trap.OLD_SOFTWARE:
-            return {}, {}
+            pass  # in the hands of the person, and at the ports
+    return replace(wrong, trap=trap), mended
+
+
+def _with(facts: Facts, **changes: Any) -> Facts:
+    """The lab with another configuration."""
+    return replace(facts, config=replace(facts.config, **changes))

@@ -1,13 +1,18 @@
-"""The loopback rig as a whole: one world, the devices around it on 127.0.0.1 and on ptys, faults, and `rig.toml`."""
+"""The loopback rig: one world, the devices around it on 127.0.0.1 and on ptys, its `rig.toml`, and its process."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import functools
+import json
 import math
+import os
+import signal
+from collections.abc import AsyncGenerator, Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, Self, cast
 
 from brushloop.drivers.force.simulator import ForceBoard, SocketcandServer
 from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL, Wrench
@@ -15,8 +20,9 @@ from brushloop.drivers.geometry import inverse, of_angles, product, turned
 from brushloop.drivers.ink.simulator import PtyLine, PumpFirmware, StationFirmware
 from brushloop.drivers.loopback import LoopbackServer
 from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
+from brushloop.drivers.sim.brush.spec import SimFileError
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.faults import Device, FaultBoard
+from brushloop.drivers.sim.faults import Device, FaultBoard, fault_of
 from brushloop.drivers.sim.scene import MjpegServer, Scene
 from brushloop.drivers.sim.world import World
 
@@ -150,17 +156,24 @@ class LoopbackRig:
         self.rtde = RtdeServer(self.arcs.cabinet, self.faults)
         self.scene = Scene(self.world)
         """What the camera looks at."""
-        self.camera = MjpegServer(self.scene, config.view, self.faults)
+        self.camera = MjpegServer(self.world, self.scene.render, config.view, self.faults)
+        self.servers: dict[LoopbackServer, int] = {
+            self.arcs: config.arcs_port,
+            self.rtde: config.rtde_port,
+            self.camera: config.camera_port,
+        }
+        """What is served, and the port of each; 0 lets the system choose."""
         if self.ink is not None:
             self.ink.next_fault = functools.partial(self.faults.kind_met, Device.INK)
         if self.force is not None:
             self.force.board.next_fault = functools.partial(self.faults.kind_met, Device.FORCE)
+            self.servers[self.force] = config.force_port
         self._open = contextlib.AsyncExitStack()
 
-    async def __aenter__(self) -> LoopbackRig:
+    async def __aenter__(self) -> Self:
         async with contextlib.AsyncExitStack() as opening:
-            for server, port in self._servers():
-                opening.push_async_callback(server.stop)
+            opening.push_async_callback(self._stop)
+            for server, port in self.servers.items():
                 await server.start(self._host, port)
             if self.force is not None:
                 await asyncio.to_thread(self.world.reaction.prepare)  # takes some tenths of a second
@@ -174,34 +187,16 @@ class LoopbackRig:
     async def __aexit__(self, *_: object) -> None:
         await self._open.aclose()
 
-    def _servers(self) -> list[tuple[LoopbackServer, int]]:
-        """The servers on a port, and the port of each; 0 lets the system choose."""
-        config = self.config
-        force = [] if self.force is None else [(self.force, config.force_port)]
-        return [
-            (self.arcs, config.arcs_port),
-            (self.rtde, config.rtde_port),
-            (self.camera, config.camera_port),
-            *force,
-        ]
+    async def _stop(self) -> None:
+        for server in self.servers:
+            await server.stop()
 
     def toml(self) -> str:
         """A `rig.toml` for this rig, as an operator would have taught it."""
         force_port = None if self.force is None else self.force.port
         ink_path = None if self.ink is None else self.ink.path
-        return rig_toml(
-            self.config,
-            Addresses(self._host, self.arcs.port, self.rtde.port, self.camera.port, force_port, ink_path),
-        )
-
-    def where(self) -> str:
-        """One line for people: which device listens where."""
-        places = [f"controller on {self._host}:{self.arcs.port} and {self.rtde.port}", f"camera on {self.camera.port}"]
-        if self.force is not None:
-            places.append(f"force on {self.force.port}")
-        if self.ink is not None:
-            places.append(f"ink on {self.ink.path}")
-        return ", ".join(places)
+        ports = self.arcs.port, self.rtde.port, self.camera.port
+        return rig_toml(self.config, Addresses(self._host, *ports, force_port, ink_path))
 
     def state(self) -> dict[str, Any]:
         """Current state of the world, as JSON."""
@@ -222,14 +217,18 @@ class LoopbackRig:
         """Change table, view or sensor while serving, as a person in the lab would; tool and brush stay."""
         self.config = self.world.config = config
         self.scene = Scene(self.world)
-        self.camera.show(self.scene, config.view)
+        self.camera.show(self.scene.render, config.view)
+
+    async def hand(self, request: Mapping[str, object]) -> dict[str, Any]:
+        """Ask the person in the lab for something. Raises ValueError, with one line, for what nobody can do."""
+        raise ValueError("there is no person here: only the lab of `brushloop sim --unknown` has one")
 
     async def idle(self, seconds: float) -> None:
         """Return once no client has been connected for `seconds`."""
         loop = asyncio.get_running_loop()
         since = loop.time()
         while loop.time() - since < seconds:
-            if any(server.clients for server, _ in self._servers()):
+            if any(server.clients for server in self.servers):
                 since = loop.time()
             await asyncio.sleep(0.2)
 
@@ -264,3 +263,126 @@ def _ink(world: World) -> PtyLine | None:
             return PtyLine(PumpFirmware(ml_per_revolution=PUMP_ML, reservoir_ml=PUMP_RESERVOIR_ML, on_pumped=pumped))
         case "none":
             return None
+
+
+USAGE = (
+    'not a request: {"do": "add", "fault": {...}}, or "list", "clear" (with a number "id" or without), '
+    '"state", "release", "fresh-sheet", "hand"'
+)
+
+
+class ControlServer(LoopbackServer):
+    """Live control of one rig: the requests are in docs/faults.md."""
+
+    def __init__(self, rig: LoopbackRig) -> None:
+        super().__init__()
+        self._rig = rig
+
+    async def open(self, path: Path) -> None:
+        """Listen at `path` for its owner alone; a socket of a rig that has ended is replaced. Raises `SimFileError`."""
+        if path.exists() and not path.is_socket():
+            raise SimFileError(path, "", "exists and is not a socket; it is not overwritten")
+        with contextlib.suppress(OSError):  # nobody listens
+            _, writer = await asyncio.open_unix_connection(path)
+            writer.close()
+            raise SimFileError(path, "", "another rig listens here")
+        # Set before the path exists: another user could connect before a later `chmod`.
+        mask = os.umask(0o177)
+        try:
+            self._server = await asyncio.start_unix_server(self._serve, path)
+        except OSError as error:
+            raise SimFileError(path, "", f"cannot listen here: {error.strerror or error}") from None
+        finally:
+            os.umask(mask)
+
+    async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Answer line by line."""
+        while True:
+            line = await reader.readuntil(b"\n")
+            try:
+                answer = {"ok": True, **await self._obey(json.loads(line))}
+            except (ValueError, RecursionError) as error:
+                text = "not JSON" if isinstance(error, json.JSONDecodeError | RecursionError) else str(error)
+                answer = {"ok": False, "error": text.replace("\n", " ")[:500]}
+            writer.write(json.dumps(answer, separators=(",", ":")).encode() + b"\n")
+            await writer.drain()
+
+    async def _obey(self, said: object) -> dict[str, Any]:
+        request = cast("dict[str, Any]", said) if isinstance(said, dict) else {}
+        board, alone = self._rig.faults, len(request) == 1
+        match request:
+            case {"do": "add", "fault": dict()} if len(request) == 2:
+                return {"id": board.hang(fault_of(request["fault"]))}
+            case {"do": "list"} if alone:
+                return {"hanging": [hung.as_json() for hung in board.hanging]}
+            case {"do": "clear"} if alone:
+                return {"taken": board.clear()}
+            case {"do": "clear", "id": int(ident)} if len(request) == 2 and not isinstance(ident, bool):
+                return {"taken": int(board.take(ident))}
+            case {"do": "state"} if alone:
+                return self._rig.state()
+            case {"do": "release"} if alone:
+                return {"was": self._rig.arcs.cabinet.release()}
+            case {"do": "fresh-sheet"} if alone:
+                self._rig.world.fresh_sheet()
+                return {}
+            case {"do": "hand"} if set(request) <= {"do", "act", "to", "index", "corner"}:
+                return await self._rig.hand(request)
+            case _:
+                raise ValueError(USAGE)
+
+
+@contextlib.asynccontextmanager
+async def live_control(rig: LoopbackRig, path: Path) -> AsyncGenerator[None]:
+    """A control socket at `path` until the block ends. Raises `SimFileError`."""
+    server = ControlServer(rig)
+    await server.open(path)
+    try:
+        yield
+    finally:
+        await server.stop()
+        path.unlink(missing_ok=True)
+
+
+def serve(
+    config: SimConfig, write_rig: Path | None, idle_exit_s: float, tell: Callable[..., None], control: Path | None
+) -> None:
+    """Serve until a signal, or until idle for `idle_exit_s` (0 means never); print the `rig.toml` or write it.
+
+    Raises `SimFileError` for a control socket that cannot be created, and rather than overwrite a file that no loopback
+    rig wrote.
+    """
+    if write_rig is not None and write_rig.exists() and not _is_ours(write_rig):
+        raise SimFileError(write_rig, "", "exists and was not written by a loopback rig; it is not overwritten")
+    rig = LoopbackRig(config)
+
+    def announce() -> None:
+        if write_rig is None:
+            tell(*rig.toml().splitlines(), "Ctrl-C ends")
+            return
+        part = write_rig.with_name(write_rig.name + ".part")
+        part.write_text(rig.toml(), encoding="utf-8")
+        part.replace(write_rig)  # a reader sees all of it or none
+        tell(f"{write_rig} is written: brushloop doctor --config {write_rig}; Ctrl-C ends")
+
+    asyncio.run(serve_until_over(rig, control, idle_exit_s, announce))
+
+
+def _is_ours(path: Path) -> bool:
+    return path.is_file() and path.read_bytes().startswith(LOOPBACK_HEAD.encode())
+
+
+async def serve_until_over(
+    rig: LoopbackRig, control: Path | None, idle_exit_s: float, announce: Callable[[], None]
+) -> None:
+    """Serve until Ctrl-C, SIGTERM, or no client for `idle_exit_s`; SIGUSR1 changes the sheet."""
+    over, loop = asyncio.Event(), asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, over.set)
+    loop.add_signal_handler(signal.SIGUSR1, rig.world.fresh_sheet)
+    async with rig, contextlib.nullcontext() if control is None else live_control(rig, control):
+        announce()
+        if idle_exit_s > 0:
+            idle = asyncio.create_task(rig.idle(idle_exit_s))
+            idle.add_done_callback(lambda _: over.set())
+        await over.wait()

@@ -176,17 +176,13 @@ class Scene:
         self.held: Held | None = None
         """The board that a person holds before the camera; it hides everything else."""
 
-    def tool(self) -> Pose:
-        """Pose of the tool now. Advances the world, so only the thread that owns the world may call it."""
-        return self._world.tool()
-
     def render(self, tool: Pose | None = None) -> NDArray[np.uint8]:
         """A (height, width) gray image of the world now.
 
-        With `tool` given it only reads the world, and may run in another thread. Do not write to the array: it is
-        returned again while the picture does not change.
+        Without `tool` it advances the world, as only the thread that owns the world may do; with it, it may run in
+        another thread. Do not write to the array: it is returned again while the picture does not change.
         """
-        tool = tool or self.tool()
+        tool = tool or self._world.tool()
         held, mirrored = self.held, self._world.config.view.mirrored
         if self._shown != (self._world.version, held):
             self._shown = self._world.version, held
@@ -302,25 +298,6 @@ def _draw(
     return raster, [rng.normal(0.0, noise, shape).astype(np.float32) for _ in range(NOISE_FIELDS)]
 
 
-WALL_GRAY, WALL_NOISE = 185, 2.0
-
-
-class Wall:
-    """What a second camera of a lab sees: a wall, and no sheet."""
-
-    def __init__(self, world: World) -> None:
-        self._world = world
-        self._noise = np.random.default_rng([world.config.seed, 17])
-
-    def tool(self) -> Pose:
-        """Pose of the tool now."""
-        return self._world.tool()
-
-    def render(self, tool: Pose | None = None) -> NDArray[np.uint8]:
-        """A (480, 640) gray image."""
-        return self._noise.normal(WALL_GRAY, WALL_NOISE, (480, 640)).astype(np.uint8)
-
-
 NOISE_LEVELS = 6
 """Number of gray levels of a covered sensor, which is not quite black."""
 
@@ -354,49 +331,27 @@ BACKLOG = 64
 """Images that a stalled stream keeps, as the buffers of a real one do."""
 
 
-class Line:
-    """One client's connection with the view's delay; no picture overtakes another."""
-
-    def __init__(self, view: View, writer: asyncio.StreamWriter) -> None:
-        self._view = view
-        self._writer = writer
-        self._loop = asyncio.get_running_loop()
-        self._last_s = self._loop.time()
-        self._random = random.Random(0)
-
-    async def send(self, data: bytes, exposed_s: float) -> None:
-        """Send now, or as soon as it is due: its delay counts from `exposed_s` and includes the time to draw it."""
-        late_s = self._view.delay_s + self._view.delay_jitter_s * self._random.random()
-        if self._writer.is_closing():  # a late picture is not drained, which would notice
-            raise ConnectionResetError("the client has gone")
-        if late_s <= 0.0:
-            self._writer.write(data)
-        else:
-            self._last_s = max(self._last_s + NEXT_S, exposed_s + late_s)
-            self._loop.call_at(self._last_s, self._write, data)
-        await self._writer.drain()  # of earlier pictures: else a slow client would fall farther and farther behind
-
-    def _write(self, data: bytes) -> None:
-        if not self._writer.is_closing():
-            self._writer.write(data)
+Render = Callable[[Pose], NDArray[np.uint8]]
+"""The gray image of a camera, with the tool at this pose; called in another thread than the world's."""
 
 
 class MjpegServer(LoopbackServer):
     """Serves `/stream.mjpg`. A client that reads too slowly is sent the newest image next, never a backlog."""
 
-    def __init__(self, scene: Scene | Wall, view: View, faults: FaultBoard | None = None) -> None:
+    def __init__(self, world: World, render: Render, view: View, faults: FaultBoard | None = None) -> None:
         """`view` gives the rate and the delay of the pictures."""
         super().__init__()
-        self._scene = scene
+        self._world = world
+        self._render = render
         self._view = view
         self._rendering = asyncio.Lock()
         self._coded: deque[tuple[NDArray[np.uint8], bytes]] = deque(maxlen=NOISE_FIELDS)
-        """The newest images of the scene and their JPEGs, reused while nothing changes."""
+        """The newest images and their JPEGs, reused while nothing changes."""
         self._faults = faults
 
-    def show(self, scene: Scene | Wall, view: View) -> None:
+    def show(self, render: Render, view: View) -> None:
         """Look at something else, with other settings. Every stream begins again, as when a camera is set up again."""
-        self._scene, self._view = scene, view
+        self._render, self._view = render, view
         self._coded.clear()
         self.drop_clients()
 
@@ -409,14 +364,14 @@ class MjpegServer(LoopbackServer):
             b"Content-Type: multipart/x-mixed-replace; boundary=" + BOUNDARY.encode() + b"\r\n\r\n"
         )
         if not request.startswith(b"HEAD"):
-            await self._stream(Line(self._view, writer))
+            await self._stream(writer)
 
-    async def _stream(self, line: Line) -> None:
+    async def _stream(self, writer: asyncio.StreamWriter) -> None:
         loop = asyncio.get_running_loop()
-        due_s = loop.time()
+        due_s = sent_s = loop.time()
         held: deque[bytes] = deque(maxlen=BACKLOG)
         shown = b""
-        while True:
+        while not writer.is_closing():  # a late picture is not drained, which would notice
             kind = None if self._faults is None else self._faults.kind_met(Device.CAMERA)
             exposed_s, image = await self._exposed()
             if kind == "frozen":
@@ -426,24 +381,33 @@ class MjpegServer(LoopbackServer):
             else:
                 shown = image
             held.append(image)
+            # The delay includes the time to draw, and no picture overtakes another.
+            delay_s = self._view.delay_s + random.uniform(0.0, self._view.delay_jitter_s)
             while held and kind != "stale":
                 jpeg = held.popleft()
                 head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
-                await line.send(head.encode() + jpeg + b"\r\n", exposed_s)
+                sent_s = max(sent_s + NEXT_S, exposed_s + delay_s)
+                loop.call_at(sent_s, _write, writer, head.encode() + jpeg + b"\r\n")
+            await writer.drain()  # of earlier pictures: else a slow client would fall farther and farther behind
             due_s = max(due_s + 1.0 / self._view.fps, loop.time())
             await asyncio.sleep(due_s - loop.time())
 
     async def _exposed(self) -> tuple[float, bytes]:
         """A new picture: the loop's time at its exposure, and its JPEG."""
         async with self._rendering:  # the scene keeps a cache: one thread at a time
-            tool = self._scene.tool()  # here, because the motion queue belongs to the event loop's thread
+            tool = self._world.tool()  # here, because the motion queue belongs to the event loop's thread
             return asyncio.get_running_loop().time(), await asyncio.to_thread(self._jpeg, tool)
 
     def _jpeg(self, tool: Pose) -> bytes:
-        image: NDArray[np.uint8] = self._scene.render(tool)
+        image = self._render(tool)
         for coded, data in self._coded:
             if coded is image:
                 return data
         _, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         self._coded.append((image, data := encoded.tobytes()))
         return data
+
+
+def _write(writer: asyncio.StreamWriter, data: bytes) -> None:
+    if not writer.is_closing():
+        writer.write(data)

@@ -49,20 +49,20 @@ class Reaction:
     and the hysteresis on the way up are left out: only the normal force of a press remains.
     """
 
-    def __init__(self, brush: Brush, *, sensor_to_tip_mm: float, hanging_kg: float) -> None:
-        self._brush = brush
-        self._arm_m = sensor_to_tip_mm / 1e3
-        self._weight_n = hanging_kg * GRAVITY_M_S2
+    def __init__(self, config: SimConfig) -> None:
+        self._spec = config.brush
+        self._arm_m = config.tool_mm / 1e3
+        self._weight_n = config.hanging_kg * GRAVITY_M_S2
 
     def prepare(self) -> None:
         """Solve the spines; takes some tenths of a second, so call it outside the event loop. Once is enough."""
-        _pushes(self._brush.spec)
+        _pushes(self._spec)
 
     def push_n(self, depth_mm: float, tilt_deg: float) -> float:
         """Normal force of the paper on the bundle; 0 in the air."""
         if depth_mm <= 0.0:
             return 0.0
-        steps_mm, rows = _pushes(self._brush.spec)
+        steps_mm, rows = _pushes(self._spec)
         at_tilts = np.array([np.interp(depth_mm, steps_mm, rows[k]) for k in range(len(TILTS_DEG))], np.float64)
         return float(np.interp(tilt_deg, np.array(TILTS_DEG), at_tilts))
 
@@ -154,20 +154,6 @@ class Press:
     severity: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class Drag:
-    """One contact that travelled along the paper, as it really happened."""
-
-    path: tuple[Waypoint, ...]
-    """The commanded tip in the paper frame, from touching to lifting off."""
-    tilt_deg: float
-    """Tilt at the deepest point."""
-    heading_deg: float
-    """Direction in which the ferrule leaned, or would have leaned, when the tip landed."""
-    ink_load: float
-    """Ink load at landing."""
-
-
 class World:
     """Tool, brush, ink and sheet under one clock.
 
@@ -181,13 +167,14 @@ class World:
         self.brush = Brush(config.brush)
         self.paper = Paper(*config.table.sheet_mm)
         self.presses: list[Press] = []
-        self.drags: list[Drag] = []
+        self.drags = 0
+        """Number of contacts that travelled along the paper."""
         self.flaws: dict[int, tuple[Flaw, float]] = {}
         """Scripted flaw and severity by the index of the press; severity 0 rules out a spontaneous split."""
         self.ink_load = 0.0
         table = config.table
         self.well = Well.round(table.well_radius_mm, table.ink_level_mm, table.well_depth_mm)
-        self.reaction = Reaction(self.brush, sensor_to_tip_mm=config.tool_mm, hanging_kg=config.hanging_kg)
+        self.reaction = Reaction(config)
         self.version = 0
         """Number of visible changes to the sheet so far."""
         self._contact: list[Pose] = []
@@ -197,8 +184,6 @@ class World:
         self.push_n = (0.0, 0.0, 0.0)
         """Force of a person's finger on the tip, in the base frame."""
         self.motion = MotionQueue(brush_pose(*config.home_mm), self._travelled, tool_of(config))
-        self._felt: tuple[object, Wrench] | None = None
-        """The state that the last wrench was computed from, and the wrench: neither changes while the arm rests."""
 
     def fresh_sheet(self) -> None:
         """Replace the sheet by a blank one, as an operator would."""
@@ -215,13 +200,11 @@ class World:
 
     def wrench(self) -> Wrench:
         """Current wrench on the force sensor, in the tool's frame."""
-        tip, table, push_n = self.tool(), self.config.table, self.push_n
-        follows_from = tip, table, push_n
-        if self._felt is None or self._felt[0] != follows_from:
-            x_mm, y_mm, depth_mm = self._on_sheet(tip)
-            free = self._in_well(x_mm, y_mm)
-            self._felt = follows_from, self.reaction.wrench(tip, 0.0 if free else depth_mm, self._normal, push_n)
-        return self._felt[1]
+        tip = self.tool()
+        x_mm, y_mm, depth_mm = self.on_sheet(tip)
+        if self.is_over_well(x_mm, y_mm):
+            depth_mm = 0.0  # there is no paper
+        return self.reaction.wrench(tip, depth_mm, self._normal, self.push_n)
 
     def to_paper(self, x_mm: float, y_mm: float) -> tuple[float, float]:
         """Convert x and y from the base frame to the paper frame."""
@@ -233,7 +216,8 @@ class World:
             return
         # Along a straight line the tip's height is linear, so the lowest point is one of the ends.
         for pose in (start, end):
-            self._dip(pose)
+            if self._is_in_ink(pose):
+                self.ink_load = self.well.dip(self.ink_load)
         high, low = self._above_mm(start), self._above_mm(end)
         if high < 0.0 or low < 0.0:
             if not self._contact:
@@ -247,24 +231,21 @@ class World:
             else:
                 self._leave_mark(min(contact, key=self._above_mm))
 
-    def _dip(self, pose: Pose) -> None:
-        table = self.config.table
-        x_mm, y_mm = self.to_paper(pose.x_mm, pose.y_mm)
-        bottom_mm = table.surface_z_mm(*table.well_mm)
-        if self._in_well(x_mm, y_mm) and pose.z_mm < bottom_mm + self.well.level_mm:
-            self.ink_load = self.well.dip(self.ink_load)
-
     def _leave_mark(self, deepest: Pose) -> None:
-        x_mm, y_mm, depth_mm = self._on_sheet(deepest)
-        if not self._is_on_sheet(x_mm, y_mm):
+        x_mm, y_mm, depth_mm = self.on_sheet(deepest)
+        if not self.is_over_sheet(x_mm, y_mm):
             return
         tilt_deg, heading_deg = self._lean(deepest)
         index = len(self.presses)
-        flaw, severity = self._flaw(index, depth_mm)
-        deepest_mm = self.brush.deepest_mm(tilt_deg)
+        if index in self.flaws:
+            flaw, severity = self.flaws[index]
+        else:
+            rng = np.random.default_rng([self.config.seed, index, 3])
+            flaw, severity = Flaw.SPLIT, natural_split(self.ink_load, depth_mm, rng)
+        flaw = flaw if severity > 0.0 else None
         make = functools.partial(
             self.brush.press,
-            min(depth_mm, deepest_mm),  # at most until the ferrule stands on the paper
+            min(depth_mm, self.brush.deepest_mm(tilt_deg)),  # at most until the ferrule stands on the paper
             min(tilt_deg, MAX_TILT_DEG),
             ink_load=self.ink_load,
             press_seed=self.config.seed * 100_003 + index,
@@ -281,8 +262,8 @@ class World:
         self.version += 1
 
     def _leave_drag(self, contact: Sequence[Pose]) -> None:
-        path = tuple(Waypoint(*self._on_sheet(pose)) for pose in contact)
-        if not any(self._is_on_sheet(w.x_mm, w.y_mm) for w in path):
+        path = tuple(Waypoint(*self.on_sheet(pose)) for pose in contact)
+        if not any(self.is_over_sheet(w.x_mm, w.y_mm) for w in path):
             return
         tilt_deg, _ = self._lean(min(contact, key=self._above_mm))
         _, heading_deg = self._lean(contact[0])
@@ -293,24 +274,15 @@ class World:
             heading_deg,
             ink_load=self.ink_load,
             # an offset keeps it apart from the seeds of presses
-            press_seed=2**40 + self.config.seed * 100_003 + len(self.drags),
+            press_seed=2**40 + self.config.seed * 100_003 + self.drags,
         )
         self.paper.lay_later(make, path[0].x_mm, path[0].y_mm, 0.0)
-        self.drags.append(Drag(path, tilt_deg, heading_deg, self.ink_load))
+        self.drags += 1
         travel_mm = sum(math.dist((a.x_mm, a.y_mm), (b.x_mm, b.y_mm)) for a, b in itertools.pairwise(path))
         self.ink_load = max(0.0, ink_left(self.ink_load, travel_mm) - INK_PER_PRESS)
         self.version += 1
 
-    def _flaw(self, index: int, depth_mm: float) -> tuple[Flaw | None, float]:
-        """The flaw of this press: the scripted one, or a spontaneous split."""
-        if index in self.flaws:
-            flaw, severity = self.flaws[index]
-        else:
-            rng = np.random.default_rng([self.config.seed, index, 3])
-            flaw, severity = Flaw.SPLIT, natural_split(self.ink_load, depth_mm, rng)
-        return (flaw, severity) if severity > 0.0 else (None, 0.0)
-
-    def _on_sheet(self, pose: Pose) -> tuple[float, float, float]:
+    def on_sheet(self, pose: Pose) -> tuple[float, float, float]:
         """x and y in the paper frame of the point of the sheet nearest to the tip, and the tip's depth below it."""
         x_mm, y_mm = self.to_paper(pose.x_mm, pose.y_mm)
         depth_mm = -self._above_mm(pose)
@@ -327,10 +299,16 @@ class World:
         yaw = math.radians(self.config.table.yaw_deg)
         return math.cos(yaw) * nx - math.sin(yaw) * ny, math.sin(yaw) * nx + math.cos(yaw) * ny, nz
 
-    def _in_well(self, x_mm: float, y_mm: float) -> bool:
+    def is_over_well(self, x_mm: float, y_mm: float) -> bool:
+        """Whether a point of the paper frame lies within the ink well."""
         return math.dist((x_mm, y_mm), self.config.table.well_mm) <= self.config.table.well_radius_mm
 
-    def _is_on_sheet(self, x_mm: float, y_mm: float) -> bool:
+    def _is_in_ink(self, tip: Pose) -> bool:
+        surface_z_mm = self.config.table.surface_z_mm(*self.config.table.well_mm) + self.well.level_mm
+        return self.is_over_well(*self.to_paper(tip.x_mm, tip.y_mm)) and tip.z_mm < surface_z_mm
+
+    def is_over_sheet(self, x_mm: float, y_mm: float) -> bool:
+        """Whether a point of the paper frame lies on the sheet."""
         size_x_mm, size_y_mm = self.config.table.sheet_mm
         return 0.0 <= x_mm <= size_x_mm and 0.0 <= y_mm <= size_y_mm
 

@@ -16,7 +16,6 @@ from brushloop.collect.touch import force
 from brushloop.collect.touch.camera import first_ink
 from brushloop.collect.touch.force import Contact, Reading, find_contact, touch_by_force
 from brushloop.collect.touch.heights import Reach
-from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.world import Reaction
 
@@ -121,7 +120,7 @@ class Felt:
 
 @pytest.fixture(scope="module")
 def reaction() -> Reaction:
-    made = Reaction(Brush(BrushSpec()), sensor_to_tip_mm=180.0, hanging_kg=0.12)
+    made = Reaction(SimConfig())
     made.prepare()
     return made
 

@@ -1,47 +1,47 @@
-"""The loopback rig as a whole: its servers, that none is reached from another machine, and what its camera sees."""
+"""The loopback rig as a whole: its servers, that none is reached from another machine, its live control, its camera."""
 
 from __future__ import annotations
 
 import asyncio
 import itertools
+import json
+import re
+import stat
+import threading
 import time
 import tomllib
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import cv2
 import numpy as np
 import pytest
 
 from brushloop.drivers.camera import CameraTable, OpenCvCamera
-from brushloop.drivers.devices import Stamp
+from brushloop.drivers.devices import Pose, Stamp
 from brushloop.drivers.force import sri_m8123
 from brushloop.drivers.force.simulator import FRAME_S, ForceBoard, SocketcandServer
 from brushloop.drivers.force.sri_m8123 import COMMAND_ID, LOOPBACK_CHANNEL, START, ForceTable, SriM8123
+from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.host import HostClock
-from brushloop.drivers.loopback import LoopbackServer, NotLoopback
+from brushloop.drivers.loopback import FaultRefused, LoopbackServer
+from brushloop.drivers.loopback import ask as ask_rig
 from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
+from brushloop.drivers.sim.brush.spec import SimFileError
 from brushloop.drivers.sim.config import SimConfig, View
-from brushloop.drivers.sim.faults import ALWAYS, Device, Fault, FaultBoard
-from brushloop.drivers.sim.rig import HOST, LoopbackRig
-from brushloop.drivers.sim.scene import Line, MjpegServer, Scene, board, homography
-from brushloop.drivers.sim.serve import ControlServer, serve
+from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
+from brushloop.drivers.sim.rig import HOST, ControlServer, LoopbackRig, live_control, serve
+from brushloop.drivers.sim.scene import MjpegServer, Scene, board, homography
 from brushloop.drivers.sim.world import World
+from tests.command import brushloop
 from tests.waiting import until
 
 
 @pytest.fixture
 def config(small_view: View) -> SimConfig:
     return SimConfig(rate=20.0, view=small_view)
-
-
-async def test_the_rigs_toml_names_the_addresses_as_served(rig: LoopbackRig):
-    table = tomllib.loads(rig.toml())
-    assert (table["robot"]["host"], table["robot"]["port"]) == (HOST, rig.arcs.port)
-    assert HOST == "127.0.0.1"
-    assert table["camera"]["source"] == f"http://{HOST}:{rig.camera.port}/stream.mjpg"
 
 
 async def test_a_taken_port_leaves_no_half_a_rig(config: SimConfig):
@@ -54,11 +54,17 @@ async def test_a_taken_port_leaves_no_half_a_rig(config: SimConfig):
             await asyncio.open_connection(HOST, rig.arcs.port)
 
 
-def test_serving_ends_by_itself_once_nobody_has_called_for_a_while(config: SimConfig, tmp_path: Path):
-    target = tmp_path / "rig.toml"
-    serve(config, target, idle_exit_s=0.2)
-    assert tomllib.loads(target.read_text())["robot"]["host"] == HOST
+def test_serving_ends_by_itself_and_leaves_a_rig_toml_unless_another_file_stands_there(
+    config: SimConfig, tmp_path: Path
+):
+    target, lines = tmp_path / "rig.toml", list[str]()
+    serve(config, target, 0.2, lines.append, None)
+    assert tomllib.loads(target.read_text())["robot"]["host"] == HOST == "127.0.0.1"
     assert [p.name for p in tmp_path.iterdir()] == ["rig.toml"]
+    assert str(target) in lines[0]
+    target.write_text("name = 'our rig'")
+    with pytest.raises(SimFileError, match="was not written by a loopback rig"):
+        serve(config, target, 0.2, lines.append, None)
 
 
 async def test_a_rig_with_a_client_is_not_idle(rig: LoopbackRig):
@@ -72,8 +78,6 @@ async def test_a_rig_with_a_client_is_not_idle(rig: LoopbackRig):
 
 
 async def test_the_motion_queue_belongs_to_the_event_loops_thread(rig: LoopbackRig, monkeypatch: pytest.MonkeyPatch):
-    import threading
-
     seen: set[str] = set()
     advance = rig.world.motion.advance
 
@@ -82,26 +86,12 @@ async def test_the_motion_queue_belongs_to_the_event_loops_thread(rig: LoopbackR
         advance(now_s)
 
     monkeypatch.setattr(rig.world.motion, "advance", spy)
-    source = f"http://{HOST}:{rig.camera.port}/stream.mjpg"
+    source = tomllib.loads(rig.toml())["camera"]["source"]
     camera, clock = OpenCvCamera(CameraTable(kind="opencv", source=source), HostClock()), HostClock()
     await camera.connect()
     await camera.fresh(Stamp(clock.now_ns()))
     await camera.close()
     assert seen == {threading.current_thread().name}
-
-
-async def test_a_late_camera_notices_that_its_client_has_gone():
-    view = View(width_px=320, height_px=240, px_per_mm=0.9, fps=50.0, delay_s=0.05)
-    async with LoopbackRig(SimConfig(force_sensor=False, ink_device="none", view=view)) as rig:
-        reader, writer = await asyncio.open_connection(HOST, rig.camera.port)
-        writer.write(b"GET /stream.mjpg HTTP/1.0\r\n\r\n")
-        await reader.readexactly(2000)
-        assert rig.camera.clients == 1
-        writer.transport.abort()
-        await until(lambda: rig.camera.clients == 0, "the server to notice")
-
-
-ELSEWHERE = ["0.0.0.0", "::", "", "192.168.1.10", "10.0.0.1", "8.8.8.8", "example.org", "localhost", "fe80::1"]
 
 
 def test_these_are_all_the_servers_there_are():
@@ -113,23 +103,15 @@ def test_these_are_all_the_servers_there_are():
     assert all(k.start is LoopbackServer.start for k in ours), "a server that listens in its own way must refuse too"
 
 
-@pytest.mark.parametrize("host", ELSEWHERE)
+@pytest.mark.parametrize(
+    "host", ["0.0.0.0", "::", "", "192.168.1.10", "10.0.0.1", "8.8.8.8", "example.org", "localhost", "fe80::1"]
+)
 async def test_a_server_refuses_any_address_that_is_not_loopback(host: str):
-    server = ArcsServer(World(SimConfig()))
-    with pytest.raises(NotLoopback) as caught:
+    server = LoopbackServer()
+    with pytest.raises(ValueError, match=re.escape(repr(host))):
         await server.start(host, 0)
-    assert caught.value.host == host
-    assert caught.value.exit_code == 2
-    assert server._server is None
-
-
-@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2"])
-async def test_a_loopback_address_is_served(host: str):
-    server = ArcsServer(World(SimConfig()))
-    await server.start(host, 0)
-    _, writer = await asyncio.open_connection(host, server.port)
-    writer.close()
-    await writer.wait_closed()
+    assert server.port == 0
+    await server.start("127.0.0.2", 0)
     await server.stop()
 
 
@@ -168,9 +150,106 @@ async def test_a_force_sensor_that_was_silent_is_heard_again_as_soon_as_the_faul
     rounds = sensor.stream.rounds
     await until(lambda: sensor.stream.rounds > rounds, "a round")
     await sensor.close()
-    bare = FaultBoard(rig.world, [Device.INK])
-    with pytest.raises(ValueError, match="device = 'ink': this rig has none"):
-        bare.hang(Fault(device=Device.INK, kind="garbage"))
+
+
+Ask = Callable[..., Awaitable[dict[str, Any]]]
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "control"
+
+
+@pytest.fixture
+async def ask(rig: LoopbackRig, path: Path) -> AsyncIterator[Ask]:
+    async def exchange(do: object, **request: object) -> dict[str, Any]:
+        return await asyncio.to_thread(ask_rig, path, {"do": do, **request})
+
+    async with live_control(rig, path):
+        yield exchange
+    assert not path.exists()
+
+
+async def test_a_fault_is_hung_listed_and_taken_down(ask: Ask, rig: LoopbackRig):
+    fault = {"device": "robot", "kind": "mute", "on": "moveLine", "nth": 2}
+    assert await ask("add", fault=fault) == {"id": 1}
+    assert await ask("list") == {"hanging": [{"id": 1, "fault": fault, "struck": 0}]}
+    assert await ask("clear", id=7) == {"taken": 0}
+    assert await ask("clear", id=1) == {"taken": 1}
+    await ask("add", fault=fault)
+    assert await ask("clear") == {"taken": 1}
+    assert not rig.faults.hanging
+
+
+@pytest.mark.parametrize(
+    ("kind", "mode"), [("protective-stop", "ProtectiveStop"), ("emergency-stop", "RobotEmergencyStop")]
+)
+async def test_a_person_ends_a_stop_that_was_asked_for_and_the_state_tells(ask: Ask, kind: str, mode: str):
+    before = await ask("state")
+    assert (before["phase"], before["moving"], before["presses"], before["ink_load"]) == ("parked", False, 0, 0.0)
+    assert (before["robot_mode"], before["safety_mode"], before["faults"]) == ("PowerOff", "Normal", 0)
+    assert before["tip_mm"] == [250.0, -230.0, 260.0]
+    await ask("add", fault={"device": "robot", "kind": kind})
+    while (await ask("state"))["safety_mode"] != mode:
+        await asyncio.sleep(0.005)
+    assert await ask("release") == {"was": mode}
+    assert (await ask("state"))["safety_mode"] == "Normal"
+
+
+async def test_what_is_no_request_gets_one_line_and_the_next_is_answered(ask: Ask, path: Path):
+    requests = {
+        b"hello": "not JSON",
+        b'{"do": "explode"}': "not a request",
+        b'{"do": "clear", "nth": 1}': "not a request",
+        b'{"do": "add", "fault": {}}': "Field required",
+        b'{"do": "hand", "act": "mend"}': "there is no person here",
+    }
+    reader, writer = await asyncio.open_unix_connection(str(path))
+    for request, words in requests.items():
+        writer.write(request + b"\n")
+        answer = json.loads(await reader.readline())
+        assert (answer["ok"], answer["error"].isprintable()) == (False, True)
+        assert words in answer["error"]
+    writer.close()
+    await writer.wait_closed()
+
+
+async def test_only_its_owner_can_open_it_and_no_other_file_or_rig_is_pushed_aside(rig: LoopbackRig, path: Path):
+    async def refused(at: Path, words: str) -> None:
+        with pytest.raises(SimFileError, match=words):
+            async with live_control(rig, at):
+                pass
+
+    dead = path.with_name("dead")
+    async with live_control(rig, path):
+        mode = path.stat().st_mode
+        assert stat.S_ISSOCK(mode)
+        assert stat.S_IMODE(mode) == 0o600
+        await refused(path, "another rig listens here")
+        path.rename(dead)
+    async with live_control(rig, dead):  # replaced
+        pass
+    path.write_text("mine")
+    await refused(path, "exists and is not a socket")
+    assert path.read_text() == "mine"
+    await refused(path.with_name("x" * 120), "too long")  # the system would cut it
+    await refused(path / "no", "cannot listen here")
+
+
+async def test_a_person_breaks_the_rig_and_mends_it(ask: Ask, path: Path):
+    async def fault(*words: str) -> Any:
+        return await asyncio.to_thread(brushloop, "sim", "fault", path, *words)
+
+    added = await fault("robot", "mute", "--on", "moveLine", "--count", "3")
+    assert json.loads(added.stdout) == {"id": 1}
+    assert (await fault("robot", "loud")).stderr.startswith("brushloop: kind = 'loud' is not one of robot's")
+    assert json.loads((await fault("clear")).stdout) == {"taken": 1}
+
+
+def test_where_no_rig_answers_it_is_said_in_one_line(tmp_path: Path):
+    with pytest.raises(FaultRefused, match="no rig answers here") as caught:
+        ask_rig(tmp_path / "nobody", {"do": "state"})
+    assert caught.value.exit_code == 2
 
 
 CONFIG = SimConfig(view=View(width_px=1024, height_px=768, px_per_mm=3.125))
@@ -207,29 +286,25 @@ def test_corners_of_the_board_lie_where_the_optics_say(view: View):
     assert np.abs(np.mean(off_px, axis=0)).max() < 0.1
 
 
-def test_noise_is_new_in_every_frame(scene: Scene):
-    assert not np.array_equal(scene.render(), scene.render())
-
-
 def test_ink_shows_in_the_very_next_frame():
     world = World(CONFIG)
     scene = Scene(world)
-    before = gray_at(scene.render(), 60.0, 60.0)
+    image = scene.render()
+    before = gray_at(image, 60.0, 60.0)
+    assert not np.array_equal(image, scene.render()), "the noise is new"
     world.paper.density = np.ones_like(world.paper.density)
     world.version += 1
     assert gray_at(scene.render(), 60.0, 60.0) < 0.3 * before
 
 
 def test_the_arm_hides_what_is_under_it():
-    table = CONFIG.table
-    assert table.yaw_deg == 90.0
-    home = (table.origin_mm[0] - 74.0, table.origin_mm[1] + 82.0, 260.0)  # over (82, 74) of the sheet
+    home = CONFIG.table.to_base(82.0, 74.0, 140.0)
     image = Scene(World(replace(CONFIG, home_mm=home))).render()
     assert gray_at(image, 82.0, 74.0) == pytest.approx(70.0, abs=3.0)
 
 
 def test_a_frame_rendered_for_a_known_tool_leaves_the_world_alone(scene: Scene, monkeypatch: pytest.MonkeyPatch):
-    tool = scene.tool()
+    tool = brush_pose(250.0, -230.0, 260.0)
 
     def nobody_may_ask(_: World) -> None:
         raise AssertionError("the world was moved on from the rendering thread")
@@ -238,52 +313,52 @@ def test_a_frame_rendered_for_a_known_tool_leaves_the_world_alone(scene: Scene, 
     scene.render(tool)
 
 
-class Loop:
-    """A clock that stands still, and what is due on it."""
+async def test_no_late_picture_overtakes_another_and_the_server_notices_that_its_client_has_gone():
+    view = View(width_px=320, height_px=240, px_per_mm=0.9, fps=50.0, delay_s=0.05, delay_jitter_s=0.2)
+    async with LoopbackRig(SimConfig(force_sensor=False, ink_device="none", view=view)) as rig:
+        rig.faults.hang(Fault(device=Device.CAMERA, kind="frozen", count=ALWAYS))  # numbers its pictures
+        reader, writer = await asyncio.open_connection(HOST, rig.camera.port)
+        writer.write(b"GET /stream.mjpg HTTP/1.0\r\n\r\n")
+        numbers: list[int] = []
+        while len(numbers) < 20:
+            await reader.readuntil(b"\xff\xd8\xff\xfe")
+            length = int.from_bytes(await reader.readexactly(2), "big")
+            numbers.append(int(await reader.readexactly(length - 2)))
+        assert numbers == sorted(numbers)
+        assert rig.camera.clients == 1
+        writer.transport.abort()
+        await until(lambda: rig.camera.clients == 0, "the server to notice")
+
+
+class Slow:
+    """A connection whose client has taken nothing until `taken` is set."""
 
     def __init__(self) -> None:
-        self.now_s = 100.0
-        self.due_s: list[float] = []
-
-    def time(self) -> float:
-        return self.now_s
-
-    def call_at(self, when_s: float, _call: Callable[..., None], _data: bytes) -> None:
-        self.due_s.append(when_s)
-
-
-class Open:
-    """A connection; its client has taken everything once `taken` is set."""
-
-    def __init__(self) -> None:
-        self.taken = asyncio.Event()
-        self.taken.set()
+        self.taken, self.waits = asyncio.Event(), asyncio.Event()
 
     def is_closing(self) -> bool:
         return False
 
+    def write(self, _: bytes) -> None:
+        pass
+
     async def drain(self) -> None:
+        self.waits.set()
         await self.taken.wait()
 
 
-async def test_the_time_to_draw_a_picture_is_a_part_of_its_delay_and_no_picture_overtakes_another() -> None:
-    loop, line = Loop(), Line(View(delay_s=0.3, delay_jitter_s=0.0), cast("asyncio.StreamWriter", Open()))
-    line._loop = cast("asyncio.AbstractEventLoop", loop)
-    line._last_s = loop.now_s
-    for drawn_s in (0.05, 0.0, 2.0, 0.0):
-        exposed_s = loop.now_s
-        loop.now_s += drawn_s
-        await line.send(b"picture", exposed_s)
-    assert loop.due_s == pytest.approx([100.3, 100.35, 100.35, 102.35], abs=1e-3)
-    assert loop.due_s == sorted(set(loop.due_s))
+async def test_a_client_that_reads_too_slowly_is_sent_no_further_picture_until_it_has_taken_the_earlier_ones():
+    image, drawn, client = np.zeros((8, 8), np.uint8), list[Pose](), Slow()
 
+    def render(tool: Pose) -> np.ndarray:
+        drawn.append(tool)
+        return image
 
-async def test_a_client_that_reads_too_slowly_is_sent_no_further_picture_until_it_has_taken_the_earlier_ones() -> None:
-    client = Open()
-    client.taken.clear()
-    line = Line(View(delay_s=0.3), cast("asyncio.StreamWriter", client))
-    sending = asyncio.create_task(line.send(b"picture", 0.0))
-    await asyncio.sleep(0)
-    assert not sending.done()
+    server = MjpegServer(World(CONFIG), render, View(fps=1000.0, delay_s=0.3))
+    streaming = asyncio.create_task(server._stream(cast("asyncio.StreamWriter", client)))
+    await client.waits.wait()
+    await asyncio.sleep(0.02)
+    assert len(drawn) == 1
     client.taken.set()
-    await sending
+    await until(lambda: len(drawn) > 1, "the next picture")
+    streaming.cancel()

@@ -17,9 +17,9 @@ from brushloop.drivers.arcs.wire import RpcConnection, open_arcs
 from brushloop.drivers.geometry import from_wire
 from brushloop.drivers.loopback import FaultRefused
 from brushloop.drivers.sim.kinematics import forward, inverted, matrix_of, pose_of
-from brushloop.drivers.sim.lab import ARCS_PORT, UnknownLab
+from brushloop.drivers.sim.lab import ARCS_PORT, LabRefused, UnknownLab
 from brushloop.drivers.sim.lab_facts import CORNERS, corner, draw, in_picture
-from brushloop.drivers.sim.serve import LabRefused, live_control
+from brushloop.drivers.sim.rig import live_control
 from brushloop.drivers.sim.world import tool_of
 
 SMALL_PX = (640, 480)
@@ -110,7 +110,7 @@ def test_what_is_seen_names_no_truth(lab: UnknownLab):
 )
 async def test_what_a_person_cannot_do_is_named(request_: dict[str, object], words: str):
     with pytest.raises(ValueError, match=words):
-        await lab_of(4).obey(request_)
+        await lab_of(4).hand(request_)
 
 
 def run(*arguments: str) -> str:
@@ -134,7 +134,7 @@ def test_options_that_do_not_go_together_are_refused(arguments: tuple[str, ...],
 
 async def test_a_person_at_the_command_line_guides_the_arm(tmp_path: Path):
     lab, socket = lab_of(4), tmp_path / "lab.sock"
-    async with live_control(lab.rig, socket, lab.obey):
+    async with live_control(lab, socket):
         said = await asyncio.to_thread(
             run, "sim", "hand", str(socket), "bring", "board-corner", "--corner", "lower left"
         )
