@@ -88,9 +88,8 @@ THINGS = (
 TOUCHED = ("pin", "board-corner", "sheet-corner", "well-rim", "wash-rim")
 """Things that the tip touches; it is brought to the others by eye."""
 WALL_GRAY, WALL_NOISE = 185, 2.0
-ADDRESSES = 200
-"""Labs of one seed that can be open at once on a machine."""
 _labs = itertools.count()
+"""Of this process: each lab has an address of its own."""
 
 
 class UnknownLab(LoopbackRig):
@@ -105,7 +104,7 @@ class UnknownLab(LoopbackRig):
         clean = draw(seed, rate, picture_px)
         self.facts, self._mended = (clean, clean) if trap is None else trapped(clean, trap)
         """The lab as it is now, and once the mistake is corrected."""
-        self.host = f"127.16.{seed % 250 + 1}.{10 + (os.getpid() + next(_labs)) % ADDRESSES}"
+        self.host = f"127.{16 + seed % 200}.{os.getpid() % 250 + 1}.{next(_labs) % 250 + 1}"
         """The address that the pendant shows."""
         self.streams = tuple(f"http://{self.host}:{port}/stream.mjpg" for port in CAMERA_PORTS)
         """The addresses on the stickers of the cameras."""
@@ -189,7 +188,10 @@ class UnknownLab(LoopbackRig):
             return {"reached": False, "says": trouble}
         short_mm = await self.guide(aim, along_brush=to == "pin")
         if to in TOUCHED:
-            self._touched()
+            self._touches += 1
+        if self._touches == self.facts.cable_after and not self._pulled:  # somebody trips over it
+            lost = ((Device.ROBOT, "deaf"), (Device.TELEMETRY, "mute"))
+            self._pulled = [self.faults.hang(Fault(device=d, kind=kind, count=ALWAYS)) for d, kind in lost]
         if short_mm > 0.0:
             return {"reached": False, "says": f"The arm is stretched out, {short_mm:.0f} mm before the {to}."}
         return {"reached": True, "says": f"The tip is at the {to}{f', {corner}' if corner else ''}."}
@@ -269,18 +271,18 @@ class UnknownLab(LoopbackRig):
             if facts.swapped is not None and name in facts.swapped:
                 name = facts.swapped[1 - facts.swapped.index(name)]
             return corner(table, to.removesuffix("-corner"), name)
-        places = {
+        (x, y), (wash_x, wash_y) = table.well_mm, facts.wash_mm
+        in_picture = facts.trap is Trap.PARK_IN_PICTURE
+        return {
             "pin": facts.pin_mm,
             "upright": over_sheet(table, UPRIGHT_ABOVE_MM),
-            "park": facts.park_mm,
+            "well": table.to_base(x, y, DIP_ABOVE_BOTTOM_MM),
+            "well-rim": table.to_base(x, y + table.well_radius_mm, table.well_depth_mm),
+            "wash-pot": table.to_base(wash_x, wash_y, DIP_ABOVE_BOTTOM_MM),
+            "wash-rim": table.to_base(wash_x, wash_y + table.well_radius_mm, table.well_depth_mm),
+            "park": over_sheet(table, facts.park_mm[2] - table.paper_z_mm) if in_picture else facts.park_mm,
             "clear-view": facts.clear_mm,
-        }
-        for pot, (x, y) in (("well", table.well_mm), ("wash", facts.wash_mm)):
-            places[f"{pot}-rim"] = table.to_base(x, y + table.well_radius_mm, table.well_depth_mm)
-            places["well" if pot == "well" else "wash-pot"] = table.to_base(x, y, DIP_ABOVE_BOTTOM_MM)
-        if facts.trap is Trap.PARK_IN_PICTURE:
-            places["park"] = over_sheet(table, facts.park_mm[2] - table.paper_z_mm)
-        return places[to]
+        }[to]
 
     def _luck(self, to: str, index: int, name: str) -> np.random.Generator:
         key = f"{to} {index} {name}"
@@ -322,26 +324,15 @@ class UnknownLab(LoopbackRig):
             if joints is not None:
                 way.append(joints)
                 near, reached = joints, pose
-        await self._move(way)
-        return math.dist(reached.position_mm, aim.position_mm)
-
-    async def _move(self, way: list[Joints]) -> None:
-        world, motion = self.world, self.world.motion
-        world.hand_guided = True
+        self.world.hand_guided = True
         try:
             for joints in way:
-                motion.add_joints(joints, SPEED_RAD_S, ACC_RAD_S2, world.clock.now_s())
-            while world.target() is not None:
+                self.world.motion.add_joints(joints, SPEED_RAD_S, ACC_RAD_S2, self.world.clock.now_s())
+            while self.world.target() is not None:
                 await asyncio.sleep(LOOK_S)
         finally:
-            world.hand_guided = False
-
-    def _touched(self) -> None:
-        """Count another touched thing; with one trap, somebody then trips over the cable."""
-        self._touches += 1
-        if self._touches == self.facts.cable_after:
-            lost = ((Device.ROBOT, "deaf"), (Device.TELEMETRY, "mute"))
-            self._pulled = [self.faults.hang(Fault(device=d, kind=kind, count=ALWAYS)) for d, kind in lost]
+            self.world.hand_guided = False
+        return math.dist(reached.position_mm, aim.position_mm)
 
 
 def _error_mm(rng: np.random.Generator, spread_mm: float) -> list[float]:

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self, cast
 
+import jinja2
+
 from brushloop.drivers.force.simulator import ForceBoard, SocketcandServer
 from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL, Wrench
 from brushloop.drivers.geometry import inverse, of_angles, product, turned
@@ -26,6 +28,8 @@ from brushloop.drivers.sim.faults import Device, FaultBoard, fault_of
 from brushloop.drivers.sim.scene import MjpegServer, Scene
 from brushloop.drivers.sim.world import World
 
+TEMPLATE = Path(__file__).with_name("rig.toml.j2")
+"""Of the `rig.toml`, as an operator would have taught it."""
 LOOPBACK_HEAD = "# The loopback rig"
 TAUGHT_TOUCH_ERROR_MM = 0.03
 """Error of a taught touch height."""
@@ -50,89 +54,19 @@ class Addresses:
 
 def rig_toml(config: SimConfig, at: Addresses) -> str:
     """TOML text; addresses as served."""
-    table, view, brush = config.table, config.view, config.brush
-    touch_z_mm = table.paper_z_mm + TAUGHT_TOUCH_ERROR_MM
-    device = {
-        "station": f'kind = "ink-station"\nport = "{at.ink_path}"\nlight = 0.8\n',
-        "pump": f'kind = "modbus-pump"\nport = "{at.ink_path}"\nml_per_revolution = {PUMP_ML}\n',
-    }
-    ink_device = f"\n[ink.device]\n{device[config.ink_device]}" if config.ink_device in device else ""
-    fast = f"simulated time runs at {config.rate:g} times real time"
-    # A whole dwell could pass between two polls, and the age of a sample says little about the arm.
-    least_dwell = f"least_dwell_s = {SEEN_S * config.rate:g}    # {fast}\n" if config.rate > 2.0 else ""
-    stale = "100.0" if config.rate <= 1.0 else f"1000.0    # allowed on this bus alone: {fast}"
-    force = f"""
-[force]
-kind = "sri-m8123"
-interface = "socketcand"
-channel = "{LOOPBACK_CHANNEL}"
-host = "{at.host}"
-port = {at.force_port}
-stale_ms = {stale}
-"""
-    head = config.head
-    quality = "" if head is None else f"\n[quality]\nhead_mm = {head.head_mm}\nmisplaced_mm = {head.misplaced_mm}\n"
-    return f"""\
-{LOOPBACK_HEAD}, seed {config.seed}. Simulated: nothing measured on it is a result on paper.
-name = "loopback rig"
-
-[robot]
-kind = "aubo-arcs"
-host = "{at.host}"
-port = {at.arcs_port}
-rtde_port = {at.rtde_port}
-tcp_offset_mm = [0.0, 0.0, 180.0]
-
-[robot.limits]
-x_mm = [200.0, 640.0]
-y_mm = [-260.0, 260.0]
-z_mm = [95.0, 400.0]
-tilt_deg = 15.0
-speed_mm_s = 250.0
-acc_mm_s2 = 1000.0
-
-[camera]
-kind = "opencv"
-source = "http://{at.host}:{at.camera_port}/stream.mjpg"
-latency_ms = 250.0
-max_delay_ms = 3000.0     # drawn and encoded on the same machine as the run, a picture may be late
-max_jitter_ms = 2000.0
-lens = "simulated, {view.px_per_mm:g} px/mm, no distortion"
-
-[brush]
-name = "{config.brush_name or f"simulated bristle bundle, seed {brush.seed}"}"
-radius_mm = {brush.radius_mm}
-length_mm = {brush.length_mm}
-max_depth_mm = 22.0
-
-[paper]
-name = "simulated Xuan paper"
-origin_mm = [{table.origin_mm[0]}, {table.origin_mm[1]}]
-yaw_deg = {table.yaw_deg}
-touch_z_mm = {touch_z_mm:.3f}
-size_mm = [{table.sheet_mm[0]}, {table.sheet_mm[1]}]
-cell_mm = [40.0, 24.0]
-touch_point_mm = [2.0, 2.0]
-
-[ink]
-name = "simulated ink"
-well_mm = [{table.well_mm[0]}, {table.well_mm[1]}]
-dip_z_mm = {table.paper_z_mm + table.ink_level_mm - 8.0}
-{ink_device}{"" if at.force_port is None else force}
-[board]
-squares = [{table.board_squares[0]}, {table.board_squares[1]}]
-square_mm = {table.board_square_mm}
-marker_mm = {table.board_marker_mm}
-dictionary = "{table.board_dictionary}"
-origin_mm = [{table.board_origin_mm[0]}, {table.board_origin_mm[1]}]
-
-[motion]
-safe_z_mm = {table.paper_z_mm + 60.0}
-park_mm = [{config.home_mm[0]}, {config.home_mm[1]}, {config.home_mm[2]}]
-travel_speed_mm_s = 200.0
-press_speed_mm_s = 20.0
-acc_mm_s2 = 800.0
-{least_dwell}{quality}"""
+    environment = jinja2.Environment(
+        undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
+    )
+    return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
+        head=LOOPBACK_HEAD,
+        config=config,
+        table=config.table,
+        at=at,
+        touch_error_mm=TAUGHT_TOUCH_ERROR_MM,
+        seen_s=SEEN_S,
+        pump_ml=PUMP_ML,
+        bus=LOOPBACK_CHANNEL,
+    )
 
 
 HOST = "127.0.0.1"

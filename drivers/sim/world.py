@@ -151,7 +151,6 @@ class Press:
     ink_load: float
     flaw: Flaw | None = None
     """The flaw of the mark: scripted, a spontaneous split, or caused by the ink load."""
-    severity: float = 0.0
 
 
 class World:
@@ -255,9 +254,8 @@ class World:
         self.paper.lay_later(make, x_mm, y_mm, heading_deg)
         want = flaw_of_load(self.ink_load)
         if want is Flaw.BLANK or (flaw is None and want is not None):
-            # no ink on the hairs, or too little for the mark
-            flaw, severity = want, 1.0 - self.ink_load
-        self.presses.append(Press(x_mm, y_mm, depth_mm, tilt_deg, heading_deg, self.ink_load, flaw, severity))
+            flaw = want  # no ink on the hairs, or too little for the mark
+        self.presses.append(Press(x_mm, y_mm, depth_mm, tilt_deg, heading_deg, self.ink_load, flaw))
         self.ink_load = max(0.0, self.ink_load - INK_PER_PRESS)
         self.version += 1
 

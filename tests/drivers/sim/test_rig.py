@@ -21,10 +21,8 @@ import pytest
 
 from brushloop.drivers.camera import CameraTable, OpenCvCamera
 from brushloop.drivers.devices import Pose, Stamp
-from brushloop.drivers.force import sri_m8123
 from brushloop.drivers.force.simulator import FRAME_S, ForceBoard, SocketcandServer
-from brushloop.drivers.force.sri_m8123 import COMMAND_ID, LOOPBACK_CHANNEL, START, ForceTable, SriM8123
-from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.force.sri_m8123 import COMMAND_ID, LOOPBACK_CHANNEL, START
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.loopback import FaultRefused, LoopbackServer
 from brushloop.drivers.loopback import ask as ask_rig
@@ -132,24 +130,6 @@ async def test_the_frames_of_a_round_are_one_burst_on_a_busy_computer(monkeypatc
     await writer.wait_closed()
     await server.stop()
     assert [b - a for a, b in itertools.pairwise(times_s)] == pytest.approx([FRAME_S, FRAME_S], abs=1e-6)
-
-
-async def test_a_force_sensor_that_was_silent_is_heard_again_as_soon_as_the_fault_is_cleared(
-    rig: LoopbackRig, monkeypatch: pytest.MonkeyPatch
-):
-    assert rig.force is not None
-    monkeypatch.setattr(sri_m8123, "ROUND_S", 0.5)  # a busy machine pauses within a round
-    table = ForceTable(
-        kind="sri-m8123", interface="socketcand", channel=LOOPBACK_CHANNEL, host=HOST, port=rig.force.port, stale_ms=2e3
-    )
-    sensor = SriM8123(table, HostClock())
-    await sensor.connect()
-    rig.faults.hang(Fault(device=Device.FORCE, kind="silence", count=ALWAYS))
-    await until(lambda: rig.faults.hanging[0].struck > 10, "silent rounds")
-    assert rig.faults.clear() == 1
-    rounds = sensor.stream.rounds
-    await until(lambda: sensor.stream.rounds > rounds, "a round")
-    await sensor.close()
 
 
 Ask = Callable[..., Awaitable[dict[str, Any]]]
@@ -301,16 +281,6 @@ def test_the_arm_hides_what_is_under_it():
     home = CONFIG.table.to_base(82.0, 74.0, 140.0)
     image = Scene(World(replace(CONFIG, home_mm=home))).render()
     assert gray_at(image, 82.0, 74.0) == pytest.approx(70.0, abs=3.0)
-
-
-def test_a_frame_rendered_for_a_known_tool_leaves_the_world_alone(scene: Scene, monkeypatch: pytest.MonkeyPatch):
-    tool = brush_pose(250.0, -230.0, 260.0)
-
-    def nobody_may_ask(_: World) -> None:
-        raise AssertionError("the world was moved on from the rendering thread")
-
-    monkeypatch.setattr(World, "tool", nobody_may_ask)
-    scene.render(tool)
 
 
 async def test_no_late_picture_overtakes_another_and_the_server_notices_that_its_client_has_gone():
