@@ -197,12 +197,17 @@ def components(
         candidates = near if near.size else candidates
     main = int(candidates[np.argmax(areas[candidates - 1])])
     others = [k for k in range(1, count) if k != main and areas[k - 1] >= speck_share * areas[main - 1]]
-    joined: list[int] = []
-    if others:
-        away_px = np.asarray(cv2.distanceTransform((labels != main).astype(np.uint8), cv2.DIST_L2, 5), np.float32)
-        joined = [k for k in others if float(away_px[labels == k].min()) <= join_mm * PX_PER_MM]
+    joined = parts_near(labels, main, others, join_mm * PX_PER_MM)
     others_mm2 = [float(areas[label - 1]) / PX_PER_MM**2 for label in others if label not in joined]
     return np.isin(labels, [main, *joined]), others_mm2
+
+
+def parts_near(labels: cv2.typing.MatLike, main: int, others: list[int], reach_px: float) -> list[int]:
+    """Those of the `others` that come within `reach_px` of the component `main`; `labels` (h, w) numbers them all."""
+    if not others:
+        return []
+    away_px = np.asarray(cv2.distanceTransform((labels != main).astype(np.uint8), cv2.DIST_L2, 5), np.float32)
+    return [label for label in others if float(away_px[labels == label].min()) <= reach_px]
 
 
 def _within(labels: NDArray[np.int32], point: tuple[float, float], radius: float) -> NDArray[np.int64]:
