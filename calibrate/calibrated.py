@@ -6,7 +6,6 @@ The page shows the corners over the photograph with residual arrows, and the sca
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy as np
 
 from brushloop.calibrate.artefact import made_by, put_to_use
 from brushloop.calibrate.board.detect import find_board
-from brushloop.calibrate.board.lens import FITTED, RMS_LIMIT_PX, Floats, Gray, fit_lens, read_lens, rms
+from brushloop.calibrate.board.lens import FITTED, RMS_LIMIT_PX, Floats, Gray, fit_lens, read_lens
 from brushloop.calibrate.board.pix2len import local_scale, paper_mm, see_board_and_lens
 from brushloop.calibrate.board.spec import BoardView, describe, named_board
 from brushloop.calibrate.commands import CalibrateRequest, LensRequest
@@ -44,8 +43,8 @@ LEAST_PX_PER_MM = 4.0
 """Below this a tip of 0.5 mm is two pixels wide."""
 WORST_INTERVAL = 5e-4
 """Relative half width of pix2len's interval: 0.01 mm over 20 mm."""
-ARROW_SHARE = 0.4
-"""Length of a typical arrow, as a share of the distance between corners."""
+ARROW_TIMES = 100
+"""How much longer than its residual each arrow is drawn, on every page, so that pages can be compared."""
 SIDE_POINTS = 9
 SCALE_GRID = (17, 13)
 
@@ -168,8 +167,7 @@ def _picture(calibration: Calibration, image: Gray, view: BoardView) -> dict[str
     off = view.pixels - expected
     dropped = np.zeros(len(off), np.bool_)
     dropped[np.argsort(-np.linalg.norm(off, axis=1))[: calibration.corners_dropped]] = True
-    times = _times(expected, off[~dropped])
-    ends = expected + times * off
+    ends = expected + ARROW_TIMES * off
     rows = zip(view.pixels.round(1).tolist(), expected.round(1).tolist(), ends.round(1).tolist(), strict=True)
     corners = [
         {"at": at, "from": start, "to": end, "off_px": round(float(np.hypot(*residual)), 2), "dropped": bool(out)}
@@ -180,18 +178,9 @@ def _picture(calibration: Calibration, image: Gray, view: BoardView) -> dict[str
         "width": width,
         "height": height,
         "unit": round(width / 1000, 2),
-        "times": f"{times:g}",
+        "times": ARROW_TIMES,
         "corners": corners,
     }
-
-
-def _times(expected: Floats, off: Floats) -> float:
-    """How much longer than a residual its arrow is: 1, 2 or 5 times a power of ten."""
-    apart = np.linalg.norm(expected[:, None] - expected[None], axis=2)
-    np.fill_diagonal(apart, np.inf)
-    wanted = max(1.0, ARROW_SHARE * float(np.median(apart.min(axis=1))) / max(rms(off), 1e-6))
-    power = 10.0 ** math.floor(math.log10(wanted))
-    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= wanted)
 
 
 def _outline(calibration: Calibration, sheet_mm: tuple[float, float]) -> Floats:

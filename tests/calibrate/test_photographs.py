@@ -57,39 +57,30 @@ def test_width_is_fitted_against_depth_in_a_report_that_fetches_nothing(tmp_path
     assert "<script" not in page
 
 
-some_or_all = pytest.mark.parametrize("each", [6, pytest.param(1, marks=pytest.mark.soak)], ids=["some", "all"])
-
-
-def imported(name: str, each: int, tmp_path: Path) -> Path:
-    """A session of each n-th photograph, validated."""
+@real
+@pytest.mark.parametrize(
+    ("name", "strokes", "least"),
+    [
+        # One of these photographs is blank, and some strokes are bent.
+        ("frida_bigbrush_tilt_16x20", 31, {"length_mm": 0.95, "depth_mid_mm_nominal": 0.8}),
+        # Specks and neighbours: their bounding box follows the command with r = .12 only.
+        ("frida_ink_10x8", 24, {"length_mm": 0.9}),
+    ],
+)
+def test_real_dragged_strokes_are_all_found_and_follow_their_commands(
+    tmp_path: Path, name: str, strokes: int, least: dict[str, float]
+) -> None:
+    """Every sixth photograph of each set, by the correlation of what was commanded and measured."""
     table = tmp_path / "strokes.csv"
-    head, *rows = (DATA / name / "strokes.csv").read_text().splitlines()
-    table.write_text("\n".join([head, *rows[::each]]) + "\n")
-    made = brushloop("sessions", "import", DATA / name, "--csv", table, "--kind", "drag", cwd=tmp_path)
-    assert made.returncode == 0, made.stderr
+    head, *lines = (DATA / name / "strokes.csv").read_text().splitlines()
+    table.write_text("\n".join([head, *lines[::6]]) + "\n")
+    imported = brushloop("sessions", "import", DATA / name, "--csv", table, "--kind", "drag", cwd=tmp_path)
+    assert imported.returncode == 0, imported.stderr
     ran = brushloop("validate", tmp_path / "sessions" / name, cwd=tmp_path)
     assert ran.returncode == 0, ran.stderr
-    return tmp_path / "sessions" / name
-
-
-def correlation(rows: list[dict[str, str]], x: str, y: str) -> float:
-    return float(np.corrcoef([float(r[x]) for r in rows], [float(r[y]) for r in rows])[0, 1])
-
-
-@real
-@some_or_all
-def test_real_dragged_strokes_are_all_found_and_open_with_depth(tmp_path: Path, each: int) -> None:
-    rows = measured(imported("frida_bigbrush_tilt_16x20", each, tmp_path))
-    assert len(rows) == (189 if each == 1 else 31)  # of 190: one photograph is blank, and is named in the report
-    assert correlation(rows, "commanded_length_mm", "measured_length_mm") > 0.95
-    least = 0.9 if each == 1 else 0.8  # of 31 strokes, a few that are bent weigh more
-    assert correlation(rows, "commanded_depth_mid_mm_nominal", "measured_mid_width_mm") > least
-
-
-@real
-@some_or_all
-def test_real_ink_with_specks_and_neighbours_does_not_break_segmentation(tmp_path: Path, each: int) -> None:
-    rows = measured(imported("frida_ink_10x8", each, tmp_path))
-    assert len(rows) == (140 if each == 1 else 24)
-    # The raw bounding box follows the command with r = .12 only.
-    assert correlation(rows, "commanded_length_mm", "measured_length_mm") > 0.9
+    rows = measured(tmp_path / "sessions" / name)
+    assert len(rows) == strokes
+    for command, correlation in least.items():
+        size = {"length_mm": "measured_length_mm"}.get(command, "measured_mid_width_mm")
+        pairs = np.array([(float(row[f"commanded_{command}"]), float(row[size])) for row in rows])
+        assert np.corrcoef(pairs.T)[0, 1] > correlation
