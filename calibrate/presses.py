@@ -50,8 +50,6 @@ class Press:
     measured: Measured
     cut: bool
     """Whether the stroke reaches the edge of its photograph, cell or field."""
-    flags: tuple[str, ...]
-    """Defects of the capture, although a stroke was found."""
 
     @property
     def condition(self) -> Condition:
@@ -129,7 +127,6 @@ def prepare_job(job: tuple[Capture, Calibration | None]) -> Arrays:
         "anchor_mm": np.array(prepared.anchor_px) / PX_PER_MM,
         "measured": np.array(astuple(measure(prepared.mask))),
         "cut": np.array(prepared.cut),
-        "flags": np.array(prepared.flags, np.str_),
     }
 
 
@@ -145,7 +142,6 @@ def press_of(header: Header, stroke: Stroke, arrays: Arrays) -> Press:
         (x_mm, y_mm),
         Measured(*arrays["measured"].tolist()),
         bool(arrays["cut"]),
-        tuple(arrays["flags"].tolist()),
     )
 
 

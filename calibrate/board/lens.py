@@ -230,7 +230,12 @@ def fit_lens(
     """
     useless = [f"{name}: {why}" for name, why in unusable.items()]
     where = f"{len(views) + len(unusable)} photographs"
-    _one_size(views, where)
+    sizes: dict[tuple[int, int], list[str]] = {}
+    for view in views:
+        sizes.setdefault(view.size_px, []).append(view.name)
+    if len(sizes) > 1:
+        problem = "; ".join(f"{w} x {h} px: {', '.join(names)}" for (w, h), names in sorted(sizes.items()))
+        raise CalibrationError(where, f"have several sizes, so they are of two cameras or settings ({problem})")
     kept, dropped = list(views), dict[str, float]()
     while True:
         if len(kept) < LEAST_VIEWS:
@@ -271,15 +276,6 @@ def fit_lens(
         photographs=dict(photographs),
         board=board,
     )
-
-
-def _one_size(views: Sequence[BoardView], where: str) -> None:
-    sizes: dict[tuple[int, int], list[str]] = {}
-    for view in views:
-        sizes.setdefault(view.size_px, []).append(view.name)
-    if len(sizes) > 1:
-        problem = "; ".join(f"{w} x {h} px: {', '.join(names)}" for (w, h), names in sorted(sizes.items()))
-        raise CalibrationError(where, f"have several sizes, so they are of two cameras or settings ({problem})")
 
 
 def _focal(views: Sequence[BoardView], ways: Ways, where: str) -> tuple[float, float] | None:

@@ -111,7 +111,12 @@ def prepare(
     # Only the cell: neighbours' ink and the table's edge would distort the estimated lighting.
     reflectance = np.ones(raster.shape, np.float32)
     reflectance[window] = flatten(raster[window])
-    _check_contrast(reflectance[window], where)
+    # The darkest GATE_MM2 is an area rather than a share, so that the picture's size does not matter.
+    pixels = reflectance[window].ravel()
+    kth = min(round(GATE_MM2 * PX_PER_MM**2), pixels.size - 1)
+    contrast = 1.0 - float(np.partition(pixels, kth)[kth])
+    if contrast < CONTRAST_GATE:
+        raise CaptureRefused(where, f"is blank: darkest ink {contrast:.2f} below paper, gate {CONTRAST_GATE}")
     otsu, _ = cv2.threshold(to_levels(reflectance[window]), 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
     ink = to_levels(reflectance) <= round(otsu)
     mask, others_mm2 = components(ink, anchor_px, join_mm, speck_share)
@@ -119,16 +124,6 @@ def prepare(
         raise CaptureRefused(where, "holds no stroke after specks and neighbours were removed")
     flags = _flags(raster[window], mask[window], others_mm2)
     return Prepared(mask, _soft_ink(reflectance, mask), ink, anchor_px, touches_edge(mask[window]), flags)
-
-
-def _check_contrast(reflectance: Soft, where: str) -> None:
-    """Raise `CaptureRefused` if the contrast is too low."""
-    # The darkest GATE_MM2 is an area rather than a share, so that the picture's size does not matter.
-    pixels = reflectance.ravel()
-    kth = min(round(GATE_MM2 * PX_PER_MM**2), pixels.size - 1)
-    contrast = 1.0 - float(np.partition(pixels, kth)[kth])
-    if contrast < CONTRAST_GATE:
-        raise CaptureRefused(where, f"is blank: darkest ink {contrast:.2f} below paper, gate {CONTRAST_GATE}")
 
 
 def to_levels(reflectance: Soft) -> Gray:

@@ -26,7 +26,7 @@ def pair_scores(step: float = 0.001) -> Scores:
     presses: list[Press] = []
     for k in range(6):
         stroke = Stroke(stroke_id=f"{k:03d}", kind="press", still=k, depth_mm=11.0 + k // 2, tilt_deg=0.0)
-        presses.append(Press("grid", "", stroke, blank, np.zeros((128, 128), np.float32), (0.0, 0.0), sizes, False, ()))
+        presses.append(Press("grid", "", stroke, blank, np.zeros((128, 128), np.float32), (0.0, 0.0), sizes, False))
     scores = Scores(presses, tuple(LEVELS))
     levels = np.array(list(LEVELS.values())) + step * np.arange(6)[:, None]
     scores.values[:] = np.stack([levels, levels - 0.1], axis=-1)[:, :, None]

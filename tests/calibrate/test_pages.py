@@ -78,7 +78,7 @@ def _loop(folder: Path) -> str:
         image[58:70, 40:end] = 255
         stroke = Stroke(stroke_id=name, kind="press", still=0, depth_mm=depth_mm, tilt_deg=5.0)
         images = np.stack([image] * len(KEYS))
-        return Press("grid", "", stroke, images, np.float32(image / 255), (29.0, 19.0), measured, False, ())
+        return Press("grid", "", stroke, images, np.float32(image / 255), (29.0, 19.0), measured, False)
 
     first, second = press("a-r01", 15.0, 90), press("a-r02", 15.0, 88)
     pairs = [Pair(first, press("a-r01~1", 14.6, 89), first.images)]

@@ -204,7 +204,7 @@ def test_the_table_is_in_order_of_capture_and_its_cells_in_order_of_session_and_
     presses: list[Press] = []
     for k, (name, at) in enumerate(order):
         stroke = Stroke(stroke_id=str(k), kind="press", still=k, depth_mm=at.depth_mm, tilt_deg=at.tilt_deg)
-        presses.append(Press(name, "", stroke, blank, np.zeros((128, 128), np.float32), (0.0, 0.0), sizes, False, ()))
+        presses.append(Press(name, "", stroke, blank, np.zeros((128, 128), np.float32), (0.0, 0.0), sizes, False))
     scores = Scores(presses, ["line", "circle"])
     assert scores.cells == [[1], [2], [0, 3], [5], [4]]
     assert scores.cell_of.tolist() == [2, 0, 1, 2, 4, 3]
