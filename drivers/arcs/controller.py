@@ -14,7 +14,7 @@ import asyncio
 import statistics
 import time
 from collections.abc import AsyncGenerator, Awaitable, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from typing import Any
@@ -317,7 +317,9 @@ async def survey(host: str, port: int, framing: Framing) -> list[dict[str, Any]]
     try:
         opened = await _exchange("connect", None, open_arcs(connection))
         if "result" not in opened["answer"]:
-            return [opened]
+            exchanges.append(opened)
+            with suppress(DeviceError):  # a cabinet that does not answer the login may answer the rest
+                await connection.open(login=False)
         await ask("SystemInfo.getInterfaceVersionCode")
         await ask("getRobotNames")
         names = results.get("getRobotNames")

@@ -281,7 +281,7 @@ class RpcConnection:
                 self._lost = str(reader.exception() or "the controller closed the connection")
         return self._lost is not None
 
-    async def open(self) -> None:
+    async def open(self, *, login: bool = True) -> None:
         """Connect and log in with the factory account, which bare clients do not; closes what was open before.
 
         Raises `ConnectionLost` (refused) or `DeviceTimeout`. Then it counts as lost, so that its next user opens it.
@@ -290,7 +290,7 @@ class RpcConnection:
         try:
             self._stream = await self._connected()
             self._decoder = BareDecoder(DEVICE) if self._framing == "bare" else FrameDecoder(DEVICE)
-            if self._framing == "sof":
+            if login and self._framing == "sof":
                 token = f"__login__\naubo\n{FACTORY_LOGIN_TOKEN}\n{SDK_INTERFACE_VERSION}\n"
                 await self._exchange("", "login", encode(token.encode()))
         except BaseException:

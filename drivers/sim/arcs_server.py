@@ -69,14 +69,9 @@ def _write(writer: asyncio.StreamWriter, data: bytes) -> None:
 
 
 def _with_another_id(answer: bytes) -> bytes:
-    """A valid reply to another request; the login's reply, which has no id, becomes one with an id."""
-    try:
-        body = json.loads(answer)
-    except ValueError:
-        body = {"id": "", "jsonrpc": "2.0", "result": 0}
-    ident = body.get("id")
-    body["id"] = ident + 1000 if isinstance(ident, int) else "ZZZZZZZZ-ZZZZ-ZZZZ"
-    return json.dumps(body, separators=(",", ":")).encode()
+    """A valid reply to another request; the login's reply is no JSON, and becomes one."""
+    body: dict[str, Any] = json.loads(answer) if answer.startswith(b"{") else {"jsonrpc": "2.0", "result": 0}
+    return json.dumps({**body, "id": "ZZZZZZZZ-ZZZZ-ZZZZ"}, separators=(",", ":")).encode()
 
 
 INVALID_REQUEST, METHOD_NOT_FOUND, INVALID_PARAMS = -32600, -32601, -32602

@@ -29,6 +29,7 @@ from tests.drivers.arcs.transcript import (
     result,
     sends,
 )
+from tests.drivers.failing import mute_to
 
 REPORTS = sorted((Path(__file__).parent / "reports").glob("*.zip"))
 
@@ -198,6 +199,13 @@ async def test_what_is_no_request_gets_an_error_and_a_frame_may_be_short(
 @pytest.fixture(params=REPORTS, ids=lambda path: path.stem)
 def archive(request: pytest.FixtureRequest) -> Archive:
     return Archive.read(request.param)
+
+
+async def test_a_cabinet_that_does_not_answer_the_login_is_asked_all_the_same(cabinet: ArcsServer) -> None:
+    mute_to(cabinet, "login")
+    refused, first, *_ = await survey(HOST, cabinet.port, "sof")
+    assert refused["answer"] == {"silence": "no reply in 1 s"}
+    assert (first["method"], first["answer"]) == ("SystemInfo.getInterfaceVersionCode", {"result": 24000})
 
 
 async def test_the_same_questions_get_the_same_answers(archive: Archive) -> None:
