@@ -81,7 +81,11 @@ class LoopbackRig:
         self.config = config
         self._host = host
         self.world = World(config)
-        self.force = _force(self.world) if config.force_sensor else None
+        self.force = None
+        if config.force_sensor:
+            noise_n, noise_nm = config.force_noise_n, config.force_noise_nm
+            board = ForceBoard(self._wrench, noise_n=noise_n, noise_nm=noise_nm, seed=config.seed)
+            self.force = SocketcandServer(board, self.world.clock.now_s, rate_hz=config.force_hz)
         self.ink = _ink(self.world)
         missing = {Device.INK: self.ink, Device.FORCE: self.force}
         self.faults = FaultBoard(self.world, [device for device, server in missing.items() if server is None])
@@ -120,6 +124,16 @@ class LoopbackRig:
 
     async def __aexit__(self, *_: object) -> None:
         await self._open.aclose()
+
+    def _wrench(self, _t_s: float) -> Wrench:
+        """The wrench as the sensor reports it, whose axes and sign depend on how it is mounted."""
+        config, wrench = self.world.config, self.world.wrench()
+        about_x, about_y = (math.radians(v) for v in config.tool_lean_deg)
+        sensor = of_angles(0.0, 0.0, math.radians(config.sensor_turn_deg))
+        brush_in_sensor = product(inverse(sensor), of_angles(about_x, about_y, 0.0))
+        force_n, torque_nm = (turned(brush_in_sensor, part) for part in (wrench[:3], wrench[3:]))
+        fx, fy, fz, mx, my, mz = (config.sensor_sign * value for value in (*force_n, *torque_nm))
+        return fx, fy, fz, mx, my, mz
 
     async def _stop(self) -> None:
         for server in self.servers:
@@ -165,27 +179,6 @@ class LoopbackRig:
             if any(server.clients for server in self.servers):
                 since = loop.time()
             await asyncio.sleep(0.2)
-
-
-def _force(world: World) -> SocketcandServer:
-    config = world.config
-    board = ForceBoard(
-        lambda _t_s: _at_sensor(world.config, world.wrench()),
-        noise_n=config.force_noise_n,
-        noise_nm=config.force_noise_nm,
-        seed=config.seed,
-    )
-    return SocketcandServer(board, world.clock.now_s, rate_hz=config.force_hz)
-
-
-def _at_sensor(config: SimConfig, wrench: Wrench) -> Wrench:
-    """The wrench as the sensor reports it, whose axes and sign depend on how it is mounted."""
-    about_x, about_y = (math.radians(v) for v in config.tool_lean_deg)
-    sensor = of_angles(0.0, 0.0, math.radians(config.sensor_turn_deg))
-    brush_in_sensor = product(inverse(sensor), of_angles(about_x, about_y, 0.0))
-    force_n, torque_nm = (turned(brush_in_sensor, part) for part in (wrench[:3], wrench[3:]))
-    fx, fy, fz, mx, my, mz = (config.sensor_sign * value for value in (*force_n, *torque_nm))
-    return fx, fy, fz, mx, my, mz
 
 
 def _ink(world: World) -> PtyLine | None:
@@ -286,7 +279,7 @@ def serve(
     Raises `SimFileError` for a control socket that cannot be created, and rather than overwrite a file that no loopback
     rig wrote.
     """
-    if write_rig is not None and write_rig.exists() and not _is_ours(write_rig):
+    if write_rig and write_rig.exists() and not write_rig.read_bytes().startswith(LOOPBACK_HEAD.encode()):
         raise SimFileError(write_rig, "", "exists and was not written by a loopback rig; it is not overwritten")
     rig = LoopbackRig(config)
 
@@ -300,10 +293,6 @@ def serve(
         tell(f"{write_rig} is written: brushloop doctor --config {write_rig}; Ctrl-C ends")
 
     asyncio.run(serve_until_over(rig, control, idle_exit_s, announce))
-
-
-def _is_ours(path: Path) -> bool:
-    return path.is_file() and path.read_bytes().startswith(LOOPBACK_HEAD.encode())
 
 
 async def serve_until_over(

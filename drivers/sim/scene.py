@@ -122,8 +122,8 @@ def _glare(view: View, paper_to_image: NDArray[np.float64]) -> NDArray[np.float3
 
 
 PRINT_PX_PER_MM = 6.0
-EDGE_MM = 5.0
-"""White edge of the print around the board."""
+EDGE_MM, TRIMMED_EDGE_MM = 5.0, 3.0
+"""White edge of the print around the board: in hand, and under the sheet."""
 WHITE, BLACK, BEHIND = 245, 20, 110
 FINGER_MM = 9.0
 """Radius of the thumb that covers a little of the print at either side."""
@@ -217,13 +217,8 @@ class Scene:
 
     def _light_board(self, held: Held) -> NDArray[np.float32]:
         """The print in hand, under the light of the table."""
-        table = self._world.config.table
-        size_x_mm, size_y_mm = (n * table.board_square_mm for n in table.board_squares)
-        inner = board(table).generateImage((round(size_x_mm * PRINT_PX_PER_MM), round(size_y_mm * PRINT_PX_PER_MM)))
-        edge = round(EDGE_MM * PRINT_PX_PER_MM)
-        columns, rows = inner.shape[1] + 2 * edge, inner.shape[0] + 2 * edge
-        paper = np.full((rows, columns), WHITE, np.uint8)
-        paper[edge:-edge, edge:-edge] = np.where(np.asarray(inner) > 127, WHITE, BLACK)
+        paper = _print(self._world.config.table, PRINT_PX_PER_MM, EDGE_MM)
+        rows, columns = paper.shape
         for column in (0, columns):
             cv2.circle(paper, (column, rows // 2), round(FINGER_MM * PRINT_PX_PER_MM), (150,), -1)
         # raster pixel centres -> mm from the middle of the board -> image
@@ -259,6 +254,14 @@ class Scene:
         return None if beside_px > self._disc_radius_px + 1 else (column_px, v_px)
 
 
+def _print(table: Table, px_per_mm: float, edge_mm: float) -> NDArray[np.uint8]:
+    """The printed board with its white edge."""
+    width_px, height_px = (round(n * table.board_square_mm * px_per_mm) for n in table.board_squares)
+    picture = np.asarray(board(table).generateImage((width_px, height_px)))
+    inked = np.where(picture > 127, WHITE, BLACK).astype(np.uint8)
+    return np.pad(inked, round(edge_mm * px_per_mm), constant_values=WHITE)
+
+
 def _extent(table: Table) -> tuple[tuple[float, float], tuple[float, float]]:
     """Lower left corner, in the paper frame, and size of what is drawn, in mm: the board and a margin of table."""
     left, bottom = (v - MARGIN_MM for v in table.board_origin_mm)
@@ -285,14 +288,10 @@ def _draw(
     width, height = (round(v * PX_PER_MM) for v in size_mm)
     raster = np.full((height, width), TABLE_GRAY, np.uint8)
     fibre = cv2.GaussianBlur(rng.normal(0.0, 6.0, (height, width)).astype(np.float32), (0, 0), 3.0)
-    board_px = tuple(round(n * table.board_square_mm * PX_PER_MM) for n in table.board_squares)
+    picture, edge = _print(table, PX_PER_MM, TRIMMED_EDGE_MM), round(TRIMMED_EDGE_MM * PX_PER_MM)
     x, y = table.board_origin_mm
-    top = round((size_mm[1] - (y - bottom_mm)) * PX_PER_MM) - board_px[1]
-    column = round((x - left_mm) * PX_PER_MM)
-    margin = round(3.0 * PX_PER_MM)
-    raster[top - margin : top + board_px[1] + margin, column - margin : column + board_px[0] + margin] = 245
-    picture = board(table).generateImage((board_px[0], board_px[1]))
-    raster[top : top + board_px[1], column : column + board_px[0]] = np.where(picture > 127, 245, 20)
+    bottom, left = round((size_mm[1] - (y - bottom_mm)) * PX_PER_MM) + edge, round((x - left_mm) * PX_PER_MM) - edge
+    raster[bottom - picture.shape[0] : bottom, left : left + picture.shape[1]] = picture
     sheet = _sheet_slices(table)
     raster[sheet] = np.clip(PAPER_GRAY + fibre[sheet], 0, 255).astype(np.uint8)
     return raster, [rng.normal(0.0, noise, shape).astype(np.float32) for _ in range(NOISE_FIELDS)]

@@ -43,16 +43,14 @@ LEVEL = (0.0, 0.0, 1.0)
 
 
 class Reaction:
-    """The wrench for a pose of the tip above or in the paper.
+    """The paper's push on one brush.
 
-    The push comes from the same spine as the ink, on the way down. Friction along the paper, the pull of the menisci
-    and the hysteresis on the way up are left out: only the normal force of a press remains.
+    It comes from the same spine as the ink, on the way down. Friction along the paper, the pull of the menisci and the
+    hysteresis on the way up are left out: only the normal force of a press remains.
     """
 
-    def __init__(self, config: SimConfig) -> None:
-        self._spec = config.brush
-        self._arm_m = config.tool_mm / 1e3
-        self._weight_n = config.hanging_kg * GRAVITY_M_S2
+    def __init__(self, spec: BrushSpec) -> None:
+        self._spec = spec
 
     def prepare(self) -> None:
         """Solve the spines; takes some tenths of a second, so call it outside the event loop. Once is enough."""
@@ -65,24 +63,6 @@ class Reaction:
         steps_mm, rows = _pushes(self._spec)
         at_tilts = np.array([np.interp(depth_mm, steps_mm, rows[k]) for k in range(len(TILTS_DEG))], np.float64)
         return float(np.interp(tilt_deg, np.array(TILTS_DEG), at_tilts))
-
-    def wrench(
-        self,
-        tip: Pose,
-        depth_mm: float,
-        normal: tuple[float, float, float] = LEVEL,
-        finger_n: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    ) -> Wrench:
-        """Force in N and torque in Nm on the sensor, in the tool's frame: z along the tool, towards the tip.
-
-        `normal` is the unit vector out of the paper, `finger_n` a person's push on the tip, both in the base frame.
-        """
-        push_n = self.push_n(depth_mm, lean(leaning_with(tip, normal))[0])
-        push, weight_n = (push_n * part for part in normal), (0.0, 0.0, self._weight_n)
-        force_n = [a - b + c for a, b, c in zip(push, weight_n, finger_n, strict=True)]
-        axes = columns(unit(tip.quaternion))
-        fx, fy, fz = (x * force_n[0] + y * force_n[1] + z * force_n[2] for x, y, z in axes)
-        return fx, fy, fz, -self._arm_m * fy, self._arm_m * fx, 0.0
 
 
 def leaning_with(pose: Pose, normal: tuple[float, float, float]) -> Pose:
@@ -173,7 +153,7 @@ class World:
         self.ink_load = 0.0
         table = config.table
         self.well = Well.round(table.well_radius_mm, table.ink_level_mm, table.well_depth_mm)
-        self.reaction = Reaction(config)
+        self.reaction = Reaction(config.brush)
         self.version = 0
         """Number of visible changes to the sheet so far."""
         self._contact: list[Pose] = []
@@ -198,12 +178,16 @@ class World:
         return self.motion.target(self.clock.now_s())
 
     def wrench(self) -> Wrench:
-        """Current wrench on the force sensor, in the tool's frame."""
-        tip = self.tool()
+        """Force in N and torque in Nm on the sensor now, in the tool's frame: z along the tool, towards the tip."""
+        tip, normal, arm_m = self.tool(), self._normal, self.config.tool_mm / 1e3
         x_mm, y_mm, depth_mm = self.on_sheet(tip)
-        if self.is_over_well(x_mm, y_mm):
-            depth_mm = 0.0  # there is no paper
-        return self.reaction.wrench(tip, depth_mm, self._normal, self.push_n)
+        paper_n = 0.0
+        if not self.is_over_well(x_mm, y_mm):
+            paper_n = self.reaction.push_n(depth_mm, lean(leaning_with(tip, normal))[0])
+        push_n, weight_n = (paper_n * part for part in normal), (0.0, 0.0, self.config.hanging_kg * GRAVITY_M_S2)
+        force_n = [a - b + c for a, b, c in zip(push_n, weight_n, self.push_n, strict=True)]
+        fx, fy, fz = (x * force_n[0] + y * force_n[1] + z * force_n[2] for x, y, z in columns(unit(tip.quaternion)))
+        return fx, fy, fz, -arm_m * fy, arm_m * fx, 0.0
 
     def to_paper(self, x_mm: float, y_mm: float) -> tuple[float, float]:
         """Convert x and y from the base frame to the paper frame."""

@@ -120,7 +120,7 @@ class Felt:
 
 @pytest.fixture(scope="module")
 def reaction() -> Reaction:
-    made = Reaction(SimConfig())
+    made = Reaction(SimConfig().brush)
     made.prepare()
     return made
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import AsyncIterator
 from pathlib import Path
 
 import numpy as np
@@ -29,21 +28,6 @@ FAST = 500.0
 def lab_of(seed: int, trap: str | None = None) -> UnknownLab:
     """A lab that does not serve: hand, arm and scene are there, the sockets are not."""
     return UnknownLab(seed, trap, rate=FAST, picture_px=SMALL_PX)  # type: ignore[arg-type]
-
-
-@pytest.fixture
-async def lab() -> AsyncIterator[UnknownLab]:
-    async with UnknownLab(4, rate=FAST, picture_px=SMALL_PX) as it:
-        yield it
-
-
-@pytest.fixture
-async def controller(lab: UnknownLab) -> AsyncIterator[Controller]:
-    asked = Controller(RpcConnection(lab.host, ARCS_PORT, timeout_s=10.0))
-    await open_arcs(asked.connection)
-    [asked.robot, *_] = await asked.robot_names()
-    yield asked
-    await asked.connection.close()
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -72,22 +56,28 @@ async def test_the_hand_brings_the_true_tip_to_the_thing():
     assert lab.world.presses == []
 
 
-async def test_what_a_client_reads_agrees_with_the_truth(lab: UnknownLab, controller: Controller):
-    await lab.bring("pin", 2)
-    joints = await controller.joint_positions()
-    tcp = from_wire(await controller.ask("RobotConfig.getTcpOffset"))
-    reported = await controller.pose()
-    assert [*map(float, matrix_of(tcp)[:3, 3])] == pytest.approx(list(lab.facts.cabinet_tcp[:3]))
-    assert pose_of(forward(joints) @ matrix_of(tcp)).position_mm == pytest.approx(reported.position_mm, abs=1e-3)
-    flange = matrix_of(reported) @ inverted(matrix_of(tcp))
-    tip = pose_of(flange @ tool_of(lab.facts.config))
-    assert tip.position_mm == pytest.approx(lab.world.tool().position_mm, abs=1e-3)
-    assert (await controller.ask("RobotConfig.getPayload"))[0] == lab.facts.payload_kg
-    assert await controller.ask("RobotState.isSteady")
-    words = " ".join(lab.labels())
-    assert lab.host in words
-    for hidden in (lab.facts.config.tool_mm, lab.facts.config.table.yaw_deg, lab.facts.pin_mm[0]):
-        assert f"{hidden:.1f}" not in words
+async def test_what_a_client_reads_agrees_with_the_truth_and_the_labels_tell_nothing_of_it():
+    async with UnknownLab(4, rate=FAST, picture_px=SMALL_PX) as lab:
+        controller = Controller(RpcConnection(lab.host, ARCS_PORT, timeout_s=10.0))
+        await open_arcs(controller.connection)
+        await controller.connection.login()
+        [controller.robot, *_] = await controller.robot_names()
+        await lab.bring("pin", 2)
+        joints = await controller.joint_positions()
+        tcp = from_wire(await controller.ask("RobotConfig.getTcpOffset"))
+        reported = await controller.pose()
+        assert [*map(float, matrix_of(tcp)[:3, 3])] == pytest.approx(list(lab.facts.cabinet_tcp[:3]))
+        assert pose_of(forward(joints) @ matrix_of(tcp)).position_mm == pytest.approx(reported.position_mm, abs=1e-3)
+        flange = matrix_of(reported) @ inverted(matrix_of(tcp))
+        tip = pose_of(flange @ tool_of(lab.facts.config))
+        assert tip.position_mm == pytest.approx(lab.world.tool().position_mm, abs=1e-3)
+        assert (await controller.ask("RobotConfig.getPayload"))[0] == lab.facts.payload_kg
+        assert await controller.ask("RobotState.isSteady")
+        words = " ".join(lab.labels())
+        assert lab.host in words
+        for hidden in (lab.facts.config.tool_mm, lab.facts.config.table.yaw_deg, lab.facts.pin_mm[0]):
+            assert f"{hidden:.1f}" not in words
+        await controller.connection.close()
 
 
 @pytest.mark.parametrize(
