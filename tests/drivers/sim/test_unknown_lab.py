@@ -60,7 +60,6 @@ async def test_what_a_client_reads_agrees_with_the_truth_and_the_labels_tell_not
     async with UnknownLab(4, rate=FAST, picture_px=SMALL_PX) as lab:
         controller = Controller(RpcConnection(lab.host, ARCS_PORT, timeout_s=10.0))
         await open_arcs(controller.connection)
-        await controller.connection.login()
         [controller.robot, *_] = await controller.robot_names()
         await lab.bring("pin", 2)
         joints = await controller.joint_positions()
