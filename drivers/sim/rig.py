@@ -279,13 +279,15 @@ def serve(
     Raises `SimFileError` for a control socket that cannot be created, and rather than overwrite a file that no loopback
     rig wrote.
     """
+    if write_rig and not write_rig.parent.is_dir():
+        raise SimFileError(write_rig, "", f"there is no folder {write_rig.parent}")
     if write_rig and write_rig.exists() and not write_rig.read_bytes().startswith(LOOPBACK_HEAD.encode()):
         raise SimFileError(write_rig, "", "exists and was not written by a loopback rig; it is not overwritten")
     rig = LoopbackRig(config)
 
     def announce() -> None:
         if write_rig is None:
-            tell(*rig.toml().splitlines(), "Ctrl-C ends")
+            tell(*rig.toml().splitlines(), "# Ctrl-C ends")
             return
         part = write_rig.with_name(write_rig.name + ".part")
         part.write_text(rig.toml(), encoding="utf-8")
