@@ -82,19 +82,10 @@ class PosesLate(NeedsOperator):
     """The recorded path of the brush would lag behind force and camera. Leaves the step void, and the brush lifted."""
 
     def __init__(self, lag_ms: float, limit_ms: float) -> None:
-        self.lag_ms = lag_ms
         super().__init__(
             f"poses of the arm arrive {lag_ms:.0f} ms late; robot.max_pose_lag_ms = {limit_ms:g}. If only pushed poses "
             "are late, leave robot.rtde_port out of rig.toml: they are then asked for. If not, look at the network."
         )
-
-
-class JogGivenUp(StepError):
-    """The operator gave up finding the paper. Leaves the brush lifted; the height known before can be kept."""
-
-    def __init__(self, number: int, of: int, height: str) -> None:
-        self.height = height
-        super().__init__(f"the operator gave up at touch {number} of {of}")
 
 
 class SheetFull(StepError):

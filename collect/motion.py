@@ -65,12 +65,6 @@ class Region:
 Segment = Move | Path | Region
 Dip = Callable[[], Awaitable[None]]
 """Fills the brush; begins and ends at travel height."""
-Hold = Callable[[], Awaitable[None]]
-"""Waits over the place where a stroke begins."""
-
-
-async def at_once() -> None:
-    """Do not wait."""
 
 
 # Travel and photographs
@@ -379,14 +373,9 @@ class Procedures:
         await self.go(*moves)
         self._dips += 1
 
-    async def press(self, patch: Patch, condition: Condition, dwell_s: float, hold: Hold = at_once) -> float:
-        """Press once; returns the depth reached below the paper along its normal, in mm.
-
-        `hold` is awaited over the patch, at travel height.
-        """
-        (first, *before), pressing = press_moves(self._config, self.plane, patch, condition, dwell_s)
-        await self.go(first)
-        await hold()
+    async def press(self, patch: Patch, condition: Condition, dwell_s: float) -> float:
+        """Press once; returns the depth reached below the paper along its normal, in mm."""
+        before, pressing = press_moves(self._config, self.plane, patch, condition, dwell_s)
         await self.go(*before)
         seen = await self.queue(pressing)
         reached_mm = max((-self.plane.above_mm(self._config.paper, pose) for pose in seen), default=0.0)
@@ -394,16 +383,13 @@ class Procedures:
             raise StepVoid(f"the depth was {reached_mm:.3f} mm, {condition.depth_mm:g} mm was commanded")
         return reached_mm
 
-    async def stroke(self, patch: Patch, drawn: Drawn, number: int, hold: Hold = at_once) -> float:
+    async def stroke(self, patch: Patch, drawn: Drawn, number: int) -> float:
         """Draw stroke `number`, from 0, of a figure whose poses were checked; begins and ends at safe height.
 
-        `hold` is awaited over the first point. Returns the depth at which the brush landed, in mm.
+        Returns the depth at which the brush landed, in mm.
         """
         robot, acc_mm_s2, depth_mm = self.rig.robot, self._config.motion.acc_mm_s2, 0.0
-        moves = stroke_moves(self._config, self.plane, patch, drawn.strokes[number], drawn.speed_mm_s)
-        for place, segment in enumerate(moves):
-            if place == 1:
-                await hold()
+        for segment in stroke_moves(self._config, self.plane, patch, drawn.strokes[number], drawn.speed_mm_s):
             if isinstance(segment, Move):
                 await self.go(segment)
             else:

@@ -22,7 +22,7 @@ from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import limits_of
 from brushloop.collect.rig.paper import Sheet, to_base
 from brushloop.collect.touch.selfcheck import partners
-from brushloop.collect.walk import StepMoves, Walked, poses_of, sheet_of, walk
+from brushloop.collect.walk import StepMoves, poses_of, sheet_of, walk
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import distance
 from brushloop.drivers.limits import Limits
@@ -125,9 +125,7 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
         step = walked.step
         kind = str(step.kind)
         kinds[kind] += 1
-        wait_s = _wait_s(config, protocol, here, walked)
         took_s, here = step_s(config, here, walked.moves)
-        took_s += wait_s
         seconds[kind] = seconds.get(kind, 0.0) + took_s
         dips += walked.moves.dips
         poses += len(walked.moves.poses)
@@ -152,14 +150,6 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
         seconds_by_kind=seconds,
         touches_mm=tuple(dict.fromkeys(touches)),
     )
-
-
-def _wait_s(config: RigConfig, protocol: ProtocolConfig, here: Pose, walked: Walked) -> float:
-    """Seconds that the arm waits over the patch for the ink; of a figure, before its first stroke."""
-    if protocol.wait_after_dip_s is None or not isinstance(walked.step, PressStep | DrawStep):
-        return 0.0
-    over_s, _ = step_s(config, here, StepMoves(walked.moves.segments[:1]))
-    return max(0.0, protocol.wait_after_dip_s - over_s)
 
 
 MOST_ROWS = 40

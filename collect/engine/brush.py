@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import asyncio
 from functools import partial
 
 from brushloop.collect.engine.capture import look_at_sheet
-from brushloop.collect.engine.recorder import RunContext, StepContext, within_limits
+from brushloop.collect.engine.recorder import StepContext, within_limits
 from brushloop.collect.errors import StepError
 from brushloop.collect.motion import TOUCH_TOLERANCE_MM
 from brushloop.collect.operator import Choice, Prompt
@@ -14,8 +13,8 @@ from brushloop.collect.protocols.steps import DrawStep, PressStep, TouchStep, Ze
 from brushloop.collect.rig.config import TouchConfig
 from brushloop.collect.rig.paper import PaperPlane, Patch
 from brushloop.collect.touch.force import ForceTap
-from brushloop.collect.touch.heights import Touch, plane_of, untouched
-from brushloop.collect.touch.measure import asked, measure_plane
+from brushloop.collect.touch.heights import plane_of
+from brushloop.collect.touch.measure import measure_plane
 from brushloop.collect.touch.selfcheck import self_check, triangle_on
 from brushloop.collect.walk import check_poses, check_step, touch_of
 from brushloop.drivers.devices import PoseSample, Well
@@ -69,16 +68,10 @@ class DipToTouch:
         """The longest time; None if no pose showed the brush on the paper."""
         return max(self._waits_s, default=None)
 
-    async def hold(self) -> None:
-        """Start timing a stroke, over its patch; wait there if the protocol asks for a fixed time after the dip."""
+    def begin(self) -> None:
+        """Time the next stroke, from the moment at which the brush left the ink."""
         run = self._context.run
-        left_ns, run.left_ink_ns = run.left_ink_ns, None
-        assert left_ns is not None
-        if (wait_s := run.protocol.wait_after_dip_s) is not None:
-            left_s = wait_s - (run.rig.clock.now_ns() - left_ns) / 1e9
-            with run.progress.meanwhile(f"wait with the ink, {wait_s:g} s from the dip"):
-                await asyncio.sleep(max(left_s, 0.0))
-        self._left_ns = left_ns
+        self._left_ns, run.left_ink_ns = run.left_ink_ns, None
 
     def _pose(self, sample: PoseSample) -> None:
         """Take a pose: the first one on the paper counts, and the step's moves come down nowhere else before it."""
@@ -94,8 +87,8 @@ async def press(context: StepContext, step: PressStep) -> PressResult:
     """The PRESS step."""
     patch, procedures = await _ready(context), context.run.procedures
     timing = DipToTouch(context)
-    pressing = procedures.press(patch, step.press.condition, step.dwell_s, timing.hold)
-    reached_mm = await context.guard.guarded(pressing)
+    timing.begin()
+    reached_mm = await context.guard.guarded(procedures.press(patch, step.press.condition, step.dwell_s))
     pressed = _as_made(context, step.press, reached_mm, timing)
     return PressResult(press=pressed, peak_force_n=_peak_n(context, context.guard.peak_n))
 
@@ -110,8 +103,8 @@ async def draw(context: StepContext, step: DrawStep) -> PressResult:
     for number in range(len(drawn.strokes)):
         if number > 0:
             await fill_brush(context)
-        drawing = run.procedures.stroke(patch, drawn, number, timing.hold)
-        depths_mm.append(await context.guard.guarded(drawing))
+        timing.begin()
+        depths_mm.append(await context.guard.guarded(run.procedures.stroke(patch, drawn, number)))
         peaks_n.append(context.guard.peak_n)
     pressed = _as_made(context, step.press, max(depths_mm), timing)
     return PressResult(
@@ -152,20 +145,16 @@ async def zero_touch(context: StepContext, step: ZeroTouchStep) -> ZeroTouchResu
         run.light = await rig.ink.light()
     if rig.force is not None and rig.config.force is not None:
         await rig.force.bias(rig.config.force.bias_s)
-    if step.method == "kept":
-        at_mm, plane = rig.config.paper.touch_point_mm, run.procedures.plane
-        measured = untouched(plane, "kept", Touch(*at_mm, plane.touch_z_mm(*at_mm)))
-    else:
-        if step.method is not None:
-            await within_limits(check_step, "", rig.config, run.procedures.plane, step)
-        measured = await _measured(context, touch_of(rig.config, step))
+    if step.method is not None:
+        await within_limits(check_step, "", rig.config, run.procedures.plane, step)
+    measured = await _measured(context, touch_of(rig.config, step))
     plane = plane_of(measured)
     await within_limits(check_poses, "over the paper as it was touched, ", rig.config, run.protocol, plane)
     moved_mm = _moved_mm(measured, run.procedures.plane)
-    if measured.method == "kept":
-        run.progress.log(f"zero touch was given up: {_height(run)} is kept", warning=True)
-    elif measured.method != "taught":
-        run.progress.log(f"zero touch by {measured.method}: {_compared(moved_mm, plane, run.procedures.plane)}")
+    if measured.method != "taught":
+        run.progress.log(
+            f"zero touch by {measured.method}: the paper lies {moved_mm:+.2f} mm from the height known before"
+        )
     if step.between_strokes:
         await _accepted(context, moved_mm)
     run.procedures.plane = plane
@@ -180,12 +169,6 @@ def _moved_mm(measured: ZeroTouchResult, before: PaperPlane) -> float:
     """How far the paper lies above where it was before, at the touched point where it moved most."""
     away = [point.z_mm - before.touch_z_mm(point.x_mm, point.y_mm) for point in measured.points]
     return max(away, key=abs)
-
-
-def _compared(moved_mm: float, now: PaperPlane, before: PaperPlane) -> str:
-    if before.slope_deg == 0.0 < now.slope_deg:  # rig.toml has one height for the whole sheet
-        return f"the paper differs by up to {moved_mm:+.2f} mm from a level sheet at the height known before"
-    return f"the paper lies {moved_mm:+.2f} mm from where it was before"
 
 
 async def _accepted(context: StepContext, moved_mm: float) -> None:
@@ -226,19 +209,12 @@ async def _fill_for_touch(context: StepContext) -> None:
 
 async def _measured(context: StepContext, config: TouchConfig) -> ZeroTouchResult:
     run = context.run
-    tap, jog = ForceTap(), asked(run.asker, _height(run))
+    tap = ForceTap()
     context.guard.listeners.append(tap.take)
 
     def tell(doing: str) -> None:
         run.progress.doing(f"zero touch by {config.method}: {doing}")
 
     dip = partial(_fill_for_touch, context)
-    measured = measure_plane(run.procedures, config, dip=dip, tap=tap, next_jog=jog, tell=tell)
+    measured = measure_plane(run.procedures, config, dip=dip, tap=tap, asker=run.asker, tell=tell)
     return await context.guard.guarded(measured)
-
-
-def _height(run: RunContext) -> str:
-    """The height that is known without a new measurement, in words."""
-    paper, plane = run.rig.config.paper, run.procedures.plane
-    how = "taught height" if plane == PaperPlane(paper.touch_z_mm) else "height that was measured before"
-    return f"the {how}, {plane.touch_z_mm(*paper.touch_point_mm):.2f} mm,"

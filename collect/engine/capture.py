@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from brushloop.calibrate.board.pix2len import Plane, see_board
 from brushloop.calibrate.compare import ANCHOR_MM, MM_PER_PX, SIZE_PX, covered, field_around
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
-from brushloop.calibrate.stats import odd_waits, wait_limit_s, waits_of
 from brushloop.calibrate.stroke import PX_PER_MM, Gray
 from brushloop.calibrate.stroke.preprocess import prepare
 from brushloop.calibrate.stroke.rectify import on_window, rectify
@@ -243,7 +242,7 @@ async def capture(context: StepContext, step: CaptureStep) -> CaptureResult:
         raise StepError(f"{press.stroke_id} is not on the sheet that is in")
     patch = run.sheet.patch(press.patch)
     frame = await _fresh_frame(context)
-    looking = _looked_at(context, step, frame, patch, _wait_check(context, press))
+    looking = _looked_at(context, step, frame, patch)
     if run.progress.more_than(press.stroke_id):
         image, verdict = await meanwhile(context.guard.guarded(run.procedures.set_out()), looking)
     else:
@@ -266,33 +265,16 @@ async def capture(context: StepContext, step: CaptureStep) -> CaptureResult:
     )
 
 
-def _wait_check(context: StepContext, press: Press) -> Check | None:
-    """Compare this stroke's time from dip to touch with those of earlier strokes; None if it was not recorded.
-
-    The check is recorded as a remark and decides nothing: the ink is judged from the photograph.
-    """
-    still, wait_s = context.attempt.serial, press.dip_to_touch_s
-    if wait_s is None:
-        return None
-    waits = {**waits_of(context.run.store.state), still: wait_s}
-    reason, limit_s = odd_waits(waits).get(still, ""), wait_limit_s(waits.values())
-    threshold_s = None if limit_s is None else sum(limit_s)
-    return Check(name="dip_to_touch", score=wait_s, threshold=threshold_s, unit="s", passed=not reason, reason=reason)
-
-
 async def _looked_at(
-    context: StepContext, step: CaptureStep, frame: Frame, patch: Patch, waited: Check | None
+    context: StepContext, step: CaptureStep, frame: Frame, patch: Patch
 ) -> tuple[Gray, Verdict | None]:
     """Record the frame, judge the stroke in it unless captures are not judged, and show both; nothing moves here."""
     run, stroke_id, still = context.run, step.press.stroke_id, context.attempt.serial
     image = await _recorded(context, frame)
-    if waited is not None and not waited.passed:
-        run.progress.log(f"{stroke_id}: {waited.reason}", warning=True)
     verdict = None
     if run.rig.config.quality.enabled:
         verdict = await uninterrupted(_judge, run, step, image, patch)
-        remarks = () if waited is None else (waited,)
-        context.recorder.quality(Quality(stroke_id=stroke_id, checks=(*verdict.checks, *remarks)), still)
+        context.recorder.quality(Quality(stroke_id=stroke_id, checks=verdict.checks), still)
         if verdict.cause is not None:
             run.progress.log(f"{stroke_id}: {verdict.reason}", warning=True)
             if Failure(verdict.cause.name).of_picture:
@@ -344,6 +326,7 @@ def _stroke(step: CaptureStep, patch: Patch, still: int) -> Stroke:
 
 
 # What a screen shows of a capture
+
 
 FINE = 8
 """Points per pixel and axis at which the model's mark is evaluated."""

@@ -47,12 +47,6 @@ class IllegalTransition(Exception):
     """The engine tried a transition that is not in the table, which is a bug."""
 
 
-def check_transition(old: State, new: State) -> None:
-    """Raise `IllegalTransition` unless `new` may follow `old`."""
-    if new not in TRANSITIONS[old]:
-        raise IllegalTransition(f"{old} -> {new}")
-
-
 class RunControl:
     """State of a run and the requests from keys, under one lock. Talks to no device."""
 
@@ -178,5 +172,6 @@ class RunControl:
             self._loop.call_soon_threadsafe(self._go_on.set)
 
     def _set(self, new: State) -> None:
-        check_transition(self._state, new)
+        if new not in TRANSITIONS[self._state]:
+            raise IllegalTransition(f"{self._state} -> {new}")
         self._state = new

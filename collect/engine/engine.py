@@ -241,8 +241,20 @@ class Engine:
                 if live is not None:
                     self._progress.log(f"live view: {live.url}")
                 shows = ([self._telemetry.frame] if self._request.on_screen else []) + ([live.frame] if live else [])
+                self._run = Run(
+                    rig=rig,
+                    protocol=self._opening.protocol,
+                    store=store,
+                    progress=self._progress,
+                    asker=self._asker,
+                    requests=self._requests,
+                    control=self._control,
+                    telemetry=self._telemetry,
+                    live=live,
+                    guided=self._request.guided,
+                )
                 async with each_frame(rig.camera, shows):
-                    await self._protocol(rig, store)
+                    await self._run.carry_out()
                 self._control.begin_closing()
                 self._progress.doing("merge and verify")
                 final = await uninterrupted(store.close)
@@ -284,21 +296,6 @@ class Engine:
                 yield
         finally:
             self._control.go_on()
-
-    async def _protocol(self, rig: Rig, store: SessionStore) -> None:
-        self._run = Run(
-            rig=rig,
-            protocol=self._opening.protocol,
-            store=store,
-            progress=self._progress,
-            asker=self._asker,
-            requests=self._requests,
-            control=self._control,
-            telemetry=self._telemetry,
-            live=self._request.live,
-            guided=self._request.guided,
-        )
-        await self._run.carry_out()
 
     def _end(self, state: State, error: Exception) -> None:
         """End with `error`, whose message says so if the arm may move or the brush may be down. The session keeps it

@@ -7,6 +7,7 @@ out only the others.
 from __future__ import annotations
 
 import datetime as dt
+import itertools
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -31,8 +32,6 @@ from brushloop.sessions.store import SessionStore
 RIG_EFFECTIVE, PROTOCOL_EFFECTIVE = "rig.effective.json", "protocol.effective.json"
 COMPARED = {RIG_EFFECTIVE: "rig.toml", PROTOCOL_EFFECTIVE: "protocol.toml"}
 """Files whose values are compared, environment and side files included, and the names by which users know them."""
-MOST_SHOWN = 5
-"""Most differences that are listed; with more, the advice below them would not fit on a screen of 24 lines."""
 MACHINE_NAMES = {
     "robot": {"host", "port", "rtde_port"},
     "camera": {"source"},
@@ -145,8 +144,6 @@ def find_resumable(opening: Opening) -> Path | None:
         changes = differences(folder, opening.snapshots)
         if not changes:
             return folder
-        if len(changes) > MOST_SHOWN:
-            changes[MOST_SHOWN - 1 :] = [f"and {len(changes) - MOST_SHOWN + 1} more"]
         way_out = (
             f"Go on as it was begun: --config {folder / 'rig.toml'} --protocol {folder / 'protocol.toml'}, beside the "
             "files that they name, in the same environment; or start a new session with --new."
@@ -240,13 +237,10 @@ def put_in_sheet(store: SessionStore, sheet: int | None) -> None:
     store.fresh_sheet()
 
 
-def next_session_id(root: Path, label: str, today: dt.date) -> str:
+def _next_session_id(root: Path, label: str) -> str:
     """Return `2026-11-21-grid-01` with the first number that is free under `root`."""
-    for number in range(1, 1000):
-        session_id = f"{today.isoformat()}-{label}-{number:02d}"
-        if not (root / session_id).exists():
-            return session_id
-    raise InputError(root, f"has 999 sessions of {today.isoformat()}-{label}")
+    ids = (f"{dt.date.today().isoformat()}-{label}-{number:02d}" for number in itertools.count(1))
+    return next(session_id for session_id in ids if not (root / session_id).exists())
 
 
 def open_sessions(root: Path) -> list[Path]:
@@ -270,7 +264,7 @@ def open_store(opening: Opening, resume: Path | None, rig: Rig, clock: Clock) ->
     header = _header(opening, rig)
     if resume is None:
         root = opening.request.out
-        session_id = next_session_id(root, opening.protocol.kind, dt.date.today())
+        session_id = _next_session_id(root, opening.protocol.kind)
         header = header.model_copy(update={"session_id": session_id})
         return SessionStore.create(root / session_id, header, opening.snapshots, clock.now_ns)
     store = SessionStore(resume, clock.now_ns)

@@ -10,7 +10,6 @@ from brushloop.calibrate.board.pix2len import WORST_RMS_PX
 from brushloop.collect.errors import (
     BadPicture,
     ForceTooHigh,
-    JogGivenUp,
     NeedsOperator,
     SheetFull,
     StepError,
@@ -39,7 +38,6 @@ MAX_FAILURES = 3
 
 STOP = Choice("x", "stop the run")
 GO_ON = "g"
-KEEP = "k"
 
 
 class Action(StrEnum):
@@ -61,8 +59,6 @@ def decide(step: Step, error: StepError | DeviceError, failures: int) -> Action:
             return Action.ASK
         # Somebody else had the arm.
         case _, ArmMoved() | SettingsChanged() | NotPowered() | PathDisturbed():
-            return Action.ASK
-        case StepKind.ZERO_TOUCH, JogGivenUp():
             return Action.ASK
         case StepKind.PRESS | StepKind.DRAW, StepVoid():
             action = Action.RETRY
@@ -108,9 +104,6 @@ def question(error: StepError | DeviceError, sheet: int) -> Prompt:
             go_on = "nobody else uses the arm: lift it and go on"
         case SettingsChanged():
             go_on = "nobody else uses the arm: restore the settings, lift it and go on"
-        case JogGivenUp(height=height):
-            text += f". {height[0].upper()}{height[1:]} can be kept: H is then counted from there."
-            return Prompt(text, (Choice(KEEP, "keep that height, go on"), Choice("a", "jog again"), STOP), STOP.key)
         case NotPowered():
             go_on = "nothing is in the way of the arm: power it, lift it and go on"
         case MotionError():
@@ -122,7 +115,7 @@ def question(error: StepError | DeviceError, sheet: int) -> Prompt:
 
 AGAIN = Choice("a", "measure again")
 BY_JOG, BY_FORCE = Choice("b", "measure by jog"), Choice("f", "measure by force")
-METHODS = {BY_JOG.key: "jog", BY_FORCE.key: "force", KEEP: "kept"}
+METHODS = {BY_JOG.key: "jog", BY_FORCE.key: "force"}
 TITLES = {
     StepKind.BOARD: "Camera, board, scale",
     StepKind.ZERO_TOUCH: "Zero touch and plane",
@@ -212,17 +205,17 @@ def _board(result: BoardResult, config: RigConfig) -> list[Fact]:
 
 def _touch(result: ZeroTouchResult, config: RigConfig) -> list[Fact]:
     touch, method = config.touch, result.method
-    named = {"taught": "taught height, visited", "kept": "none: the previous height is kept"}
-    facts = [Fact("method", named.get(method, method))]
+    taught = method == "taught"
+    facts = [Fact("method", "taught height, visited" if taught else method)]
     for number, point in enumerate(result.points, 1):
         where = f"point {number} ({point.x_mm:.0f}, {point.y_mm:.0f})"
-        if method in named:
-            facts.append(Fact(where, f"{'rests' if method == 'taught' else 'is'} at {point.z_mm:.2f} mm"))
+        if taught:
+            facts.append(Fact(where, f"rests at {point.z_mm:.2f} mm"))
             continue
         span_mm = point.span_mm
         facts.append(Fact(where, f"{point.z_mm:.3f} mm"))
         facts.append(_within("  its touches span", span_mm, touch.repeatability_mm, f"{span_mm:.3f} mm"))
-    if method not in named:
+    if not taught:
         moved_mm = result.moved_mm
         facts.append(_within("from the height before", moved_mm, touch.moved_mm, f"{moved_mm:+.3f} mm"))
     residuals = [abs(residual_mm) for residual_mm in result.residuals_mm]

@@ -130,7 +130,7 @@ class Run(RunContext):
                     await self._lift(error)
                     raise
                 if action is Action.ASK:
-                    step = by_method(step, await self._ask(error))
+                    await self._ask(error)
                     failures = 0
                 released = action is Action.ASK and isinstance(error, MotionError)
                 await self._once_arm_is_free(self._recover, released=released)
@@ -200,8 +200,8 @@ class Run(RunContext):
             await self._park()
         return answer
 
-    async def _ask(self, error: StepError | DeviceError) -> str:
-        """Let a person decide after `error`; return the answer, or raise an error if it is to stop."""
+    async def _ask(self, error: StepError | DeviceError) -> None:
+        """Let a person decide after `error`; raise an error if the answer is to stop."""
         in_order = False
         if not arm_at_fault(error):
             with contextlib.suppress(StepError, DeviceError):
@@ -218,7 +218,6 @@ class Run(RunContext):
         self.forget_camera()
         if isinstance(error, SheetFull):
             self.fresh_sheet()
-        return answer
 
     async def _lift(self, error: StepError | DeviceError | SessionError) -> None:
         """Lift the brush off the paper after `error`, unless the arm is at fault."""

@@ -93,9 +93,6 @@ class ProtocolBase(Config):
     board_every: Annotated[int, Field(ge=1, le=MAX_STROKES)] | None = None
     """Photograph the board again after this many strokes, to see whether camera or sheet moved; if left out, only at
     the start."""
-    wait_after_dip_s: Annotated[float, Field(ge=0.0, le=600.0)] | None = None
-    """Wait over the patch until this much time has passed since the brush left the ink; if left out, it presses at
-    once."""
 
     @property
     def own_patch_mm(self) -> tuple[float, float] | None:
@@ -405,8 +402,6 @@ class CalibrationConfig(ProtocolBase):
     def _without_strokes(self) -> Self:
         if self.board_every is not None:
             raise ValueError("board_every counts strokes, and this protocol has none: use board_views")
-        if self.wait_after_dip_s is not None:
-            raise ValueError("wait_after_dip_s: this protocol has no dips")
         return self
 
     def steps(self, layout: Layout | None = None) -> Protocol:

@@ -80,7 +80,7 @@ class ZeroTouchStep(StepBase):
 
     kind: ClassVar[StepKind] = StepKind.ZERO_TOUCH
     method: str | None = None
-    """`jog`, `force`, or `kept` for the height known before; None for the rig's method."""
+    """`jog` or `force`; None for the rig's method."""
     between_strokes: bool = False
     """A person asked for it between two strokes, and accepts the new height."""
 

@@ -45,7 +45,6 @@ class Contact:
     sigma_mm: float
     """Standard error from the noise of the samples alone, without the error of taking the brush for a hinge."""
     spring: Spring
-    samples: int
 
 
 def find_contact(
@@ -110,7 +109,7 @@ def find_contact(
     )
     variance = np.linalg.pinv((moved * weights) @ moved.T + np.diag((0.0, known)), hermitian=True) * sample_sd_n**2
     sigma_mm, sigma_n_mm = (math.sqrt(float(v)) for v in np.diag(variance))
-    return Contact(contact, sigma_mm, Spring(stiffness, sigma_n_mm), int(samples.sum()))
+    return Contact(contact, sigma_mm, Spring(stiffness, sigma_n_mm))
 
 
 SLOW_MM = (-0.8, 0.08, 0.4)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import statistics
 from dataclasses import dataclass
-from typing import Literal
 
 from brushloop.collect.errors import StepError
 from brushloop.collect.rig.config import PaperConfig, TouchConfig
@@ -102,12 +101,10 @@ def at_one_point(touches: list[Touch], config: TouchConfig, guide: PaperPlane | 
     )
 
 
-def untouched(plane: PaperPlane, method: Literal["taught", "kept"], touch: Touch) -> ZeroTouchResult:
-    """A plane that no touch has measured: the taught one, visited, or the previous one, after touching was given up.
-
-    `touch` is where its height is stated.
-    """
-    return _result(plane, method, [at_one_point([touch], TouchConfig())], (0.0,))
+def taught(paper: PaperConfig, rests_mm: float) -> ZeroTouchResult:
+    """The level plane at the taught height, which was visited and not measured; the arm rested at `rests_mm`."""
+    visited = Touch(*paper.touch_point_mm, rests_mm)
+    return _result(PaperPlane(paper.touch_z_mm), "taught", [at_one_point([visited], TouchConfig())], (0.0,))
 
 
 def through(points: list[TouchedPoint], config: TouchConfig) -> ZeroTouchResult:

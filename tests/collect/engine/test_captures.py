@@ -15,14 +15,12 @@ from brushloop.calibrate.calibrated import calibrate_session
 from brushloop.calibrate.commands import CalibrateRequest
 from brushloop.calibrate.compare import KEYS, Alignment, Tone, simulated
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.collect.engine import capture as capturing
 from brushloop.collect.engine import recorder
 from brushloop.collect.engine.capture import mark_of
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.recorder import RunContext
 from brushloop.collect.engine.snapshot import LastCapture
 from brushloop.collect.errors import BadPicture, ConfigError, NeedsOperator, Parked, StepError
-from brushloop.collect.photograph.checks import Verdict, check_drawing
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.tui.review_screen import Review
 from brushloop.drivers.sim.brush.footprint import Flaw
@@ -39,7 +37,7 @@ from tests.rigs import Lab
 from tests.runs import answered_alike, question, until, wait_for_end
 
 if TYPE_CHECKING:
-    from brushloop.calibrate.stroke import Gray
+    pass
 
 
 def used(lab: Lab) -> int:
@@ -131,23 +129,6 @@ def test_the_peak_force_of_a_figure_is_that_of_its_deepest_stroke(sharp_lab: Lab
     [drawn] = replay(folder / JOURNAL_NAME).results(PressResult)
     assert (drawn.peak_force_n or 0.0) > 0.02, "the shallow stroke comes last and reaches 0.007 N"
     assert drawn.depths_mm == pytest.approx((5.0, 1.0), abs=0.1)
-
-
-def test_a_figure_without_ink_is_drawn_again(sharp_lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    (sharp_lab.folder / "protocol.toml").write_text(FIGURE, encoding="utf-8")
-    left = [1]
-
-    def blank(image: Gray, *rest: object, **more: object) -> Verdict:
-        left[0] -= 1
-        return check_drawing(np.full_like(image, 200) if left[0] >= 0 else image, *rest, **more)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(capturing, "check_drawing", blank)
-    engine = sharp_lab.run()
-    now = engine.snapshot()
-    assert (now.state, now.strokes_done, now.given_up) == (State.DONE, 1, 0)
-    assert used(sharp_lab) == 2
-    folder = sharp_lab.session
-    assert [capture.stroke.stroke_id for capture in Recording(folder).captures()] == ["bar-r01"]
 
 
 # A camera that distorts, with its lens file

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
-from brushloop.collect.engine.control import FINAL, TRANSITIONS, IllegalTransition, RunControl, State, check_transition
+from brushloop.collect.engine.control import FINAL, TRANSITIONS, IllegalTransition, RunControl, State
 from brushloop.collect.engine.policy import MAX_FAILURES, Action, decide
 from brushloop.collect.errors import ForceTooHigh, NeedsOperator, SheetFull, StepVoid, arm_at_fault
 from brushloop.collect.operator import Asker, Choice, Prompt
@@ -38,8 +38,8 @@ def test_every_state_can_be_reached() -> None:
 
 
 def test_a_way_that_the_table_does_not_have_is_a_defect() -> None:
-    with pytest.raises(IllegalTransition, match="done -> running"):
-        check_transition(State.DONE, State.RUNNING)
+    with pytest.raises(IllegalTransition, match="idle -> done"):
+        RunControl(lambda _: None).end(State.DONE)
 
 
 class SlippedIn:

@@ -155,9 +155,8 @@ def test_a_dose_that_does_not_arrive_is_the_operators_to_mend(lab: Lab, monkeypa
 
 def test_poses_that_come_late_end_the_run_before_a_press_counts(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(AuboArcs, "pose_lag_ms", lambda _: 412.0)
-    with pytest.raises(PosesLate, match="max_pose_lag_ms = 100") as caught:
+    with pytest.raises(PosesLate, match="arrive 412 ms late"):
         lab.run()
-    assert caught.value.lag_ms == 412.0
     assert len(lab.state.cut) == 1
     assert not lab.state.results(PressResult)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime as dt
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +14,6 @@ from brushloop.collect.engine.open_or_resume import (
     CollectRequest,
     Opening,
     find_resumable,
-    next_session_id,
     open_sessions,
     put_in_sheet,
 )
@@ -26,7 +24,6 @@ from brushloop.collect.walk import walk
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import Addresses, rig_toml
-from brushloop.sessions.errors import InputError
 from brushloop.sessions.events import CaptureResult, Condition, Done, Press, PressResult
 from brushloop.sessions.journal import RunState
 from brushloop.sessions.records import Header, Source
@@ -126,14 +123,6 @@ def test_both_files_and_the_environment_are_distinguished(lab: Path, monkeypatch
     assert way_out == WAY_OUT
 
 
-def test_another_kind_of_protocol_fits_on_a_small_terminal(lab: Path) -> None:
-    Path("protocol.toml").write_text('kind = "list"\npresses = [{depth_mm = 11.0}, {depth_mm = 12.0}]\n')
-    lines = refused()
-    assert 'protocol.toml: kind: "grid" -> "list"' in lines
-    assert lines[-2].startswith("and ")
-    assert sum(1 + len(f"brushloop: {line}") // 80 for line in lines) <= 12
-
-
 def test_a_changed_row_of_a_side_file_is_named_by_its_number(lab: Path) -> None:
     Path("p.csv").write_text("depth_mm\n11\n12\n")
     Path("protocol.toml").write_text('kind = "list"\nfile = "p.csv"\n')
@@ -204,12 +193,3 @@ def test_open_sessions_are_listed_oldest_first_without_the_closed(lab: Path) -> 
     store.close()
     store.release()
     assert [folder.name for folder in open_sessions(lab / "sessions")] == ["grid-00", "grid-02"]
-
-
-def test_session_ids_count_up_until_the_day_is_full(tmp_path: Path) -> None:
-    today = dt.date(2026, 11, 21)
-    assert next_session_id(tmp_path, "grid", today) == "2026-11-21-grid-01"
-    for number in range(1, 1000):
-        (tmp_path / f"2026-11-21-grid-{number:02d}").touch()
-    with pytest.raises(InputError, match="999 sessions"):
-        next_session_id(tmp_path, "grid", today)

@@ -173,28 +173,17 @@ def test_a_height_that_is_not_taken_and_a_jog_that_is_given_up_leave_the_paper_w
     ]
 
 
-@pytest.mark.parametrize("guided", [False, pytest.param(True, marks=pytest.mark.soak)])
-def test_who_gives_the_jog_of_the_set_up_up_keeps_the_taught_height_and_the_run_goes_on(lab: Lab, guided: bool) -> None:
+def test_who_gives_the_jog_of_the_set_up_up_is_asked_and_may_jog_again(lab: Lab) -> None:
     lab.write_protocol("[11.0]", "[0.0]")
-    lab.edit_rig("[paper]", '[touch]\nmethod = "jog"\n\n[paper]')
-    engine = lab.engine(on_screen=True, guided=guided)
+    lab.edit_rig("[paper]", '[touch]\nmethod = "jog"\ntouches = 1\n\n[paper]')
+    engine = lab.engine(on_screen=True)
     engine.start()
-    if guided:
-        answer(engine, "Camera, board, scale", "g")
-    now = until(engine, lambda now: now.prompt is not None and "Touch 1 of 3." in now.prompt.question)
-    assert now.prompt is not None
-    assert now.prompt.choices[-1].label == "give up: the taught height, 120.03 mm, stays unchanged"
-    answer(engine, "Touch 1 of 3.", "x")
-    answer(engine, "The taught height, 120.03 mm, can be kept", "a")
-    answer(engine, "Touch 1 of 3.", "x")
-    answer(engine, "The taught height, 120.03 mm, can be kept", "k")
-    if guided:
-        answer(engine, "Zero touch and plane", "g")
+    answer(engine, "Touch 1 of 1.", "x")
+    answer(engine, "the operator gave up at touch 1 of 1", "g")
+    answer(engine, "Touch 1 of 1.", "t")
     wait_for_end(engine)
     assert engine.snapshot().strokes_done == 1
-    assert any("given up: the taught height, 120.03 mm, is kept" in line for line in engine.snapshot().messages)
-    [result] = lab.state.results(ZeroTouchResult)
-    assert (result.method, result.touch_z_mm, result.moved_mm) == ("kept", pytest.approx(120.03), 0.0)
+    assert [result.method for result in lab.state.results(ZeroTouchResult)] == ["jog"]
 
 
 @pytest.mark.parametrize("state", [State.PAUSED, State.ASKING])

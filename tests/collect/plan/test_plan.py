@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,7 +21,7 @@ from brushloop.collect.plan import (
     path_s,
 )
 from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
-from brushloop.collect.protocols.steps import MARKING, Drawn, DrawStep, PressStep, Step, StepKind
+from brushloop.collect.protocols.steps import MARKING, Drawn, DrawStep, Step, StepKind
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.rig.devices import Rig, limits_of
 from brushloop.collect.rig.paper import PaperPlane, Sheet
@@ -143,17 +142,6 @@ def test_what_cannot_be_done_is_named_before_anything_is_connected(
         check_protocol(tmp_path / "rig.toml", tmp_path / "protocol.toml", config, protocol(tmp_path, text))
 
 
-def test_washes_are_counted_where_they_fall_also_within_a_figure(tmp_path: Path) -> None:
-    config = rig(tmp_path, *FAR_POT)
-    washed: list[tuple[str, int]] = []
-    for one in walk(config, example("protocol-write.toml")):
-        assert config.ink.wash is not None
-        bottom = [pose for pose, _ in one.moves.poses if pose.z_mm == config.ink.wash.dip_z_mm]
-        washed.append((str(one.step.kind), len(bottom) // config.ink.wash.strokes))
-    # Every second dip of the process: the first figure's second one lies within it.
-    assert [pair for pair in washed if pair[0] in ("dip", "draw")] == [("dip", 0), ("draw", 1), ("dip", 0), ("draw", 1)]
-
-
 def test_the_outermost_cells_stand_for_all(tmp_path: Path) -> None:
     config, wanted, plane = rig(tmp_path), example("protocol.toml"), PaperPlane(120.0, 0.01, -0.02)
     corners = [pose for pose, _, _ in all_poses(config, wanted, plane)]
@@ -171,18 +159,6 @@ def test_a_sheet_that_leans_is_checked_as_it_lies(tmp_path: Path) -> None:
     check_poses(tmp_path / "rig.toml", config, wanted, PaperPlane(120.0))
     with pytest.raises(ConfigError, match=r"z = \d\d\.\d+ mm is outside .* on patch \d+\)"):
         check_poses(tmp_path / "rig.toml", config, wanted, PaperPlane(120.0, -0.05))
-
-
-def test_the_walk_goes_where_the_steps_say(tmp_path: Path) -> None:
-    config, wanted = rig(tmp_path), example("protocol.toml")
-    walked = list(walk(config, wanted))
-    for before, after in itertools.pairwise(walked):
-        if before.step.kind in MARKING:
-            assert after.step.kind == StepKind.CAPTURE
-            assert (after.patches, after.sheet) == (before.patches, before.sheet)
-    step, moves = next((w.step, w.moves) for w in walked if isinstance(w.step, PressStep))
-    deepest = min(pose.z_mm for pose, _ in moves.poses)
-    assert deepest == pytest.approx(config.paper.touch_z_mm - step.press.condition.depth_mm)
 
 
 def test_a_drawn_stroke_goes_through_its_points_at_its_depths(tmp_path: Path) -> None:

@@ -17,13 +17,12 @@ from brushloop.collect.plan import draw_plan, make_plan
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.rig.paper import PaperPlane
-from brushloop.collect.walk import _for_tool, all_poses, ask_reach
+from brushloop.collect.walk import all_poses, ask_reach
 from brushloop.drivers.arcs.controller import RobotMode
-from brushloop.drivers.errors import ConnectionLost, ProtocolViolation
-from brushloop.drivers.geometry import brush_pose, from_wire
+from brushloop.drivers.errors import ProtocolViolation
+from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.kinematics import inverted, matrix_of
 from brushloop.drivers.sim.rig import Addresses, rig_toml
 from brushloop.drivers.sim.world import World
 
@@ -78,14 +77,6 @@ def test_every_kind_has_a_picture(rig_path: Path, tmp_path: Path, name: str) -> 
     assert image is not None
     assert min(image.shape) > 400
     assert image.std() > 10.0
-
-
-@pytest.mark.parametrize("ending", [".svg", ".pdf", ".JPG"])
-def test_a_picture_has_the_format_of_its_ending(rig_path: Path, tmp_path: Path, ending: str) -> None:
-    path = tmp_path / f"plan{ending}"
-    plan(rig_path, "protocol-list.toml", "--picture", str(path))
-    head = {".svg": b"<?xml", ".pdf": b"%PDF", ".JPG": b"\xff\xd8"}
-    assert path.read_bytes().startswith(head[ending])
 
 
 @pytest.mark.parametrize(
@@ -164,11 +155,6 @@ async def test_a_tool_that_is_no_number_is_an_error_of_the_device(rig_path: Path
         await ask_reach(rig_path, config, [(brush_pose(300.0, 0.0, 200.0), 10.0, "park")])
 
 
-async def test_a_controller_that_does_not_answer_is_an_error_of_the_device(rig_path: Path) -> None:
-    with pytest.raises(ConnectionLost):
-        await ask_reach(rig_path, load_rig(rig_path), [])
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -188,14 +174,3 @@ def test_files_that_are_missing_or_swapped_are_named(
     with pytest.raises(ConfigError) as refused:
         CliRunner().invoke(app, [command, *arguments], catch_exceptions=False)
     assert str(refused.value).startswith(words)
-
-
-def test_a_tip_is_where_either_tool_says_that_it_is():
-    """Two descriptions of the flange's place: theirs, and ours with a turn of its own, give the same flange."""
-    ours = from_wire([0.004, -0.007, 0.18, 0.03, -0.02, 0.5])
-    theirs = from_wire([0.05, -0.1, 0.3, 0.1, 0.2, 1.0])
-    tip = brush_pose(400.0, 50.0, 130.0, heading_deg=70.0, tilt_deg=10.0)
-    flanges = [
-        matrix_of(at) @ inverted(matrix_of(tool)) for at, tool in ((tip, ours), (_for_tool(tip, ours, theirs), theirs))
-    ]
-    assert flanges[1] == pytest.approx(flanges[0], abs=1e-9)

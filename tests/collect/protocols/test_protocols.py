@@ -351,8 +351,6 @@ def load(folder: Path, protocol: str, csv: str | bytes | None = None):
         ('kind = "write"\ncell_mm = [60.0, 60.0]\nfigures = 3\n', None, r"figures: "),
         (CALIBRATION + "touches_mm = [[1.0, 1.0], [1.0, 1.0]]\n", None, r"touches_mm: \(1.0, 1.0\) occurs twice"),
         (CALIBRATION + "board_every = 3\n", None, r"use board_views"),
-        (CALIBRATION + "wait_after_dip_s = 3.0\n", None, r"wait_after_dip_s: this protocol has no dips"),
-        (LIST + "wait_after_dip_s = 601\n", "depth_mm\n11\n", r"wait_after_dip_s: .*600 \(given: 601\)$"),
         ('kind = "teapot"\n', None, r"kind: .*'grid', 'few-strokes', 'list', 'replay', 'write', 'calibration'"),
         ("x = 1\n", None, r"protocol.toml: kind: "),
         ('kind = "grid"\ndepths_mm = [11.0]\ntilts_deg = [0.0]\nspeed = 3\n', None, r"speed: unknown field"),

@@ -15,13 +15,13 @@ import pytest
 from pydantic import ValidationError
 
 from brushloop.collect.errors import ConfigError, NeedsOperator, StepError
-from brushloop.collect.operator import Asker
+from brushloop.collect.operator import Asker, Prompt
 from brushloop.collect.protocols.steps import SelfCheckStep, ZeroTouchStep
 from brushloop.collect.rig.config import PaperConfig, RigConfig, TouchConfig
 from brushloop.collect.rig.paper import PaperPlane, Sheet
 from brushloop.collect.touch import camera
 from brushloop.collect.touch.heights import Touch, at_one_point, plane_of, used_patches
-from brushloop.collect.touch.measure import Jogged, asked, measure_plane
+from brushloop.collect.touch.measure import measure_plane
 from brushloop.collect.touch.selfcheck import partners, self_check, triangle_on
 from brushloop.collect.walk import check_step, moves_of
 from brushloop.drivers.devices import Pose
@@ -38,8 +38,13 @@ THREE: dict[str, Any] = {"points_mm": [(6.0, 4.0), (104.0, 4.0), (50.0, 76.0)]}
 PATCHES: dict[str, Any] = {"points_mm": [(4.0, 4.0), (70.0, 4.0), (36.0, 40.0)]}
 
 
-async def measured(bench: Bench, **config: Any) -> ZeroTouchResult:
-    return await measure_plane(bench.effector, TouchConfig(**config), tap=bench.tap)
+NOBODY = Asker(watched=False)
+
+
+async def measured(bench: Bench, asker: Asker = NOBODY, **touch: Any) -> ZeroTouchResult:
+    config = TouchConfig.model_validate(touch)
+    dip, tap = bench.effector.dip, bench.tap
+    return await measure_plane(bench.effector, config, dip=dip, tap=tap, asker=asker, tell=lambda _: None)
 
 
 def errors_mm(bench: Bench, result: ZeroTouchResult) -> list[float]:
@@ -169,54 +174,56 @@ async def test_a_patch_that_does_not_fit_on_the_sheet_is_refused(make_bench: Mak
     assert bench.lifted
 
 
-class Operator:
-    """Jogs by what he sees: down in large steps, then smaller ones, until the tip touches."""
+class Operator(Asker):
+    """Jogs by the bench: down in large steps, then smaller ones, until the tip touches; or by `keys`, once each."""
 
-    def __init__(self, bench: Bench) -> None:
+    def __init__(self, bench: Bench, *keys: str) -> None:
+        super().__init__(watched=True)
         self._bench = bench
-        self.asked = 0
+        self._keys = list(keys)
+        self.questions: list[str] = []
 
-    async def __call__(self, at: Jogged) -> float | None:
-        self.asked += 1
+    async def ask(self, prompt: Prompt) -> str:
+        self.questions.append(prompt.question)
+        if self._keys:
+            return self._keys.pop(0)
         table, tip = self._bench.sim.table, self._bench.target
         gap_mm = table.above_mm(*self._bench.world.to_paper(tip.x_mm, tip.y_mm), tip.z_mm)
-        return next((-step for step in (1.0, 0.1, 0.02) if gap_mm > step), None)
+        return next((key for key, step in (("1", 1.0), ("2", 0.1), ("3", 0.02)) if gap_mm > step), "t")
+
+
+class ToTheEnd(Asker):
+    """Jogs down to the end of the travel, then says that the tip touches."""
+
+    async def ask(self, prompt: Prompt) -> str:
+        return "t" if "end of the travel" in prompt.question else "1"
 
 
 async def test_the_operator_jogs_until_it_touches(make_bench: MakeBench) -> None:
     bench = make_bench((0.5, 0.5), paper_z_mm=120.4)
     operator = Operator(bench)
-    config = TouchConfig(method="jog", **THREE)
-    result = await measure_plane(bench.effector, config, next_jog=operator)
+    result = await measured(bench, operator, method="jog", **THREE)
     assert max(map(abs, errors_mm(bench, result))) < 0.021
-    assert operator.asked > 9
+    assert len(operator.questions) > 9
     assert bench.lifted
 
 
 async def test_a_jog_ends_at_the_travel_limit_and_says_so(make_bench: MakeBench) -> None:
     bench = make_bench(paper_z_mm=110.0)
-    seen: list[Jogged] = []
-
-    async def down(at: Jogged) -> float | None:
-        seen.append(at)
-        if len(seen) == 20:
-            raise StepError("given up")
-        return -1.0
-
-    with pytest.raises(StepError, match="given up"):
-        await measure_plane(bench.effector, TouchConfig(method="jog"), next_jog=down)
-    assert min(at.above_mm for at in seen) == pytest.approx(-2.0)
-    assert [at.lowest for at in seen] == [at.above_mm < -1.99 for at in seen]
-    assert {(at.number, at.of) for at in seen} == {(1, 3)}
+    operator = Operator(bench, *"1" * 19, "x")
+    with pytest.raises(NeedsOperator, match="touch 1 of 3"):
+        await measured(bench, operator, method="jog")
+    said = [("is -2.00 mm from" in question, "end of the travel" in question) for question in operator.questions]
+    assert said[0] == (False, False)
+    assert said[-1] == (True, True)
+    assert all(lowest == told for lowest, told in said)
     assert bench.lifted
 
 
 async def test_a_jog_that_nobody_watches_asks_for_an_operator(make_bench: MakeBench) -> None:
     bench = make_bench()
-    config = TouchConfig(method="jog")
-    nobody = asked(Asker(watched=False))
     with pytest.raises(NeedsOperator, match="Jog until the tip just touches"):
-        await measure_plane(bench.effector, config, next_jog=nobody)
+        await measured(bench, method="jog")
     assert bench.lifted
 
 
@@ -275,18 +282,13 @@ def noted(bench: Bench, config: RigConfig) -> list[Pose]:
     return sent
 
 
-async def down(at: Jogged) -> float | None:
-    """Whoever jogs goes down to the end, then says that it touches."""
-    return None if at.lowest else -1.0
-
-
 @pytest.mark.parametrize("method", ["taught", "force", "jog", "camera"])
 async def test_no_touch_leaves_what_was_checked(make_bench: MakeBench, method: str) -> None:
     bench = make_bench((0.5, -0.5), paper_z_mm=119.4)
-    asked = TouchConfig.model_validate({"method": method, "residual_mm": 9.0, **POINTS})
-    config = bench.rig.config.model_copy(update={"touch": asked})
+    touch: dict[str, Any] = {"method": method, "residual_mm": 9.0, **POINTS}
+    config = bench.rig.config.model_copy(update={"touch": TouchConfig.model_validate(touch)})
     sent = noted(bench, config)
-    await measure_plane(bench.effector, asked, tap=bench.tap, next_jog=down)
+    await measured(bench, ToTheEnd(watched=True), **touch)
     planned = moves_of(config, PaperPlane(config.paper.touch_z_mm), TOUCH)
     if method != "camera":  # whose spots of one patch lie beside each other
         beside = [(a, b) for a, b in pairwise(sent) if math.hypot(b.x_mm - a.x_mm, b.y_mm - a.y_mm) > 1.0]
@@ -299,15 +301,13 @@ async def test_touches_that_each_find_the_paper_lower_do_not_add_up(make_bench: 
     """The operator jogs to the end of the travel at each of five points: no lower than the plan allowed for."""
     bench = make_bench()
     points = [(x, 4.0) for x in (4.0, 36.0, 68.0, 100.0)]
-    asked = TouchConfig.model_validate(
-        {"method": "jog", "residual_mm": 9.0, "touches": 1, "points_mm": [*points, (4.0, 60.0)]}
-    )
-    config = bench.rig.config.model_copy(update={"touch": asked})
+    touch: dict[str, Any] = {"method": "jog", "residual_mm": 9.0, "touches": 1, "points_mm": [*points, (4.0, 60.0)]}
+    config = bench.rig.config.model_copy(update={"touch": TouchConfig.model_validate(touch)})
     sent = noted(bench, config)
-    await measure_plane(bench.effector, asked, next_jog=down)
+    await measured(bench, ToTheEnd(watched=True), **touch)
     planned = moves_of(config, PaperPlane(config.paper.touch_z_mm), TOUCH)
     assert not not_checked(config, sent, planned.segments)
-    assert lowest_mm(sent) > 120.0 - asked.travel_mm - 2.1  # what a lean of 1 deg over 116 mm may be
+    assert lowest_mm(sent) > 120.0 - config.touch.travel_mm - 2.1  # what a lean of 1 deg over 116 mm may be
 
 
 async def test_the_self_check_presses_as_deep_as_was_checked(make_bench: MakeBench) -> None:
