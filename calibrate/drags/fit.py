@@ -180,7 +180,7 @@ class Kept(Frozen):
         own_x = np.asarray(self.left_mm + np.arange(seen.shape[2]) * MM_PER_PX, np.float64)
         own_y = np.asarray(self.top_mm - np.arange(seen.shape[1]) * MM_PER_PX, np.float64)
         drawn = lagging([commanded_path(*row[:4]) for row in self.commands], model.vector()).distances(own_x, own_y)
-        missed = clipped(captured_distance(seen)) - clipped(drawn)
+        missed = clipped(captured_distance(seen, MM_PER_PX)) - clipped(drawn)
         spread = known.std(axis=0)
         # A command that never changes in training has no influence.
         scales = np.where(spread > 1e-9, np.array(SPREADS) * spread, 1e9)
@@ -211,13 +211,13 @@ def clipped(distance_mm: NDArray[np.floating]) -> NDArray[np.float32]:
     return (REACH_MM * np.tanh(np.asarray(distance_mm, np.float32) / REACH_MM)).astype(np.float32)
 
 
-def captured_distance(masks: NDArray[np.bool_]) -> Floats:
+def captured_distance(masks: NDArray[np.bool_], mm_per_px: float) -> Floats:
     """Signed distance to the edge of captured ink (n, rows, columns), positive inside, mm."""
 
     def to_other(inked: NDArray[np.bool_]) -> list[cv2.typing.MatLike]:
         return [cv2.distanceTransform(each, cv2.DIST_L2, 5) - 0.5 for each in inked.astype(np.uint8)]
 
-    return np.where(masks, np.array(to_other(masks)), -np.array(to_other(~masks))).astype(np.float64) * MM_PER_PX
+    return np.where(masks, np.array(to_other(masks)), -np.array(to_other(~masks))).astype(np.float64) * mm_per_px
 
 
 class DragArtefact(SessionFit):
