@@ -109,7 +109,7 @@ class Scheduler:
     """Number of jobs that run at a time."""
 
     def finished(
-        self, function: Callable[[J], Arrays], jobs: Iterable[tuple[str, J]], store: Store
+        self, function: Callable[[J], Arrays], jobs: Iterable[tuple[str, J]], store: Store | None = None
     ) -> Iterator[tuple[str, Arrays]]:
         """Yield (key, result) of every job, in no fixed order: what the store lacks is done and kept there.
 
@@ -120,12 +120,13 @@ class Scheduler:
         def done() -> Iterator[tuple[str, Arrays]]:
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 key, arrays = running.pop(future), future.result()
-                store.put(key, arrays)
+                if store is not None:
+                    store.put(key, arrays)
                 yield key, arrays
 
         try:
             for key, job in jobs:
-                if (kept := store.get(key)) is not None:
+                if store is not None and (kept := store.get(key)) is not None:
                     yield key, kept
                     continue
                 running[self.executor.submit(_alone, function, job)] = key
