@@ -23,7 +23,7 @@ from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.presses import Refused, read_presses, rectified
 from brushloop.calibrate.remote import local_path
 from brushloop.calibrate.session import Calibration, OpenSession, open_session
-from brushloop.calibrate.stroke.preprocess import Prepared
+from brushloop.calibrate.stroke import Prepared
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.strokes import Prediction
 from brushloop.sessions.errors import SessionDamaged

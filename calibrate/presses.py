@@ -17,9 +17,19 @@ from brushloop.calibrate.compare import ANCHOR_MM, FIELD_MM, KEYS, Image, Pixels
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.report import source_label
 from brushloop.calibrate.session import Calibration, OpenSession
-from brushloop.calibrate.stroke import PX_PER_MM, Gray
-from brushloop.calibrate.stroke.preprocess import BACKGROUND_MM, Measured, Prepared, measure, prepare
-from brushloop.calibrate.stroke.rectify import cut_out, on_raster, on_window, rectify_by, rescale
+from brushloop.calibrate.stroke import (
+    BACKGROUND_MM,
+    PX_PER_MM,
+    Gray,
+    Measured,
+    Prepared,
+    cut_out,
+    measure,
+    on_window,
+    prepare,
+    rectify_by,
+    rescale,
+)
 from brushloop.calibrate.work import Arrays, Scheduler, key_of, threads
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.recording import Capture, bad_stills
@@ -172,7 +182,8 @@ def rectified(capture: Capture, calibration: Calibration | None) -> tuple[Gray, 
         reach_mm = (left_mm + around, top_mm + around, right_mm + around, bottom_mm + around)
         image, anchor_px = cut_out(image, anchor_px, stroke.px_per_mm, reach_mm, capture.where)
     raster = rescale(image, stroke.px_per_mm, capture.where)
-    anchor = None if anchor_px is None else on_raster(anchor_px, stroke.px_per_mm)
+    scale_x, scale_y = (PX_PER_MM / scale for scale in stroke.px_per_mm)
+    anchor = None if anchor_px is None else (anchor_px[0] * scale_x, anchor_px[1] * scale_y)
     return raster, prepare(raster, anchor, capture.where)
 
 

@@ -26,8 +26,10 @@ from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.presses import Refused, rectified
 from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.calibrate.stats import Line, fit_line
-from brushloop.calibrate.stroke import PX_PER_MM, Gray, Mask
-from brushloop.calibrate.stroke.preprocess import (
+from brushloop.calibrate.stroke import (
+    PX_PER_MM,
+    Gray,
+    Mask,
     Measured,
     components,
     measure,

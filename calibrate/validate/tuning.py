@@ -16,8 +16,7 @@ from brushloop.calibrate.files import Written, check_target
 from brushloop.calibrate.presses import Refused, prepare_press
 from brushloop.calibrate.report import source_label
 from brushloop.calibrate.session import OpenSession
-from brushloop.calibrate.stroke import PX_PER_MM
-from brushloop.calibrate.stroke.preprocess import Prepared
+from brushloop.calibrate.stroke import PX_PER_MM, Prepared
 from brushloop.calibrate.validate.command import one_source, open_session
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.generator.config import ANCHOR_SHARE, INPUTS, Placement, Target

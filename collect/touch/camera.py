@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from brushloop.calibrate.board.lens import apply
 from brushloop.calibrate.board.pix2len import local_scale, see_board
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.stroke import PX_PER_MM
-from brushloop.calibrate.stroke.rectify import rectify
+from brushloop.calibrate.stroke import PX_PER_MM, rectify
 from brushloop.collect.errors import StepError
 from brushloop.collect.motion import Dip, Move, Procedures, touching, up
 from brushloop.collect.photograph.frames import Gray, undistorted

@@ -11,7 +11,7 @@ from brushloop.calibrate.compare import KEYS, Tone
 from brushloop.calibrate.loop import AGAIN, ANOTHER, SIMULATED, LoopRecord, statistics_of, verdicts
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.scores import Scores
-from brushloop.calibrate.stroke.preprocess import Measured
+from brushloop.calibrate.stroke import Measured
 from brushloop.calibrate.writing import Figure
 from brushloop.calibrate.writing.compare import KEYS as WRITTEN_KEYS
 from brushloop.calibrate.writing.compare import PAIRS, PLANNED, Character, Table3Row, WritingComparison, WrittenRecord

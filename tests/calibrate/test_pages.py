@@ -21,7 +21,7 @@ from brushloop.calibrate.compare import KEYS, Tone
 from brushloop.calibrate.loop import NOT_AGAIN, Pair, score_pairs, statistics_of, verdicts, write_loop
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.report import Axis, Marks, Panel, chart_uri, source_label, source_note
-from brushloop.calibrate.stroke.preprocess import Measured
+from brushloop.calibrate.stroke import Measured
 from brushloop.calibrate.validate.page import pages_beside
 from brushloop.calibrate.writing import Figure, Plan, PlannedBy, as_points
 from brushloop.calibrate.writing.compare import Character, WritingComparison, write_written

@@ -20,7 +20,7 @@ from brushloop.calibrate.compare import (
 )
 from brushloop.calibrate.presses import Press, prepare_job
 from brushloop.calibrate.scores import Scores, similarities
-from brushloop.calibrate.stroke.preprocess import Measured
+from brushloop.calibrate.stroke import Measured
 from brushloop.calibrate.validate.run import score_job
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.raster import coverage

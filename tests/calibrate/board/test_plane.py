@@ -27,8 +27,7 @@ from brushloop.calibrate.commands import PrintRequest
 from brushloop.calibrate.compare import field_around
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.stroke import PX_PER_MM as RASTER_PX_PER_MM
-from brushloop.calibrate.stroke.preprocess import prepare
-from brushloop.calibrate.stroke.rectify import rectify_by
+from brushloop.calibrate.stroke import prepare, rectify_by
 from tests.calibrate.simulated_rigs import BRUSHES, CAMERAS, Shot, boards, sheet, true_mask, true_scale
 
 SPEC = BoardSpec(squares=(7, 5), square_mm=20.0, marker_mm=15.0, dictionary="DICT_5X5_50", origin_mm=(-10.0, 5.0))

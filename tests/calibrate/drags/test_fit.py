@@ -10,7 +10,7 @@ import pytest
 from brushloop.calibrate.drags import MM_PER_PX, Drag, Drags, commanded_path
 from brushloop.calibrate.drags import fit as drags
 from brushloop.calibrate.drags.fit import LAG, PREDICTED, Kept, different, fit_values, model_of, predicted
-from brushloop.calibrate.stroke.preprocess import Measured
+from brushloop.calibrate.stroke import Measured
 from brushloop.model.drag import DragModel, Drawings, ink, lagging
 from brushloop.sessions.records import Header, Source, Stroke
 

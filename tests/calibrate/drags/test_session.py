@@ -17,7 +17,7 @@ from brushloop.calibrate.drags import along_axis, commanded_path, defects, read_
 from brushloop.calibrate.drags.fit import FOLDER, LAG, PREDICTED, DragArtefact
 from brushloop.calibrate.drags.report import summary, validate_drags, write_drags
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.stroke.preprocess import measure
+from brushloop.calibrate.stroke import measure
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
 from tests.photographed import imported, photograph
 

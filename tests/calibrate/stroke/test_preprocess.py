@@ -8,9 +8,7 @@ import pytest
 
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.stats import fit_line
-from brushloop.calibrate.stroke import PX_PER_MM
-from brushloop.calibrate.stroke.preprocess import measure, prepare
-from brushloop.calibrate.stroke.rectify import rectify, rescale
+from brushloop.calibrate.stroke import PX_PER_MM, measure, prepare, rectify, rescale
 
 PAGE = (800, 800)
 
