@@ -22,6 +22,8 @@ Gray = NDArray[np.uint8]
 Soft = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float64]
+Rect = tuple[float, float, float, float]
+"""Four lengths: x, y, width and height of a rectangle, or how far to reach to the left, top, right and bottom."""
 PX_PER_MM = 20.0
 """Resolution of the raster that strokes are measured on (0.05 mm a pixel)."""
 MAX_RASTER_PX = 8192
@@ -50,9 +52,7 @@ GAP_MM = 1.5
 """Bare streaks and glare narrower than this lie inside a stroke, not between two."""
 
 
-def rectify(
-    image: Gray, image_to_paper: Floats, window_mm: tuple[float, float, float, float], px_per_mm: float = PX_PER_MM
-) -> Gray:
+def rectify(image: Gray, image_to_paper: Floats, window_mm: Rect, px_per_mm: float = PX_PER_MM) -> Gray:
     """Rectify the window (x, y, width, height in the paper frame), row 0 at its far edge (largest y).
 
     `image_to_paper` has pixel centres on integers, as cv2 does; the result's pixel (i, j) covers [j, j+1) x [i, i+1).
@@ -81,7 +81,7 @@ def cut_out(
     image: Gray,
     point_px: tuple[float, float],
     px_per_mm: tuple[float, float],
-    reach_mm: tuple[float, float, float, float],
+    reach_mm: Rect,
     where: str,
 ) -> tuple[Gray, tuple[float, float]]:
     """The part of a photograph that reaches so far from a point to the left, top, right and bottom; the point in it.
@@ -97,7 +97,7 @@ def cut_out(
     return part, (x - column, y - row)
 
 
-def rectify_by(image: Gray, plane: Plane, window_mm: tuple[float, float, float, float], where: str) -> Gray:
+def rectify_by(image: Gray, plane: Plane, window_mm: Rect, where: str) -> Gray:
     """Rectify the window (x, y, width, height in the paper frame) to 20 px/mm, as `rectify` does.
 
     The photograph is as it was taken; the lens distortion is removed here. Raises `CaptureRefused` if its size is not
@@ -117,9 +117,7 @@ def rectify_by(image: Gray, plane: Plane, window_mm: tuple[float, float, float, 
     return cast("Gray", sampled)
 
 
-def on_window(
-    cell_mm: tuple[float, float, float, float], window_mm: tuple[float, float, float, float]
-) -> tuple[int, int, int, int]:
+def on_window(cell_mm: Rect, window_mm: Rect) -> tuple[int, int, int, int]:
     """Convert a paper cell (x, y, width, height in mm) to pixels of a window's raster: x, y, width, height."""
     x, y, width, height = cell_mm
     top = window_mm[1] + window_mm[3] - (y + height)
