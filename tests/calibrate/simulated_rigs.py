@@ -9,12 +9,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.board.lens import apply
+from brushloop.calibrate.board.lens import Lens, apply
 from brushloop.calibrate.board.pix2len import local_scale
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.drivers.geometry import brush_pose
@@ -23,6 +24,8 @@ from brushloop.drivers.sim.brush.paper import PX_PER_MM as SHEET_PX_PER_MM
 from brushloop.drivers.sim.config import SimConfig, Table, View
 from brushloop.drivers.sim.scene import Optics, Scene
 from brushloop.drivers.sim.world import World
+from brushloop.sessions.records import Stroke
+from tests.calibrate.given import photographed
 
 Gray = NDArray[np.uint8]
 Floats = NDArray[np.float64]
@@ -129,6 +132,23 @@ def true_mask(shot: Shot, window_mm: tuple[float, float, float, float], px_per_m
     size = (round(width * px_per_mm), round(height * px_per_mm))
     window = cv2.warpAffine(shot.ink, move, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
     return np.asarray(window, np.float32) >= INK
+
+
+def collected(folder: Path, shot: Shot, optics: Lens | None = None) -> Path:
+    """The closed session of a shot: its board, then each press in a cell of its own, on the same photograph."""
+    strokes = [
+        Stroke(
+            stroke_id=f"s{k}",
+            kind="press",
+            still=0,
+            depth_mm=13.0,
+            tilt_deg=5.0,
+            anchor_mm=anchor,
+            cell_mm=(anchor[0] - 30.0, anchor[1] - 12.0, 40.0, 24.0),
+        )
+        for k, anchor in enumerate(shot.anchors_mm)
+    ]
+    return photographed(folder, shot.board, [shot.image], [(stroke, shot.image) for stroke in strokes], optics=optics)
 
 
 def _photographed(world: World, anchors: tuple[tuple[float, float], ...]) -> Shot:

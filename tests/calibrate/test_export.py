@@ -24,9 +24,8 @@ from brushloop.sessions.events import CaptureResult, PressResult, StepKind
 from brushloop.sessions.imports import ImportOptions
 from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.records import Check, Quality, Stroke, Topic, Wrench
-from tests.calibrate.given import photographed
-from tests.calibrate.simulated_rigs import sheet, true_mask
+from brushloop.sessions.records import Check, Quality, Topic, Wrench
+from tests.calibrate.simulated_rigs import collected, sheet, true_mask
 
 
 @pytest.fixture
@@ -141,11 +140,7 @@ def test_names_that_a_file_system_would_refuse_become_names(make, tmp_path, to):
 
 def test_crops_and_masks_lie_over_the_true_marks(tmp_path: Path, to: Path) -> None:
     shot = sheet(0, 2)
-    strokes = [
-        Stroke(stroke_id=f"s{k}", kind="press", still=0, depth_mm=13.0, tilt_deg=5.0, anchor_mm=anchor)
-        for k, anchor in enumerate(shot.anchors_mm)
-    ]
-    session = photographed(tmp_path / "pressed", shot.board, [shot.image], [(one, shot.image) for one in strokes])
+    session = collected(tmp_path / "pressed", shot)
     words = ["sessions", "export", str(session), str(to), "--crops"]
     refused = CliRunner().invoke(app, words)
     assert f"is not calibrated: run `brushloop calibrate {session}`" in str(refused.exception)

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from brushloop.__main__ import app
 from brushloop.calibrate.artefact import current, load_artefact
-from brushloop.calibrate.board.lens import Lens, read_lens
+from brushloop.calibrate.board.lens import read_lens
 from brushloop.calibrate.board.pix2len import see_board
 from brushloop.calibrate.calibrated import calibrate_session as calibrate
 from brushloop.calibrate.commands import CalibrateRequest
@@ -24,9 +24,9 @@ from brushloop.calibrate.session import Calibration
 from brushloop.calibrate.stroke import PX_PER_MM
 from brushloop.collect.tui.review_screen import Review
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.records import Condition, Stroke
-from tests.calibrate.given import kept_lens, photographed
-from tests.calibrate.simulated_rigs import CAMERAS, Shot, sheet, true_mask, true_scale
+from brushloop.sessions.records import Condition
+from tests.calibrate.given import kept_lens
+from tests.calibrate.simulated_rigs import CAMERAS, Shot, collected, sheet, true_mask, true_scale
 
 BARREL = 3
 WORST_SCALE = 2e-4
@@ -50,22 +50,6 @@ def lens(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def calibrate_session(session: Path, lens: Path | None = None) -> Calibration:
     return calibrate(CalibrateRequest(session, lens)).calibration
-
-
-def collected(folder: Path, shot: Shot, optics: Lens | None = None) -> Path:
-    strokes = [
-        Stroke(
-            stroke_id=f"s{k}",
-            kind="press",
-            still=0,
-            depth_mm=13.0,
-            tilt_deg=5.0,
-            anchor_mm=anchor,
-            cell_mm=(anchor[0] - 30.0, anchor[1] - 12.0, 40.0, 24.0),
-        )
-        for k, anchor in enumerate(shot.anchors_mm)
-    ]
-    return photographed(folder, shot.board, [shot.image], [(one, shot.image) for one in strokes], optics=optics)
 
 
 def holds(made: Calibration, shot: Shot) -> None:
