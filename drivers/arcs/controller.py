@@ -1,11 +1,6 @@
 """Typed calls to the controller: what is sent over one connection, and what codes, modes and errors mean at the arm.
 
 `survey` is a transcript of untyped ones, which change nothing: what a cabinet answered, for a report of a defect.
-
-MotionError
- +-- WrongOperationalMode   the pendant's mode switch is not on Automatic
- +-- MotionFailed
-      +-- OutOfReach        accepted, then failed in planning: messages 30047 and 30048
 """
 
 from __future__ import annotations
@@ -25,8 +20,6 @@ from brushloop.drivers.errors import (
     ConnectionLost,
     DeviceError,
     DeviceTimeout,
-    MotionError,
-    MotionFailed,
     MotionRefused,
     NotPowered,
     ProtocolViolation,
@@ -107,27 +100,6 @@ REFUSAL_REMEDY = {
     ReturnCode.QUEUE_FULL: "Another client is sending motion; close it.",
     ReturnCode.BUSY: "Another program has the arm; stop it on the pendant.",
 }
-
-
-class WrongOperationalMode(MotionError):
-    """A program may not move the arm in this operational mode; `mode` is the controller's name for it."""
-
-    condition = "Nothing was set or powered."
-    remedy = "Turn it to Automatic on the pendant; no software here does that."
-
-    def __init__(self, device: str, op: str, mode: str) -> None:
-        self.mode = mode
-        super().__init__(device, op, f"operational mode is {mode}")
-
-
-class OutOfReach(MotionFailed):
-    """The controller accepted a target and could not plan a path to it; `code` is the number of its message."""
-
-    remedy = "Bring the target within reach: move the sheet or turn the brush, then teach again."
-
-    def __init__(self, device: str, op: str, code: int, name: str) -> None:
-        self.code = code
-        super().__init__(device, op, f"the controller reports {code} ({name})")
 
 
 NOT_RUNNING = -1

@@ -19,7 +19,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from brushloop.drivers.arcs.controller import Controller, OutOfReach, ReturnCode
+from brushloop.drivers.arcs.controller import Controller, ReturnCode
 from brushloop.drivers.arcs.wire import DEVICE
 from brushloop.drivers.devices import Pose, QueuedLine
 from brushloop.drivers.errors import (
@@ -112,6 +112,7 @@ def _not_arrived(what: str) -> MotionFailed:
 
 
 PLANNING_FAILED = {30047: "pose out of reach", 30048: "planning failed"}
+BRING_NEARER = "Bring the target within reach: move the sheet or turn the brush, then teach again."
 NEWEST = 20
 
 
@@ -140,10 +141,11 @@ class Messages:
         return [code for _, code in fresh]
 
     async def explain(self, error: MotionFailed) -> MotionFailed:
-        """`OutOfReach` if a new message reports it, else the error itself."""
+        """The failure that a new message reports, if the controller could not plan a path, else the error itself."""
         for code in await self.codes():
             if code in PLANNING_FAILED:
-                return OutOfReach(DEVICE, error.op, code, PLANNING_FAILED[code])
+                what = f"the controller reports {code} ({PLANNING_FAILED[code]})"
+                return MotionFailed(DEVICE, error.op, what, remedy=BRING_NEARER)
         return error
 
 

@@ -90,7 +90,7 @@ class AuboArcs:
     async def enable(self) -> None:
         """Check the mode, set the tool, power on, release the brakes, arm the watchdog; moves nothing.
 
-        Raises `WrongOperationalMode`, `RobotNotSafe`, `MotionRefused`, `SettingsChanged`, `DeviceTimeout`.
+        Raises `MotionError`, of which are `RobotNotSafe`, `MotionRefused` and `SettingsChanged`, and `DeviceTimeout`.
         """
         self._enabled = True
         if not await self._motion.idle():

@@ -15,11 +15,11 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, Field
 
-from brushloop.drivers.arcs.controller import Controller, RobotMode, WrongOperationalMode, accepted
+from brushloop.drivers.arcs.controller import Controller, RobotMode, accepted
 from brushloop.drivers.arcs.motion import POLL_S
 from brushloop.drivers.arcs.wire import DEVICE, Framing, numbers
 from brushloop.drivers.devices import Pose
-from brushloop.drivers.errors import ArmMoved, DeviceTimeout, NotPowered, SettingsChanged
+from brushloop.drivers.errors import ArmMoved, DeviceTimeout, MotionError, NotPowered, SettingsChanged
 from brushloop.drivers.geometry import angles, distance, from_wire
 from brushloop.drivers.limits import Limits
 
@@ -125,12 +125,18 @@ def require_same(op: str, wanted: Settings, current: Settings) -> None:
 async def make_ready(controller: Controller, table: ArcsTable) -> Settings:
     """Check the operational mode, set tool, payload and collision level, where configured, and read all back.
 
-    Raises `WrongOperationalMode`, `MotionRefused` for a setting that the controller refuses, and `SettingsChanged` for
-    one that it accepted but did not apply.
+    Raises `MotionError` in a mode that is for a person next to the arm, `MotionRefused` for a setting that the
+    controller refuses, and `SettingsChanged` for one that it accepted but did not apply.
     """
     wanted = await read_back(controller)
-    if wanted.operational_mode not in ("Automatic", "Disabled"):  # the others are for a person next to the arm
-        raise WrongOperationalMode(DEVICE, "power on", wanted.operational_mode)
+    if wanted.operational_mode not in ("Automatic", "Disabled"):
+        raise MotionError(
+            DEVICE,
+            "power on",
+            f"operational mode is {wanted.operational_mode}",
+            condition="Nothing was set or powered.",
+            remedy="Turn it to Automatic on the pendant; no software here does that.",
+        )
     offset = [*(mm / 1e3 for mm in table.tcp_offset_mm), *map(math.radians, table.tcp_rotation_deg)]
     commands: dict[str, dict[str, object]] = {"setTcpOffset": {"offset": offset}}
     wanted = replace(wanted, tool=from_wire(offset))
