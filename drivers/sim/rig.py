@@ -14,8 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self, cast
 
-import jinja2
-
 from brushloop.drivers.force.simulator import ForceBoard, SocketcandServer
 from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL, Wrench
 from brushloop.drivers.geometry import inverse, of_angles, product, turned
@@ -54,8 +52,10 @@ class Addresses:
 
 def rig_toml(config: SimConfig, at: Addresses) -> str:
     """TOML text; addresses as served."""
-    environment = jinja2.Environment(
-        undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
+    from jinja2 import Environment, StrictUndefined  # slow to import
+
+    environment = Environment(
+        undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
     )
     return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
         head=LOOPBACK_HEAD,
