@@ -329,7 +329,7 @@ def figures_content(now: Snapshot) -> Content:
     percent = 100 * now.strokes_done // now.strokes_planned if now.strokes_planned else 0
     going_on = "" if now.state in FINAL else f"   {left} left   {eta_text(now) or 'no ETA yet'}"
     strokes = f"{now.strokes_done}/{now.strokes_planned}  {percent} %   elapsed {minutes_text(now.elapsed_s)}{going_on}"
-    counts = [f"voids {now.voids}", f"left out {now.given_up}" if now.given_up else ""]
+    counts = [f"{now.voids} attempts cut", f"left out {now.given_up}" if now.given_up else ""]
     counts.append("ink level unknown" if now.ink_level is None else f"ink {now.ink_level:.0%} of the well")
     warned = "bold $text-warning" if now.voids or now.given_up else ""
     rows: list[tuple[str, Content | str]] = [
@@ -363,7 +363,7 @@ def _live_rows(now: Snapshot) -> list[tuple[str, Content | str]]:
         target = tip_text(now.target_mm) + to_go
     if now.force_n is not None:
         ceiling = "" if now.force_ceiling_n is None else f" (stops at {now.force_ceiling_n:g} N)"
-        force = f"{now.force_n:6.3f} N{ceiling}   drawn to {scale_n(now.trace_n[-TRACE_PEAKS:]):.2g} N"
+        force = f"{now.force_n:6.3f} N{ceiling}   trace up to {scale_n(now.trace_n[-TRACE_PEAKS:]):.2g} N"
     return [("Tip", tip), ("Target", target), ("Force", force)]
 
 
