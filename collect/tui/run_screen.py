@@ -105,6 +105,11 @@ class LogPane(VerticalScroll, inherit_bindings=False):
         Binding("pagedown", "page_down", "Newer lines", show=False),
     ]
 
+    def on_mount(self) -> None:
+        """Stay at the newest line until the operator scrolls away; draw the scrollbar, which textual moves undrawn."""
+        self.anchor()
+        self.screen.screen_layout_refresh_signal.subscribe(self, lambda _: self.vertical_scrollbar.refresh())
+
 
 class RunScreen(Screen[None], inherit_bindings=False):
     """Draws snapshots; keeps only what is on the screen."""
@@ -207,10 +212,6 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
                 yield self._camera
         yield self._note
         yield Footer(compact=True, show_command_palette=False)
-
-    def on_mount(self) -> None:
-        """Keep the log at its newest line until the operator scrolls away."""
-        self._log_pane.anchor()
 
     def action_next_pane(self) -> None:
         """Show overview, last capture, and camera in turn, on a narrow screen."""
