@@ -119,7 +119,6 @@ COMMANDS: tuple[tuple[str, str, type[Any], str], ...] = (
     ("twin", RESEARCH, commands.TwinRequest, "twin.run:twin"),
     ("validate sessions", "", commands.ValidateRequest, "calibrate.validate.command:validate"),
     ("validate diff", "", commands.DiffRequest, "calibrate.validate.diff:compare"),
-    ("validate captures", "", commands.CapturesRequest, "calibrate.validate.tuning:captures"),
     ("write plan", "", commands.PlanRequest, "calibrate.writing.plan:plan"),
     ("write compare", "", commands.CompareWrittenRequest, "calibrate.writing.compare:compare"),
     ("write learn", "", commands.LearnRequest, "calibrate.writing.learn:learn"),

@@ -174,15 +174,6 @@ class DiffRequest:
 
 
 @dataclass(frozen=True, slots=True)
-class CapturesRequest:
-    """Write captured presses in the format that `brushloop train tune` reads."""
-
-    sessions: Annotated[tuple[str, ...], Argument(metavar="SESSION", help="Sessions of presses.")]
-    generator: Annotated[Path, Option(help="The generator.safetensors to tune.")]
-    out: Annotated[Path, Option(help="The file for `brushloop train tune`.")] = Path("captures.safetensors")
-
-
-@dataclass(frozen=True, slots=True)
 class ExportRequest:
     """Export strokes, poses and forces: pictures as files, and tables as CSV or Parquet.
 
@@ -341,14 +332,13 @@ class TrainRequest:
 
 @dataclass(frozen=True, slots=True)
 class TuneRequest:
-    """Fine-tune a generator on captured strokes; some are held out to validate on."""
+    """Fine-tune a generator on captured presses; a share of their conditions is held out to validate on."""
 
     generator: Annotated[Path, Argument(help="The generator.safetensors to start from.")]
-    captures: Annotated[Path, Argument(help="Captured strokes, a safetensors file.")]
+    sessions: Annotated[tuple[str, ...], Argument(metavar="SESSION", help="Sessions of presses.")]
     out: Annotated[Path, Option(help="Folder of this training.")] = Path("generator-tuned")
     steps: Annotated[int, Option(min=1, help="Number of steps.")] = 300
     learning_rate: Annotated[float, Option(min=0, max=1, help="Peak learning rate.")] = 3e-4
-    held_out: Annotated[float, Option(min=0, max=1, help="Share of conditions to validate on.")] = 0.2
 
 
 @dataclass(frozen=True, slots=True)

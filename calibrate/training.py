@@ -1,11 +1,12 @@
-"""What is written beside a trained generator: its card in Markdown, and the page of its training.
+"""`brushloop train` and `train tune`: captured presses in a generator's image format, and what is written beside it.
 
-The page shows held-out strokes as the network draws them, and the losses.
+That is its card in Markdown, and the page of its training, with held-out strokes as the network draws them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.commands import TrainRequest, TuneRequest
+from brushloop.calibrate.compare import FINE, Image, averaged, brush_of
+from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.files import Written, write_whole
+from brushloop.calibrate.presses import Refused, prepare_press
 from brushloop.calibrate.report import (
     BLUE,
     ORANGE,
@@ -24,12 +28,18 @@ from brushloop.calibrate.report import (
     chart_uri,
     ink_uri,
     overlay_uri,
+    source_label,
     write_page,
 )
-from brushloop.model.generator.config import INPUTS, TrainConfig, load_config, preset
-from brushloop.model.generator.data import TuningFiles, sets, sha256
-from brushloop.model.generator.stroke import GeneratorFile, read_generator
+from brushloop.calibrate.session import OpenSession
+from brushloop.calibrate.stroke import PX_PER_MM, Prepared
+from brushloop.calibrate.validate.command import one_source, open_session
+from brushloop.model.ccdbsm import DomainError
+from brushloop.model.generator.config import ANCHOR_SHARE, INPUTS, Placement, Target, TrainConfig, load_config, preset
+from brushloop.model.generator.data import Captures, Images, sets, sha256
+from brushloop.model.generator.stroke import GeneratorFile, load_generator, read_generator
 from brushloop.model.similarity import csim
+from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.terminal import Progress, unseen
 
 PAGE = "training.html"
@@ -51,24 +61,57 @@ def train(request: TrainRequest, progress: Progress = unseen) -> Written:
 
 
 def tune(request: TuneRequest, progress: Progress = unseen) -> Written:
-    """Fine-tune a generator on captured strokes. Raises `TrainError`."""
-    files, steps = TuningFiles(request.generator, request.captures), request.steps
-    every = max(1, steps // 20)
-    config = files.config(request.held_out, steps=steps, learning_rate=request.learning_rate, validate_every=every)
-    return _trained(config, request.out, progress, files)
+    """Fine-tune a generator on the presses of sessions of one source. Raises `TrainError` and `CalibrationError`."""
+    read_generator(request.generator)  # refused before any photograph is read
+    sessions = [open_session(place) for place in request.sessions]
+    one_source(sessions)
+    captures, left_out = captures_of(sessions, request.generator)
+    steps = request.steps
+    config = captures.config(steps=steps, learning_rate=request.learning_rate, validate_every=max(1, steps // 20))
+    written = _trained(config, request.out, progress, captures)
+    used = f"{len(captures.images)} presses ({captures.source})"
+    return Written(written.path, (*(f"left out: {name}: {why}" for name, why in left_out), used, *written.said))
 
 
-def _trained(config: TrainConfig, folder: Path, progress: Progress, tuning: TuningFiles | None = None) -> Written:
+def captures_of(sessions: Sequence[OpenSession], generator: Path) -> tuple[Captures, list[Refused]]:
+    """The presses of sessions of one source in the generator's image format, and those that it is not tuned on.
+
+    Raises as `load_generator` does, and `CalibrationError` where fewer than two conditions are left.
+    """
+    targets = [load_generator(generator, brush_of(session.header)).target for session in sessions]
+    inputs, images, left_out = list[tuple[float, float]](), list[Image](), list[Refused]()
+    for session, target in zip(sessions, targets, strict=True):
+        for capture in session.recording.captures():
+            depth_mm, tilt_deg = capture.stroke.depth_mm, capture.stroke.tilt_deg
+            if depth_mm is None or tilt_deg is None or capture.bad:
+                left_out.append((capture.stroke.stroke_id, capture.bad or "has no depth or tilt"))
+                continue
+            try:
+                target.check(np.array([[depth_mm, tilt_deg]]))
+                images.append(_placed(prepare_press(capture, session.calibration), target))
+                inputs.append((depth_mm, tilt_deg))
+            except (CaptureRefused, SessionDamaged) as error:
+                left_out.append((capture.stroke.stroke_id, error.what))
+            except DomainError as error:
+                left_out.append((capture.stroke.stroke_id, f"the generator does not draw it: {error}"))
+    if len(set(inputs)) < 2:
+        what = f"{len(set(inputs))} conditions are left, at least 2 are needed: one to learn from, one to validate on"
+        raise CalibrationError(str(sessions[0].recording.path), what)
+    label = source_label(sessions[0].header.source, (session.header.brush for session in sessions))
+    return Captures(generator, Images(targets[0], np.array(inputs, np.float32), np.array(images)), label), left_out
+
+
+def _trained(config: TrainConfig, folder: Path, progress: Progress, captures: Captures | None = None) -> Written:
     """Train in the folder, and write the generator's card and the page."""
     from brushloop.model.generator.train import run_training  # loads torch
 
     progress("training", 0, config.steps)
-    path = run_training(config, folder, lambda step: progress("training", step, config.steps), tuning)
-    page = write_training(path, tuning)
+    path = run_training(config, folder, lambda step: progress("training", step, config.steps), captures)
+    page = write_training(path, captures)
     return Written(path, (f"Generator: {path}, its card: {path.with_suffix('.md')}", f"Page: {page}"))
 
 
-def write_training(path: Path, tuning: TuningFiles | None = None) -> Path:
+def write_training(path: Path, captures: Captures | None = None) -> Path:
     """Write card and page of a generator that `run_training` has finished; returns the page's path.
 
     Raises TrainError for captures that it was not tuned on, and OSError.
@@ -87,16 +130,16 @@ def write_training(path: Path, tuning: TuningFiles | None = None) -> Path:
         note="captured strokes: tuned on some of them, judged by the others"
         if file.config.tuning
         else "the network learns to draw what a closed-form model draws: no ink, neither real nor simulated",
-        samples=sorted(_samples(file, tuning), key=lambda sample: sample["csim"]),
+        samples=sorted(_samples(file, captures), key=lambda sample: sample["csim"]),
         trust=trust,
         losses=_losses(losses, checks, label),
         facts=facts,
     )
 
 
-def _samples(file: GeneratorFile, tuning: TuningFiles | None) -> Iterator[dict[str, Any]]:
+def _samples(file: GeneratorFile, captures: Captures | None) -> Iterator[dict[str, Any]]:
     """Target, network and difference of some held-out strokes, spread evenly over them."""
-    _, held_out = sets(file.config, tuning)
+    _, held_out = sets(file.config, captures)
     chosen = np.linspace(0, len(held_out) - 1, min(SAMPLES, len(held_out))).round().astype(int)
     inputs, targets = held_out.pick(chosen)
     for values, target, drawn in zip(inputs, targets, file.images(inputs), strict=True):
@@ -181,3 +224,25 @@ def _card(name: str, facts: list[tuple[str, str]], trust: list[Point]) -> str:
 
 def _plain(text: str) -> str:
     return "".join(c if c.isalnum() or c in " .,;-_()/:+" else "?" for c in text)
+
+
+def _placed(prepared: Prepared, target: Target) -> Image:
+    """(N, N) share of ink in each pixel of the generator. Raises `CaptureRefused` for a stroke that is cut or large."""
+    if prepared.cut:
+        raise CaptureRefused("capture", "is cut by the edge of its photograph or cell")
+    step_px = target.px_mm * PX_PER_MM
+    side_px = target.size_px * step_px
+    assert prepared.anchor_px is not None  # prepare_press aligns every press with its point of touch
+    if target.placement is Placement.CENTRED:
+        rows, columns = (np.flatnonzero(prepared.mask.any(axis=axis)) for axis in (1, 0))
+        left, top = (0.5 * (ends[0] + ends[-1] + 1 - side_px) for ends in (columns, rows))
+    else:
+        left, top = (at - share * side_px for at, share in zip(prepared.anchor_px, ANCHOR_SHARE, strict=True))
+    # At least as fine as the mask itself, else thin ink would fall between the samples.
+    fine = max(FINE, math.ceil(step_px))
+    coverage = averaged(prepared.mask.astype(np.float32), (float(left), float(top)), step_px, target.size_px, fine)
+    image = np.clip(coverage, 0.0, 1.0)
+    inked_px = float(np.count_nonzero(prepared.mask))
+    if abs(float(image.sum()) * step_px**2 - inked_px) > 0.01 * inked_px:
+        raise CaptureRefused("capture", "is larger than the generator's image")
+    return image

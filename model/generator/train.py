@@ -26,7 +26,7 @@ from torch import Tensor
 
 from brushloop.model.generator import TrainError
 from brushloop.model.generator.config import TrainConfig, differences
-from brushloop.model.generator.data import Images, Singles, TuningFiles, batch_numbers, sets, write_whole
+from brushloop.model.generator.data import Captures, Images, Singles, batch_numbers, sets, write_whole
 from brushloop.model.generator.network import Generator, squared_error
 from brushloop.model.generator.stroke import FORMAT, read_generator
 from brushloop.model.similarity import SSIM_SETTINGS, binary_scores, csim, ssim
@@ -50,7 +50,7 @@ def likeness(drawn: NDArray[Any], target: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def run_training(
-    config: TrainConfig, folder: Path, stepped: Callable[[int], object], tuning: TuningFiles | None = None
+    config: TrainConfig, folder: Path, stepped: Callable[[int], object], captures: Captures | None = None
 ) -> Path:
     """Train to the end, from the folder's checkpoint if it has one; return the generator's path.
 
@@ -65,8 +65,8 @@ def run_training(
     try:
         with FileLock(folder / ".lock", timeout=0):
             torch.set_num_threads(1)
-            run = _Training(config, folder, *sets(config, tuning))
-            run.start(tuning)
+            run = _Training(config, folder, *sets(config, captures))
+            run.start(captures)
             while not run.ended:
                 run.advance()
                 stepped(run.step)
@@ -115,16 +115,13 @@ class _Training:
         converged = bool(self.validations) and self.validations[-1][1] <= self.config.target_mse
         return self.step == self.config.steps or converged
 
-    def start(self, tuning: TuningFiles | None) -> None:
+    def start(self, captures: Captures | None) -> None:
         """Continue from the folder's checkpoint, or begin with the weights of the generator to tune."""
         if self._checkpoint.exists():
             self._resume()
-        elif tuning is not None:
-            file = read_generator(tuning.start)
-            same = file.config.model_copy(update={"target": self.config.target, "layers": self.config.layers})
-            for difference in differences(file.config, same):
-                raise TrainError(tuning.start, f"is another generator: {difference}")
-            self.network.load_state_dict({name: torch.from_numpy(value) for name, value in file.weights.items()})
+        elif captures is not None:
+            weights = read_generator(captures.start).weights
+            self.network.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
 
     def advance(self) -> None:
         """Make one step, and what falls due after it."""

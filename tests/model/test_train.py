@@ -1,4 +1,4 @@
-"""`brushloop train` and `tune`: Algorithm 1, what a folder holds, captures, and what happens after a cut."""
+"""`brushloop train`: Algorithm 1, what a folder holds, how captures are divided, and what happens after a cut."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from brushloop.__main__ import app
 from brushloop.model.generator import TrainError
 from brushloop.model.generator import train as training
 from brushloop.model.generator.config import TrainConfig, checked, load_config
-from brushloop.model.generator.data import load_captures, save_captures, split
+from brushloop.model.generator.data import Images, split
 from brushloop.model.generator.network import Generator
-from brushloop.model.generator.stroke import load_generator, read_generator
+from brushloop.model.generator.stroke import read_generator
 from brushloop.model.generator.train import new_network, run_training
 
 TOML = """
@@ -152,56 +152,13 @@ def test_blank_output_ends_the_training_with_advice(
         run_training(tiny.model_copy(update={"learning_rate": 1e-9}), tmp_path, lambda step: None)
 
 
-def test_captures_must_fit_the_generator_and_repeats_of_a_condition_are_held_out_together(
-    tmp_path: Path, tiny: TrainConfig
-) -> None:
-    path, target = tmp_path / "captures.safetensors", tiny.target
-    inputs = {"depth_mm": np.repeat(np.arange(11.0, 17.0), 4), "tilt_deg": np.full(24, 5.0)}
-    images = np.random.default_rng(0).random((24, 32, 32), np.float32)
-    good: dict[str, Any] = {"inputs": inputs, "images": images, "px_mm": 0.8, "placement": "centred", "source": "rig"}
-    save_captures(path, **good)
-    captures, source = load_captures(path, target)
-    assert source == "rig"
-    np.testing.assert_allclose(captures.pick(np.arange(24))[1], images, atol=0.5 / 255 + 1e-6, rtol=0)
+def test_repeats_of_a_condition_are_held_out_together(tiny: TrainConfig) -> None:
+    inputs = np.column_stack((np.repeat(np.arange(11.0, 17.0), 4), np.full(24, 5.0))).astype(np.float32)
+    captures = Images(tiny.target, inputs, np.zeros((24, 32, 32), np.float32))
     for seed in range(5):
         kept, held = split(captures, seed, 0.3)
         assert (len(kept), len(held)) == (16, 8)
         assert not set(held.inputs[:, 0].tolist()) & set(kept.inputs[:, 0].tolist())
-    for change, words in (
-        ({"px_mm": 0.2}, "px_mm is '0.2', expected '0.8'"),
-        ({"placement": "zero-touch"}, "placement is 'zero-touch'"),
-        ({"images": images[:, :16, :16]}, "images must be"),
-        ({"inputs": inputs | {"depth_mm": np.full(24, 21.0)}}, "depth_mm = 21 is outside"),
-        ({"inputs": inputs | {"speed": np.zeros(24)}}, "'speed' is not an input"),
-        ({"inputs": {"depth_mm": inputs["depth_mm"]}}, "tilt_deg must be 24"),
-        ({"inputs": inputs | {"depth_mm": np.full(24, 13.0)}}, "at least two conditions"),
-    ):
-        save_captures(path, **good | change)
-        with pytest.raises(TrainError, match=words):
-            load_captures(path, target)
-
-
-def test_fine_tuning_on_captures_is_marked_as_such(finished: Path, tmp_path: Path) -> None:
-    path = finished / "generator.safetensors"
-    before = load_generator(path)
-    assert not before.fitted
-    inputs = np.column_stack((np.linspace(11, 20, 20), np.linspace(0, 10, 20)))
-    images = np.roll(before.target.images(inputs), 2, axis=1)  # a brush that marks the paper two pixels lower
-    captures = tmp_path / "captures.safetensors"
-    named = {"depth_mm": inputs[:, 0], "tilt_deg": inputs[:, 1]}
-    save_captures(captures, named, images, 0.8, "centred", "loopback rig")
-    command = ["train", "tune", str(path), str(captures), "--out", str(tmp_path / "t"), "--steps", "60"]
-    ran = CliRunner().invoke(app, [*command, "--learning-rate", "0.01"])
-    assert ran.exit_code == 0, ran.exception
-    after = load_generator(tmp_path / "t" / "generator.safetensors")
-    assert after.fitted
-    assert "tuned on captured strokes" in after.definition
-    for name in ("generator.md", "training.html"):
-        assert "captures of loopback rig" in (tmp_path / "t" / name).read_text()
-    old, new = (np.square(model.file.images(inputs) - images).mean() for model in (before, after))
-    assert new < 0.7 * old
-    again = CliRunner().invoke(app, [*command, "--learning-rate", "0.02"])
-    assert "learning_rate: 0.01 -> 0.02" in str(again.exception)
 
 
 @pytest.mark.parametrize(
@@ -209,7 +166,7 @@ def test_fine_tuning_on_captures_is_marked_as_such(finished: Path, tmp_path: Pat
     [
         (["--target", "cube"], "cube: no such target; known: press, anchored"),
         (["--config", "no.toml"], "no.toml: No such file"),
-        (["tune", "no.safetensors", "captures.safetensors"], "no.safetensors: no such file"),
+        (["tune", "no.safetensors", "nowhere"], "no.safetensors: no such file"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(arguments: list[str], words: str) -> None:

@@ -1,4 +1,4 @@
-"""A trained generator among the models, and captured presses as `brushloop train tune` reads them, end to end."""
+"""A trained generator among the models, and the same tuned on the presses of a session."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ import torch
 from typer.testing import CliRunner
 
 from brushloop.__main__ import app
-from brushloop.calibrate.session import OpenSession
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.session import OpenSession, open_session
+from brushloop.calibrate.training import captures_of
 from brushloop.calibrate.validate.tables import NORMAL, load_report
-from brushloop.calibrate.validate.tuning import align_captures
-from brushloop.model.generator import SHIPPED_GENERATOR
-from brushloop.model.generator.data import load_captures
-from brushloop.model.generator.stroke import load_generator, read_generator
+from brushloop.model.generator.stroke import load_generator
 from brushloop.sessions.records import Source
+from tests.calibrate.validate.conftest import MakeSession
 
 # One word a line, as the file's owner would write it.
 TRAINING = """
@@ -79,7 +79,7 @@ def test_a_generator_is_scored_beside_what_it_was_trained_on(session: Path, gene
 
 
 @pytest.mark.parametrize("placement", ["centred", "zero-touch"])
-def test_captures_go_through_the_file_into_a_tuning(
+def test_a_generator_is_tuned_on_the_presses_of_a_session(
     session: Path, generator: Path, tmp_path: Path, placement: str
 ) -> None:
     if placement == "zero-touch":
@@ -90,16 +90,10 @@ def test_captures_go_through_the_file_into_a_tuning(
         )
         invoke("train", "--config", tmp_path / "train.toml", "--out", tmp_path / "made")
         generator = tmp_path / "made" / "generator.safetensors"
-    captures = tmp_path / "captures.safetensors"
-    said = invoke("validate", "captures", session, "--generator", generator, "--out", captures)
-    assert "left out: blank" in said
-    assert "10 presses (imported photographs)" in said
-
-    kept, source = load_captures(captures, read_generator(generator).config.target)
-    inputs, truth = kept.pick(np.arange(len(kept)))
-    assert source == "imported photographs"
+    images = captures_of([open_session(session)], generator)[0].images
+    assert images.inputs.tolist()[:2] == [[11.0, 0.0], [11.0, 10.0]]
+    inputs, truth = images.pick(np.arange(len(images)))
     assert truth.shape == (10, 32, 32)
-    assert inputs.tolist()[:2] == [[11.0, 0.0], [11.0, 10.0]]
     # The ink of a deeper press is more; none is cut off, and it lies where the generator puts it.
     area = truth.sum(axis=(1, 2))
     assert area[2] > 1.5 * area[0]
@@ -107,20 +101,30 @@ def test_captures_go_through_the_file_into_a_tuning(
     middle = (truth.sum(axis=1) * np.arange(32)).sum(axis=1) / area
     assert np.abs(middle - (16 if placement == "centred" else 18)).max() < 4.0
 
-    tuned = tmp_path / "tuned"
-    invoke("train", "tune", generator, captures, "--out", tuned, "--steps", "100", "--held-out", "0.25")
-    made = load_generator(tuned / "generator.safetensors")
-    assert made.fitted
+    command = ("train", "tune", generator, session, "--out", tmp_path / "tuned", "--steps", "100")
+    said = invoke(*command, "--learning-rate", "0.001")
+    assert "left out: blank" in said
+    assert "10 presses (imported photographs)" in said
+    tuned = load_generator(tmp_path / "tuned" / "generator.safetensors")
+    assert tuned.fitted
+    assert "tuned on captured strokes" in tuned.definition
+    for name in ("generator.md", "training.html"):
+        assert "captures of imported photographs" in (tmp_path / "tuned" / name).read_text()
     before, after = (
-        float(np.square(load_generator(path).file.images(inputs) - truth).mean())
-        for path in (generator, tuned / "generator.safetensors")
+        float(np.square(model.file.images(inputs) - truth).mean()) for model in (load_generator(generator), tuned)
     )
     assert after < 0.8 * before
+    again = CliRunner().invoke(app, [*map(str, command), "--learning-rate", "0.02"])
+    assert "learning_rate: 0.001 -> 0.02" in str(again.exception)
 
 
-def test_captures_of_a_described_brush_keep_its_remark() -> None:
-    brush = "soft (twin of monday, simulated)"
-    header = SimpleNamespace(source=Source.LOOPBACK, brush=brush, brush_radius_mm=None, brush_length_mm=None)
-    empty = SimpleNamespace(header=header, recording=SimpleNamespace(captures=lambda: iter(())))
-    found = align_captures([cast(OpenSession, empty)], SHIPPED_GENERATOR)
-    assert found.source == "loopback rig, brush twin of monday, simulated"
+def test_presses_of_a_single_condition_are_refused_and_a_described_brush_keeps_its_remark(
+    make_session: MakeSession, generator: Path, tmp_path: Path
+) -> None:
+    pressed = open_session(make_session(tmp_path, repeats=1, blank=False))
+    twin = {"source": Source.LOOPBACK, "brush": "soft (twin of monday, simulated)"}
+    pressed.recording.header = pressed.header.model_copy(update=twin)
+    assert captures_of([pressed], generator)[0].source == "loopback rig, brush twin of monday, simulated"
+    recording = SimpleNamespace(path=tmp_path, captures=lambda: iter(()))
+    with pytest.raises(CalibrationError, match="0 conditions are left, at least 2 are needed"):
+        captures_of([cast(OpenSession, SimpleNamespace(header=pressed.header, recording=recording))], generator)
