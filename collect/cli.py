@@ -15,7 +15,6 @@ from brushloop.collect.chains import PROTOCOL_FILE, RIG_FILE, Arm, Rig, Tui, on_
 from brushloop.sessions.terminal import say
 
 if TYPE_CHECKING:
-    from brushloop.collect.commission.step import Guide
     from brushloop.collect.engine.engine import Engine
     from brushloop.collect.engine.open_or_resume import Opening
 
@@ -188,13 +187,13 @@ def _first_report(config: Path, report: Path) -> bool:
     import asyncio
 
     from brushloop.collect.commission.arm import write_first_report
-    from brushloop.collect.commission.notebook import TaughtFile
+    from brushloop.collect.commission.notebook import Notebook, notebook_path
 
-    taught = TaughtFile(config)
-    if not taught.path.exists():
+    path = notebook_path(config)
+    if not path.exists():
         return False
-    asyncio.run(write_first_report(report, taught.load()))
-    say(f"There is no {config} yet: {report} holds what {taught.path} knows and what the arm answered. Read it first.")
+    asyncio.run(write_first_report(report, Notebook.load(config)))
+    say(f"There is no {config} yet: {report} holds what {path} knows and what the arm answered. Read it first.")
     return True
 
 
@@ -220,6 +219,7 @@ def teach(
 def _commission(rig: Path, step: str | None, *, arm: bool) -> None:
     import sys
 
+    from brushloop.collect.commission.step import Visit
     from brushloop.collect.errors import ConfigError
     from brushloop.collect.tui.commission_app import run_commission
     from brushloop.drivers.host import HostClock
@@ -227,14 +227,15 @@ def _commission(rig: Path, step: str | None, *, arm: bool) -> None:
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise ConfigError("rig", "", "a rig is taught on a screen: run this command in a terminal")
 
-    async def work(guide: Guide) -> Path | None:
-        from brushloop.collect.commission.step import Visit
+    visit = Visit(rig, HostClock(), armed=arm)
+
+    async def work() -> Path | None:
         from brushloop.collect.commission.wizard import Wizard
 
-        wizard = Wizard(Visit(guide, rig, HostClock(), armed=arm))
+        wizard = Wizard(visit)
         return await (wizard.run() if step is None else wizard.again(step))
 
-    if (written := run_commission(work, str(rig))) is not None:
+    if (written := run_commission(visit, work)) is not None:
         say(f"{written} is written, with how each value was obtained. Next: brushloop rig check {written}")
 
 
@@ -269,11 +270,11 @@ def check(
     import json
     from dataclasses import asdict
 
-    from brushloop.collect.commission.notebook import TaughtFile, gaps
+    from brushloop.collect.commission.notebook import Notebook, gaps
     from brushloop.collect.rig.check import check_page, check_rig, contradictions
     from brushloop.collect.rig.config import load_rig
 
-    checks = [*check_rig(load_rig(rig)), *gaps(TaughtFile(rig).load())]
+    checks = [*check_rig(load_rig(rig)), *gaps(Notebook.load(rig))]
     if as_json:
         say(json.dumps({"contradictions": contradictions(checks), "checks": [asdict(check) for check in checks]}))
     else:

@@ -6,14 +6,13 @@ import asyncio
 import contextlib
 import math
 from collections.abc import AsyncGenerator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from brushloop.collect.commission.notebook import Notebook, touch_of
+from brushloop.collect.commission.notebook import Notebook, Taught
 from brushloop.collect.commission.step import Asked, Step, Visit
 from brushloop.collect.rig.doctor import Finding, Scrubber, numbers_only, transcript, write_archive
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, Controller, only_asking
@@ -27,7 +26,6 @@ NAMES = {
     "robot.host": "<host>",
     "aside.address": "<host>",
     "camera.source": "<camera>",
-    "aside.sources": "<camera>",
     "force.host": "<host>",
     "aside.bus": "<host>",
     "ink.device.port": "<port>",
@@ -39,8 +37,6 @@ FRAMINGS: tuple[Framing, ...] = ("sof", "bare")
 STILL_MM, STILL_DEG = 0.02, 0.01
 """An arm that is held still by hand moves by less than this between two readings."""
 STILL_S, PATIENCE_S = 0.1, 20.0
-MOST_CHARACTERS = 100
-"""Of a name that a cabinet reports; the notebook has no room for more than a few of these."""
 
 
 def address_of(text: str) -> tuple[str, int]:
@@ -61,19 +57,17 @@ ADDRESS = Asked(
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Cabinet:
+class Cabinet(NamedTuple):
     """What a cabinet reports about itself and its arm."""
 
     who: str
     """Model, control box and software."""
-    robot_mode: str
-    safety_mode: str
-    operational_mode: str
+    modes: tuple[str, str, str]
+    """Of the robot, of its safety, and of the mode switch."""
     tcp_mm_deg: tuple[float, ...]
     """Flange to tool as set on the pendant: x, y, z in mm, rx, ry, rz in deg."""
     payload_kg: float
-    payload_cog_mm: tuple[float, ...]
+    payload_cog_mm: list[float]
     collision_level: int
 
 
@@ -87,9 +81,6 @@ class ArmReader:
         if self._controller.connection.lost:
             await self._controller.connection.open()
         return await self._controller.ask(method)
-
-    async def _name(self, method: str) -> str:
-        return str(await self._ask(method))[:MOST_CHARACTERS]
 
     async def flange(self) -> Pose:
         """Wait until the arm is held still, and return the pose of the flange in the base frame.
@@ -126,7 +117,7 @@ class ArmReader:
         software = f"interface {await call('SystemInfo.getInterfaceVersionCode')}"
         with contextlib.suppress(RpcError):
             software += f", {await call('SystemInfo.getControlSoftwareFullVersion')}"
-        model, box = await self._name("RobotConfig.getRobotType"), await self._name("RobotConfig.getControlBoxType")
+        model, box = await self._ask("RobotConfig.getRobotType"), await self._ask("RobotConfig.getControlBoxType")
         tool = numbers("getTcpOffset", await self._ask("RobotConfig.getTcpOffset"))
         level = await self._ask("RobotConfig.getCollisionLevel")
         if type(level) is not int:
@@ -137,14 +128,14 @@ class ArmReader:
             payload_kg, *centre_m = numbers("getPayload", [mass_kg, *cog_m], 4)
         except (TypeError, ValueError):
             raise ProtocolViolation(DEVICE, "getPayload", f"expected mass and centre, got {payload!r}") from None
+        getters = ("RobotState.getRobotModeType", "RobotState.getSafetyModeType", "RobotManage.getOperationalMode")
+        robot_mode, safety_mode, switch = [str(await self._ask(getter)) for getter in getters]
         return Cabinet(
-            f"{model} ({box}), {software[:MOST_CHARACTERS]}",
-            await self._name("RobotState.getRobotModeType"),
-            await self._name("RobotState.getSafetyModeType"),
-            await self._name("RobotManage.getOperationalMode"),
-            (*(1e3 * v for v in tool[:3]), *(math.degrees(v) for v in tool[3:])),
+            f"{model} ({box}), {software}",
+            (robot_mode, safety_mode, switch),
+            (*(1e3 * v for v in tool[:3]), *map(math.degrees, tool[3:])),
             payload_kg,
-            tuple(1e3 * metres for metres in centre_m),
+            [1e3 * metres for metres in centre_m],
             level,
         )
 
@@ -169,11 +160,11 @@ async def touch(visit: Visit, reader: ArmReader, thing: str, how: str, *, may_sk
     A thing that was touched before is not asked for again.
     """
     if thing in visit.notebook.touches:
-        return visit.notebook.touches[thing].pose()
+        return visit.notebook.touches[thing]
     if not await visit.brought(thing, how, may_skip=may_skip):
         return None
     flange = await reader.flange()
-    visit.save(visit.notebook.with_touch(thing, touch_of(flange)))
+    visit.save(visit.notebook.with_touch(thing, flange))
     x, y, z = flange.position_mm
     visit.say(f"{thing}: the flange is at ({x:.2f}, {y:.2f}, {z:.2f}) mm")
     return flange
@@ -205,50 +196,45 @@ class ArmStep(Step):
 
     async def carry_out(self, visit: Visit) -> None:
         """Ask for the address and read everything else. Raises `DeviceError`."""
-        await visit.values("arm", ADDRESS)
+        await visit.values(ADDRESS)
         host, port = address_of(str(visit.notebook.get(ADDRESS.field)))
-        visit.guide.working(f"asking {host}:{port} who it is")
+        visit.working(f"asking {host}:{port} who it is")
         framing, cabinet = await find_framing(host, port)
+        robot_mode, safety_mode, switch = cabinet.modes
         tcp = [f"{v:.1f}" for v in cabinet.tcp_mm_deg]
         visit.say(
             f"{host}:{port} answers in the {framing} framing: {cabinet.who}",
-            f"robot mode {cabinet.robot_mode}, safety {cabinet.safety_mode}, mode switch {cabinet.operational_mode}",
+            f"robot mode {robot_mode}, safety {safety_mode}, mode switch {switch}",
             f"tool set on the pendant: {', '.join(tcp[:3])} mm, turned by {', '.join(tcp[3:])} deg; "
             f"payload {cabinet.payload_kg:g} kg; collision level {cabinet.collision_level}",
         )
-        if doubt := doubtful_tool(math.hypot(*cabinet.tcp_mm_deg[:3])):
-            visit.say(doubt, tone="warning")
-        if cabinet.safety_mode not in MOVING_ALLOWED:
+        tool_mm = math.hypot(*cabinet.tcp_mm_deg[:3])
+        if tool_mm and not SHORTEST_TOOL_MM <= tool_mm <= LONGEST_TOOL_MM:
             visit.say(
-                f"The safety mode is {cabinet.safety_mode}: the arm cannot be guided by hand until it is released.",
+                f"The pendant's tool is {tool_mm:.3g} mm long: perhaps metres were typed where millimetres are taken, "
+                "or millimetres where metres are. It is measured in the third step and replaced.",
+                tone="warning",
+            )
+        if safety_mode not in MOVING_ALLOWED:
+            visit.say(
+                f"The safety mode is {safety_mode}: the arm cannot be guided by hand until it is released.",
                 "Look at the pendant; this program clears nothing.",
                 tone="warning",
             )
-        pushed, as_set = await answers(host, RTDE_PORT), "as set on the pendant"
-        with visit.together():
-            visit.keep("arm", "robot.kind", "aubo-arcs", f"{cabinet.who} answered")
-            visit.keep("arm", "robot.host", host, "typed, and answered")
-            visit.keep("arm", "robot.port", port, "answered")
-            visit.keep("arm", "robot.framing", framing, "the first that the controller answered")
-            if pushed:
-                visit.keep("arm", "robot.rtde_port", RTDE_PORT, "answered, and sends poses")
-            visit.keep("arm", "robot.payload_kg", cabinet.payload_kg, as_set, "kg", known="not weighed")
-            visit.keep("arm", "robot.payload_cog_mm", list(cabinet.payload_cog_mm), as_set, "mm", known="not measured")
-            if cabinet.collision_level:
-                visit.keep("arm", "robot.collision_level", cabinet.collision_level, as_set)
-
-
-def doubtful_tool(length_mm: float) -> str:
-    """What is wrong with the length of the tool set on the pendant; empty if it is plausible."""
-    if length_mm > LONGEST_TOOL_MM and SHORTEST_TOOL_MM <= length_mm / 1e3 <= LONGEST_TOOL_MM:
-        wrong = f"millimetres were typed where metres are taken, and {length_mm / 1e3:.0f} mm are meant"
-    elif 0.0 < length_mm < 1.0:
-        wrong = f"metres were typed where millimetres are taken, and {1e3 * length_mm:.0f} mm are meant"
-    elif length_mm > LONGEST_TOOL_MM:
-        wrong = "no brush is"
-    else:
-        return ""
-    return f"The pendant's tool is {length_mm:.3g} mm long: {wrong}. It is measured in the third step and replaced"
+        as_set = "as set on the pendant"
+        values = {
+            "robot.kind": Taught("aubo-arcs", f"{cabinet.who} answered"),
+            "robot.host": Taught(host, "typed, and answered"),
+            "robot.port": Taught(port, "answered"),
+            "robot.framing": Taught(framing, "the first that the controller answered"),
+            "robot.payload_kg": Taught(cabinet.payload_kg, as_set, "kg", known="not weighed"),
+            "robot.payload_cog_mm": Taught(cabinet.payload_cog_mm, as_set, "mm", known="not measured"),
+        }
+        if await answers(host, RTDE_PORT):
+            values["robot.rtde_port"] = Taught(RTDE_PORT, "answered, and sends poses")
+        if cabinet.collision_level:
+            values["robot.collision_level"] = Taught(cabinet.collision_level, as_set)
+        visit.keep(values)
 
 
 async def write_first_report(path: Path, notebook: Notebook) -> None:

@@ -9,7 +9,7 @@ import statistics
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.collect.commission.notebook import Notebook, Taught, taught
+from brushloop.collect.commission.notebook import Notebook, Taught
 from brushloop.collect.commission.sheet import inside_corners
 from brushloop.collect.commission.step import Asked, Step, Visit
 from brushloop.collect.errors import NotAccepted
@@ -98,22 +98,22 @@ class BrushStep(Step):
 
     async def carry_out(self, visit: Visit) -> None:
         """Ask for what calipers say, and find the device at the well. Raises `NotAccepted`, `DeviceError`."""
-        await visit.values("brush", *BRUSH)
+        await visit.values(*BRUSH)
         kind = visit.notebook.get("aside.ink")
         if kind != NONE.key and "ink.device.kind" not in visit.notebook.values:
-            await visit.values("brush", PORT)
+            await visit.values(PORT)
             port = str(visit.notebook.get(PORT.field))
             device: InkTable = InkStationConfig(kind="ink-station", port=port)
             if kind == PUMP.key:
-                await visit.values("brush", DELIVERY)
+                await visit.values(DELIVERY)
                 ml = visit.notebook.number(DELIVERY.field)
                 device = ModbusPumpConfig(kind="modbus-pump", port=port, ml_per_revolution=ml)
             await self._primed(visit, device)
-            visit.keep("brush", "ink.device.kind", device.kind, "answered on its line")
-        await visit.values("brush", Asked("ink.name", "Name of the ink, for the record", default="ink"))
+            visit.keep({"ink.device.kind": Taught(device.kind, "answered on its line")})
+        await visit.values(Asked("ink.name", "Name of the ink, for the record", default="ink"))
 
     async def _primed(self, visit: Visit, config: InkTable) -> None:
-        visit.guide.working(f"asking {config.port} who it is")
+        visit.working(f"asking {config.port} who it is")
         device = config.device(visit.clock)
         try:
             identity = await device.connect()
@@ -121,7 +121,7 @@ class BrushStep(Step):
             gauge = "no gauge" if level is None else f"well {level:.0%} full"
             visit.say(f"{identity.model} {identity.firmware}: {gauge}")
             while await visit.yes(f"Give {PRIME_ML:g} ml, to fill its tube? The well must stand under it."):
-                visit.guide.working(f"giving {PRIME_ML:g} ml")
+                visit.working(f"giving {PRIME_ML:g} ml")
                 await device.dose(min(PRIME_ML, config.dose_ml))
                 level = await device.level()
                 if level is not None:
@@ -130,21 +130,15 @@ class BrushStep(Step):
             await device.close()
 
 
-CHANNEL = "can0"
-"""Channel of a gateway, unless one was typed."""
-
-
 def _addressed(bus: str) -> dict[str, str | int]:
-    """The fields of `[force]` for what was typed. Raises ValueError."""
-    if not bus:
-        return {}
+    """The fields of `[force]` for what was typed; none for an empty text. Raises ValueError."""
     host, colon, rest = bus.partition(":")
     if not colon:
-        return {"kind": "sri-m8123", "interface": "socketcan", "channel": bus}
+        return {"kind": "sri-m8123", "interface": "socketcan", "channel": bus} if bus else {}
     port, _, channel = rest.partition("/")
     if not port.isdecimal() or not 0 < int(port) < 65536:
         raise ValueError(f"{bus!r} is no bus: type can0, or HOST:PORT/can0 of a gateway")
-    at = {"kind": "sri-m8123", "interface": "socketcand", "channel": channel or CHANNEL}
+    at = {"kind": "sri-m8123", "interface": "socketcand", "channel": channel or "can0"}
     return {**at, "host": host, "port": int(port)}
 
 
@@ -183,13 +177,13 @@ class ForceStep(Step):
 
     async def carry_out(self, visit: Visit) -> None:
         """Find the sensor and have it pushed. Raises `NotAccepted`, `DeviceError`."""
-        await visit.values("force", BUS)
-        with visit.together():
-            for field, value in _addressed(str(visit.notebook.get("aside.bus"))).items():
-                visit.keep("force", f"force.{field}", value, "typed")
-            if visit.notebook.get("force.channel") == LOOPBACK_CHANNEL:
-                how = "simulated time may run faster than rounds arrive: allowed on the loopback rig's bus alone"
-                visit.keep("force", "force.stale_ms", LOOPBACK_STALE_MS, how, "ms")
+        await visit.values(BUS)
+        addressed = _addressed(str(visit.notebook.get("aside.bus")))
+        values = {f"force.{field}": Taught(value, "typed") for field, value in addressed.items()}
+        if addressed.get("channel") == LOOPBACK_CHANNEL:
+            how = "simulated time may run faster than rounds arrive: allowed on the loopback rig's bus alone"
+            values["force.stale_ms"] = Taught(LOOPBACK_STALE_MS, how, "ms")
+        visit.keep(values)
         if not visit.notebook.get("aside.bus"):
             visit.say(
                 "Without a force sensor the height of the paper is found by jogging with keys, when a session starts."
@@ -202,7 +196,7 @@ class ForceStep(Step):
         samples = list[ForceSample]()
         sensor = SriM8123(ForceTable.model_validate(visit.notebook.table("force.")), visit.clock)
         try:
-            visit.guide.working("listening to the sensor; let nothing touch the brush")
+            visit.working("listening to the sensor; let nothing touch the brush")
             identity = await sensor.connect()
             await sensor.bias(REST_S)
             sensor.listen(samples.append)
@@ -215,7 +209,7 @@ class ForceStep(Step):
                 "then take the finger away."
             )
             await visit.brought("push-sensor 0", how)
-            visit.guide.working("waiting for the end of the push")
+            visit.working("waiting for the end of the push")
             force_n = await self._push(samples)
         finally:
             sensor.listen(None)
@@ -227,7 +221,8 @@ class ForceStep(Step):
                 "The sensor counts a push toward the flange as positive: it is mounted, or wired, the other way round "
                 "than usual. push_axis takes this into account; nothing has to be changed."
             )
-        visit.keep("force", "touch.force.push_axis", axis, how, known="direction within 35 deg, sign certain")
+        known = "direction within 35 deg, sign certain"
+        visit.keep({"touch.force.push_axis": Taught(axis, how, known=known)})
 
     async def _push(self, samples: list[ForceSample]) -> NDArray[np.float64]:
         """Mean force of the strongest tenth of a second, once the push is over or has been waited for."""
@@ -247,9 +242,9 @@ class ForceStep(Step):
         widest_deg = min(max(math.ceil(10.0 * (lean_deg + LEAN_ROOM_DEG)) / 10.0, 1.0), 3.0)
         leans = f"the sheet leans by {lean_deg:.2f} deg, and {LEAN_ROOM_DEG:g} deg more"
         return {
-            "touch.method": taught("force", method, why),
-            "touch.points_mm": taught("force", points.tolist(), f"{INSET_MM:g} mm inside the sheet's corners"),
-            "touch.lean_deg": taught("force", widest_deg, leans),
+            "touch.method": Taught(method, why),
+            "touch.points_mm": Taught(points.tolist(), f"{INSET_MM:g} mm inside the sheet's corners"),
+            "touch.lean_deg": Taught(widest_deg, leans),
         }
 
 

@@ -13,20 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.board.detect import find_board
-from brushloop.calibrate.board.lens import (
-    GOOD_VIEWS,
-    fit_lens,
-    guidance,
-    held,
-    nominal_normals,
-)
+from brushloop.calibrate.board.lens import GOOD_VIEWS, fit_lens, guidance, held, nominal_normals
 from brushloop.calibrate.board.spec import BoardSpec, BoardView, describe
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_gray
-from brushloop.collect.commission.notebook import Notebook
-from brushloop.collect.commission.step import Asked, Step, Visit
+from brushloop.collect.commission.notebook import Notebook, Taught
+from brushloop.collect.commission.step import NO, YES, Asked, Step, Visit
 from brushloop.collect.errors import NotAccepted
-from brushloop.collect.operator import Choice
+from brushloop.collect.operator import Prompt
 from brushloop.collect.photograph.frames import gray
 from brushloop.drivers.camera import CameraTable, Locked, OpenCvCamera, found_settings
 from brushloop.drivers.devices import Stamp
@@ -38,8 +32,6 @@ LATE_MS = 2500.0
 """Until the delay is measured, a picture counts as taken this long before it came: no useful camera is slower."""
 SETTLE_S, LIVE_S = 2.0, 0.3
 """How long a device may take to choose its settings, and time between pictures for a person who guides something."""
-TILE_PX, NUMBER_PX = (480, 360), 64
-"""Width and height of one picture beside others, and the side of the square with its number."""
 VIEW = "aside.lens_view_"
 """Beginning of the fields for the photographs of the held board: the names of their files."""
 MOST_VIEWS = 20
@@ -89,7 +81,7 @@ class CameraStep(Step):
     title = "Find the camera"
     minutes = 12
     needs = ("arm",)
-    observes = ("camera.", *PRINTED, "aside.sources", VIEW)
+    observes = ("camera.", *PRINTED, VIEW)
 
     async def carry_out(self, visit: Visit) -> None:
         """Ask for source and print, measure the rest. Raises `NotAccepted`, `DeviceError`, `CalibrationError`."""
@@ -98,41 +90,33 @@ class CameraStep(Step):
         if "camera.source" not in visit.notebook.values:
             await self._source(visit)
         async with taught_camera(visit.notebook, visit.clock) as camera:
-            visit.guide.working("looking for the board")
+            visit.working("looking for the board")
             await _board_in(visit, await still(camera, visit.clock), "camera", lying=True)
             await self._lens(visit, camera)
 
     async def _print(self, visit: Visit) -> None:
         visit.say("The board: a print of `brushloop camera board`. Its name stands along its lower edge.")
-        await visit.values("camera", *PRINT)
+        await visit.values(*PRINT)
         squares: list[float] = [int(visit.notebook.number(f"aside.squares_{side}")) for side in ("across", "along")]
-        with visit.asked_again_if_refused(*PRINTED), visit.together():
-            visit.keep("camera", "board.squares", squares, FROM_PRINT)
+        values = {"board.squares": Taught(squares, FROM_PRINT)}
+        with visit.asked_again_if_refused(*PRINTED):
             try:
-                board_of(visit.notebook)
+                board_of(visit.notebook.with_values(values))
             except ValueError as error:
                 raise NotAccepted(f"no such board: {error}".splitlines()[0] + ".", "Read the print again.") from None
+        visit.keep(values)
 
     async def _source(self, visit: Visit) -> None:
+        """Ask for a camera and show its picture, until the person says that it is the one over the sheet."""
         devices = sorted((p.name[5:] for p in Path("/dev").glob("video*") if p.name[5:].isdecimal()), key=int)
-        if devices:
-            visit.say(f"Video devices of this computer: {', '.join(devices)}")
-        question = "Address of the camera's stream, as http://192.0.2.8/stream.mjpg (several: separated by spaces)"
-        await visit.values("camera", Asked("aside.sources", question))
-        typed = str(visit.notebook.get("aside.sources")).split()
-        seen = {source: await self._looked_at(visit, source) for source in dict.fromkeys([*typed, *devices])}
-        usable = {source: look for source, look in seen.items() if look is not None}
-        if not usable:
-            visit.save(visit.notebook.without("aside.sources"))
-            raise NotAccepted("no camera gives a picture.", "Check power, cable and address; then try again.")
-        source = max(usable, key=lambda source: usable[source][0])
-        if len(usable) > 1:
-            choices = tuple(Choice(str(number), source) for number, source in enumerate(usable, 1))
-            pictures = side_by_side([picture for _, picture in usable.values()])
-            visit.say(f"{len(usable)} cameras give a picture, numbered as below.", picture=pictures)
-            best = next(choice.key for choice in choices if choice.label == source)
-            chosen = await visit.choose("Which of them looks at the sheet?", choices, best)
-            source = next(choice.label for choice in choices if choice.key == chosen)
+        number = f", or the number of a video device ({', '.join(devices)})" if devices else ""
+        question = Prompt(f"Address of the camera's stream, as http://192.0.2.8/stream.mjpg{number}", read=str)
+        while True:
+            source = str(await visit.ask(question))
+            board_seen = await self._looked_at(visit, source)
+            over_sheet = "Is this the picture of the camera over the sheet?"
+            if await visit.choose(over_sheet, (YES, NO), (YES if board_seen else NO).key) == YES.key:
+                break
         # What a device chose by itself; the settings of a stream only its own set-up can change.
         locked = await asyncio.to_thread(found_settings, int(source), SETTLE_S) if source.isdecimal() else {}
         if not locked:
@@ -141,30 +125,29 @@ class CameraStep(Step):
                 "off in the camera's own set-up.",
                 tone="warning",
             )
-        with visit.together():
-            visit.keep("camera", "camera.kind", "opencv", "the only kind")
-            for name, value in locked.items():
-                whole = int(value) if name in ("width", "height") else value
-                visit.keep("camera", f"camera.locked.{name}", whole, "chosen by the camera itself, locked, read back")
-            visit.keep("camera", "camera.source", source, "typed or found, and its picture was seen")
+        values = {
+            f"camera.locked.{name}": Taught(
+                int(value) if name in ("width", "height") else value, "chosen by the camera itself, locked, read back"
+            )
+            for name, value in locked.items()
+        }
+        values["camera.kind"] = Taught("opencv", "the only kind")
+        values["camera.source"] = Taught(source, "typed, and its picture was seen")
+        visit.keep(values)
 
-    async def _looked_at(self, visit: Visit, source: str) -> tuple[int, Gray] | None:
-        """Show a picture of a camera; return how many corners of the board it shows, and the picture, if any."""
-        visit.guide.working(f"waiting for a picture of {source}")
+    async def _looked_at(self, visit: Visit, source: str) -> bool:
+        """Show a picture of a camera; whether the board is in it. Raises `NotAccepted` for a mirror or no picture."""
+        visit.working(f"waiting for a picture of {source}")
         try:
             async with opened(source, visit.clock) as camera:
                 picture = await still(camera, visit.clock)
         except DeviceError as error:
-            visit.say(f"{source}: {error.what}", tone="warning")
-            return None
+            raise NotAccepted(f"{source}: {error.what}.", "Check power, cable and address; then try again.") from None
         height, width = picture.shape
-        try:
-            corners = len((await asyncio.to_thread(find_board, picture, board_of(visit.notebook), source)).ids)
-            what = f"{corners} corners of the board are seen"
-        except CalibrationError as error:
-            corners, what = 0, error.what
-        visit.say(f"{source}: {width} x {height} px; {what}", picture=picture)
-        return corners, picture
+        view = await _board_in(visit, picture, source, lying=False)
+        corners = 0 if view is None else len(view.ids)
+        visit.say(f"{source}: {width} x {height} px; {corners} corners of the board are seen", picture=picture)
+        return view is not None
 
     async def _lens(self, visit: Visit, camera: OpenCvCamera) -> None:
         """Fit the lens to photographs of the held board; nothing where the person skips the first ones."""
@@ -184,7 +167,7 @@ class CameraStep(Step):
                 return
             if views and (todo := still_missing(views)):
                 visit.say(*todo)
-        visit.guide.working("computing the lens")
+        visit.working("computing the lens")
         digests = {view.name: hashlib.sha256((folder / view.name).read_bytes()).hexdigest() for view in views}
         file = await asyncio.to_thread(fit_lens, views, describe(spec), digests, {})
         for warning in (*file.warnings, *file.guidance):
@@ -193,7 +176,7 @@ class CameraStep(Step):
         how = f"fitted to {len(file.residuals_px)} photographs of the board held in {file.ways} ways"
         known = f"residual {file.rms_px:.2f} px"
         known += "" if reach is None else f", focal length to +-{max(reach):.1f} px (95 %)"
-        visit.keep("camera", "camera.lens_file", str(path.relative_to(visit.rig_path.parent)), how, known=known)
+        visit.keep({"camera.lens_file": Taught(str(path.relative_to(visit.rig_path.parent)), how, known=known)})
         visit.say(f"Lens: residual {file.rms_px:.2f} px over {len(file.residuals_px)} photographs.")
 
     async def _held(self, visit: Visit, camera: OpenCvCamera, folder: Path, index: int, views: list[BoardView]) -> bool:
@@ -203,7 +186,7 @@ class CameraStep(Step):
         async with shown_live(visit, camera):
             if not await visit.brought(f"hold-board {index}", how, may_skip=True):
                 return False
-        visit.guide.working("looking for the board in the picture")
+        visit.working("looking for the board in the picture")
         picture = await still(camera, visit.clock)
         coded = cv2.imencode(".png", picture)[1].tobytes()
         # Named after its content: a photograph that is taken once more does not replace one that going back restores.
@@ -211,7 +194,7 @@ class CameraStep(Step):
         if (view := await _board_in(visit, picture, name, lying=False)) is None:
             return True
         (folder / name).write_bytes(coded)
-        visit.keep("camera", f"{VIEW}{index:02d}", name, "photograph of the board held in hand")
+        visit.keep({f"{VIEW}{index:02d}": Taught(name, "photograph of the board held in hand")})
         views.append(view)
         return True
 
@@ -228,7 +211,7 @@ async def _board_in(visit: Visit, picture: Gray, name: str, *, lying: bool) -> B
         if "mirrored" in error.what:
             raise NotAccepted(f"{error.what}.", MIRRORED) from None
         if lying and ("another board" in error.what or "arranged" in error.what):
-            visit.save(visit.notebook.without(*PRINTED))
+            visit.forget(*PRINTED)
             raise NotAccepted(f"{error.what}.", OTHER_PRINT) from None
         visit.say(f"The board is not seen: {error.what}", picture=picture, tone="warning")
         return None
@@ -289,7 +272,7 @@ async def shown_live(visit: Visit, camera: OpenCvCamera) -> AsyncGenerator[None]
             while True:
                 frame = await camera.fresh(after)
                 after = Stamp(frame.exposed_after_ns + 1)
-                visit.guide.live = gray(frame.image)
+                visit.live = gray(frame.image)
                 await asyncio.sleep(LIVE_S)
 
     task = asyncio.create_task(look(), name="live picture")
@@ -298,19 +281,4 @@ async def shown_live(visit: Visit, camera: OpenCvCamera) -> AsyncGenerator[None]
     finally:
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
-        visit.guide.live = None
-
-
-def side_by_side(pictures: Sequence[Gray]) -> Gray:
-    """Pictures of any sizes in one, two in a row, numbered from 1 in their upper left corners."""
-    width_px, height_px = TILE_PX
-    tiles = np.zeros(((len(pictures) + 1) // 2 * height_px, min(len(pictures), 2) * width_px), np.uint8)
-    for number, picture in enumerate(pictures):
-        top, left = number // 2 * height_px, number % 2 * width_px
-        scale = min(width_px / picture.shape[1], height_px / picture.shape[0])
-        small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)[:height_px, :width_px]
-        tiles[top : top + small.shape[0], left : left + small.shape[1]] = small
-        tiles[top : top + NUMBER_PX, left : left + NUMBER_PX] = 0
-        at = (left + 10, top + NUMBER_PX - 12)
-        cv2.putText(tiles, str(number + 1), at, cv2.FONT_HERSHEY_SIMPLEX, 1.8, (255,), 5, cv2.LINE_AA)
-    return tiles
+        visit.live = None

@@ -10,12 +10,14 @@ import json
 import textwrap
 import tomllib
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 from pydantic import Field, ValidationError
+from pydantic.dataclasses import dataclass
 
 from brushloop.calibrate.files import replacing, write_whole
 from brushloop.collect.errors import ConfigError
@@ -30,8 +32,6 @@ MAX_BYTES = 1024 * 1024
 ENDING, ASIDE = ".taught.json", "aside."
 Value = bool | int | float | str | list[Finite] | list[list[Finite]]
 """What a field of `rig.toml` can hold."""
-FieldName = Annotated[str, Field(min_length=3, max_length=100, pattern=r"^[a-z0-9_]+(\.[a-z0-9_]+)*$")]
-ThingName = Annotated[str, Field(max_length=60)]
 StepName = Literal["arm", "camera", "tip", "sheet", "places", "brush", "force", "limits", "proof"]
 """In the order in which they are taught: the box of the limits needs the deepest press."""
 STEPS: tuple[StepName, ...] = get_args(StepName)
@@ -46,20 +46,25 @@ UNTRIED = """\
 #   speeds and stops: the dry run of the last step; forces: the push in the step of the brush."""
 
 
-class Taught(Config):
-    """One value: where it goes in `rig.toml`, how it was obtained, and how well it is known."""
+def now_utc() -> str:
+    """The current time in UTC as text, to the second, as the notebook keeps it."""
+    return datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+
+
+@dataclass(frozen=True)
+class Taught:
+    """The value of one field of `rig.toml`, how it was obtained, and how well it is known."""
 
     value: Value
-    unit: Annotated[str, Field(max_length=20)] = ""
-    how: Annotated[str, Field(max_length=400)]
+    how: str
     """How it was obtained, as a clause."""
-    sigma: Annotated[float, Field(ge=0.0)] | None = None
+    unit: str = ""
+    sigma: float | None = None
     """One standard error, in the unit; None where none can be given."""
-    known: Annotated[str, Field(max_length=400)] = ""
+    known: str = ""
     """How well it is known, in words."""
-    at: Annotated[str, Field(max_length=40)]
+    at: str = field(default_factory=now_utc)
     """When, in UTC."""
-    step: StepName
 
     def comment(self) -> str:
         """One line for `rig.toml`."""
@@ -67,44 +72,36 @@ class Taught(Config):
         return f"{self.how}{error}{'; ' if self.known else ''}{self.known} ({self.at})"
 
 
-def taught(
-    step: StepName, value: Value, how: str, unit: str = "", *, sigma: float | None = None, known: str = ""
-) -> Taught:
-    """A value of now."""
-    return Taught(value=value, unit=unit, how=how, sigma=sigma, known=known, at=now_utc(), step=step)
-
-
-class Touch(Config):
-    """Pose of the flange in the base frame while the tip was at a thing."""
-
-    position_mm: tuple[Finite, Finite, Finite]
-    quaternion: tuple[Finite, Finite, Finite, Finite]
-
-    def pose(self) -> Pose:
-        """The flange."""
-        return Pose(*self.position_mm, *self.quaternion)
-
-
-def touch_of(pose: Pose) -> Touch:
-    """The pose of the flange as a touch."""
-    return Touch(position_mm=pose.position_mm, quaternion=pose.quaternion)
-
-
-def now_utc() -> str:
-    """The current time in UTC as text, to the second, as the notebook keeps it."""
-    return datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
-
-
 class Notebook(Config):
-    """Everything that is known of one rig."""
+    """Everything that is known of one rig. It is kept in one file, which `save` replaces as a whole."""
 
     schema_version: Literal[1] = 1
-    values: dict[FieldName, Taught] = Field(default_factory=dict[str, Taught], max_length=300)
+    values: dict[str, Taught] = Field(default_factory=dict[str, Taught])
     """By the path of the field in `rig.toml`; `aside.` marks values that are not in it."""
-    touches: dict[ThingName, Touch] = Field(default_factory=dict[str, Touch], max_length=300)
-    """By what was touched: `pin 0`, `board-corner lower left 1`."""
+    touches: dict[str, Pose] = Field(default_factory=dict[str, Pose])
+    """The flange in the base frame while the tip was at a thing, by its name: `pin 0`, `board-corner lower left 1`."""
     done: dict[StepName, str] = Field(default_factory=dict[StepName, str])
     """Steps that were finished, and when."""
+
+    @classmethod
+    def load(cls, rig_path: Path) -> Notebook:
+        """What was taught of this rig; an empty notebook where there is no file. Raises `ConfigError`."""
+        path = notebook_path(rig_path)
+        try:
+            return cls.model_validate_json(read_text(path, MAX_BYTES)) if path.exists() else cls()
+        except ValidationError as error:
+            raise refusal(path, error, cls) from None
+
+    def save(self, rig_path: Path) -> None:
+        """Replace the file; returns once it is safe against a loss of power. Raises `ConfigError`."""
+        path = notebook_path(rig_path)
+        try:
+            with replacing(path) as part, part.open("w", encoding="utf-8") as file:
+                file.write(self.model_dump_json(indent=1))
+                sync(file)
+            fsync_folder(path.absolute().parent)
+        except OSError as error:
+            raise ConfigError(path, "", error.strerror or str(error)) from None
 
     @property
     def framing(self) -> Framing:
@@ -134,15 +131,15 @@ class Notebook(Config):
 
     def touched(self, kind: str) -> dict[str, Pose]:
         """Everything touched of one kind, by the rest of its name, in the order in which it was touched."""
-        return {name[len(kind) + 1 :]: t.pose() for name, t in self.touches.items() if name.split(" ")[0] == kind}
+        return {name[len(kind) + 1 :]: pose for name, pose in self.touches.items() if name.split(" ")[0] == kind}
 
-    def with_values(self, values: dict[str, Taught]) -> Notebook:
+    def with_values(self, values: Mapping[str, Taught]) -> Notebook:
         """The same with these values; others stay."""
         return self.model_copy(update={"values": {**self.values, **values}})
 
-    def with_touch(self, name: str, touch: Touch) -> Notebook:
+    def with_touch(self, name: str, flange: Pose) -> Notebook:
         """The same with one more touch, or another one in its place."""
-        return self.model_copy(update={"touches": {**self.touches, name: touch}})
+        return self.model_copy(update={"touches": {**self.touches, name: flange}})
 
     def without(self, *names: str) -> Notebook:
         """The same without the values whose paths begin like this, and without what was touched of these kinds, such
@@ -153,41 +150,17 @@ class Notebook(Config):
 
     def finished(self, step: StepName) -> Notebook:
         """The same with this step done. Only the proof proves what it rests on: after another step it is done again."""
-        done = {name: at for name, at in self.done.items() if name != "proof"}
-        return self.model_copy(update={"done": {**done, step: now_utc()}})
+        unproven = self.reopened("proof")
+        return unproven.model_copy(update={"done": {**unproven.done, step: now_utc()}})
 
     def reopened(self, step: StepName) -> Notebook:
         """The same with this step to be done again."""
         return self.model_copy(update={"done": {name: at for name, at in self.done.items() if name != step}})
 
 
-class TaughtFile:
-    """The notebook on disk. `save` returns once it is safe there."""
-
-    def __init__(self, rig_path: Path) -> None:
-        self.path = rig_path.with_name(rig_path.stem + ENDING)
-
-    def load(self) -> Notebook:
-        """What was taught before; an empty notebook where there is no file. Raises `ConfigError`."""
-        if not self.path.exists():
-            return Notebook()
-        try:
-            return Notebook.model_validate_json(read_text(self.path, MAX_BYTES))
-        except ValidationError as error:
-            raise refusal(self.path, error, Notebook) from None
-
-    def save(self, notebook: Notebook) -> None:
-        """Replace the whole file, safe against a loss of power. Raises `ConfigError`, also if it is too large."""
-        text = notebook.model_dump_json(indent=1)
-        if len(text.encode()) > MAX_BYTES:
-            raise ConfigError(self.path, "", f"would be larger than {MAX_BYTES} bytes: an answer is too long")
-        try:
-            with replacing(self.path) as part, part.open("w", encoding="utf-8") as file:
-                file.write(text)
-                sync(file)
-            fsync_folder(self.path.absolute().parent)
-        except OSError as error:
-            raise ConfigError(self.path, "", error.strerror or str(error)) from None
+def notebook_path(rig_path: Path) -> Path:
+    """Where the notebook of a rig lies: beside its `rig.toml`."""
+    return rig_path.with_name(rig_path.stem + ENDING)
 
 
 def gaps(notebook: Notebook) -> Iterator[Check]:
@@ -198,9 +171,9 @@ def gaps(notebook: Notebook) -> Iterator[Check]:
         if step not in notebook.done:
             arm = " --arm" if step == "proof" else ""
             yield unmeasured(f"step {step}", "not done since something was taught", f"brushloop rig teach {step}{arm}")
-    for field, known in notebook.values.items():
-        if known.known.startswith(UNKNOWN) and not field.startswith(ASIDE):
-            yield unmeasured(field, f"{known.value} {known.unit}".rstrip(), f"{known.how}, {known.known}")
+    for path, known in notebook.values.items():
+        if known.known.startswith(UNKNOWN) and not path.startswith(ASIDE):
+            yield unmeasured(path, f"{known.value} {known.unit}".rstrip(), f"{known.how}, {known.known}")
 
 
 def rig_of(notebook: Notebook, rig_path: Path) -> RigConfig:
@@ -217,9 +190,12 @@ def rig_text(notebook: Notebook, rig_path: Path) -> str:
     proven = notebook.done.get("proof")
     lines = [HEAD, UNPROVEN if proven is None else f"{PROVEN}, {proven}.", *UNTRIED.splitlines()]
     tables = defaultdict[str, list[str]](list)
-    for field, value in _fields(notebook, rig_path).items():
-        table, _, name = field.rpartition(".")
-        if (known := notebook.values.get(field)) is not None:
+    named = {"name": rig_path.stem, "paper.name": "Xuan paper"}
+    for path, value in {**named, **notebook.table("")}.items():
+        if path.startswith(ASIDE):
+            continue
+        table, _, name = path.rpartition(".")
+        if (known := notebook.values.get(path)) is not None:
             tables[table] += [f"# {line}" for line in textwrap.wrap(known.comment().replace("\n", " "), 116)]
         # TOML writes numbers, strings, lists and booleans as JSON does, but for one character.
         text = json.dumps(_rounded(value), ensure_ascii=False).replace("\x7f", "\\u007f")
@@ -229,26 +205,19 @@ def rig_text(notebook: Notebook, rig_path: Path) -> str:
     return "\n".join(lines) + "\n"
 
 
-def write_rig(rig_path: Path, notebook: Notebook) -> tuple[Path, Path | None]:
-    """Write `rig.toml`; returns its path, and that of the old file, which is kept. Raises `ConfigError`, OSError."""
+def write_rig(rig_path: Path, notebook: Notebook) -> Path | None:
+    """Write `rig.toml`; returns where an older file with another text is kept. Raises `ConfigError`, OSError."""
     rig_of(notebook, rig_path)
-    text, kept = rig_text(notebook, rig_path), None
-    if rig_path.exists():
-        old = rig_path.read_text(encoding="utf-8")
-        if old == text:
-            return rig_path, None
+    text = rig_text(notebook, rig_path)
+    old = rig_path.read_text(encoding="utf-8") if rig_path.exists() else text
+    kept = None
+    if old != text:
         names = (f"{rig_path.name}.bak{number}" for number in ("", *(f"-{n}" for n in range(2, 10_000))))
         kept = next(path for name in names if not (path := rig_path.with_name(name)).exists())
         with kept.open("x", encoding="utf-8") as file:
             file.write(old)
     write_whole(rig_path, text)
-    return rig_path, kept
-
-
-def _fields(notebook: Notebook, rig_path: Path) -> dict[str, Value]:
-    """Every field of `rig.toml` by its path; values without a table come first."""
-    kept = {field: known.value for field, known in notebook.values.items() if not field.startswith(ASIDE)}
-    return {"name": rig_path.stem, "paper.name": "Xuan paper", **kept}
+    return kept
 
 
 def _rounded(value: Value) -> Any:

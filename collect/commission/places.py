@@ -10,8 +10,8 @@ import numpy as np
 
 from brushloop.calibrate.files import read_gray
 from brushloop.collect.commission.arm import ArmReader, taught_arm, tip_of, touch
-from brushloop.collect.commission.camera import shown_live, side_by_side, still, taught_camera
-from brushloop.collect.commission.notebook import Notebook, Taught, Value, rig_of, taught
+from brushloop.collect.commission.camera import shown_live, still, taught_camera
+from brushloop.collect.commission.notebook import Notebook, Taught, Value, rig_of
 from brushloop.collect.commission.sheet import Point, corners_of
 from brushloop.collect.commission.step import Asked, Step, Visit
 from brushloop.collect.errors import ConfigError, NotAccepted
@@ -39,6 +39,7 @@ AWAY = {
     "park": "Now bring the arm to its waiting place: brush upright, above everything, out of the camera's picture, "
     f"{APART_MM:g} mm or more from there: two pictures that agree show the arm in neither.",
 }
+PARKED = "aside.parked"
 INK = ("well-rim", "well", "wash-rim", "wash-pot")
 MARGIN_MM = 25.0
 """Room beside what was taught: a brush lifted along a tool axis that leans by 15 deg moves aside by as much."""
@@ -64,7 +65,7 @@ class PlacesStep(Step):
     title = "Well, wash and park"
     minutes = 5
     needs = ("camera", "tip", "sheet")
-    observes = (*INK, *AWAY, "aside.wipe", "ink.wipe.", "aside.wash", "ink.wash.")
+    observes = (*INK, *AWAY, "aside.wipe", "ink.wipe.", "aside.wash", "ink.wash.", PARKED)
 
     async def carry_out(self, visit: Visit) -> None:
         """Have the tip brought to each place; look whether the parked arm is out of the picture."""
@@ -76,9 +77,8 @@ class PlacesStep(Step):
                 visit.say(check_pot(visit.notebook, "well-rim 0", "well 0", "well"))
             await self._wipe(visit, reader)
             await self._wash(visit, reader)
-            if "park 0" not in visit.notebook.touches:
-                with visit.together():
-                    await self._park(visit, reader)
+            if PARKED not in visit.notebook.values:
+                await self._park(visit, reader)
 
     async def _wipe(self, visit: Visit, reader: ArmReader) -> None:
         """Have the side of the rim touched at which a drop is wiped off, if there is to be a wipe."""
@@ -93,7 +93,7 @@ class PlacesStep(Step):
         if wipe:
             with visit.asked_again_if_refused("well-rim 1"):
                 check_wipe(visit.notebook)
-        visit.keep("places", "aside.wipe", wipe, "answered")
+        visit.keep({"aside.wipe": Taught(wipe, "answered")})
 
     async def _wash(self, visit: Visit, reader: ArmReader) -> None:
         """Have rim and middle of a pot of water touched, if there is one."""
@@ -107,21 +107,21 @@ class PlacesStep(Step):
             await touch(visit, reader, "wash-pot 0", how)
             with visit.asked_again_if_refused("wash-rim", "wash-pot"):
                 check_pot(visit.notebook, "wash-rim 0", "wash-pot 0", "pot of water")
-        visit.keep("places", "aside.wash", wash, "answered")
+        visit.keep({"aside.wash": Taught(wash, "answered")})
 
     async def _park(self, visit: Visit, reader: ArmReader) -> None:
         """Have the arm brought out of the picture, to two places.
 
         Raises `NotAccepted` unless the pictures from there show the same.
         """
-        # Going back may have left one of the places: its picture has to be taken with the arm there.
-        visit.save(visit.notebook.without(*AWAY))
+        # One place alone may be left, after going back or a power cut: its picture needs the arm there again.
+        visit.forget(*AWAY)
         pictures: list[Thumbnail] = []
         async with taught_camera(visit.notebook, visit.clock) as camera:
             for kind, how in AWAY.items():
                 async with shown_live(visit, camera):
                     await touch(visit, reader, f"{kind} 0", how)
-                visit.guide.working("waiting for a picture without the arm")
+                visit.working("waiting for a picture without the arm")
                 pictures.append(thumbnail(await still(camera, visit.clock)))
         places = tips(visit.notebook)
         if (apart_mm := math.dist(places["park 0"], places["clear-view 0"])) < APART_MM:
@@ -131,13 +131,15 @@ class PlacesStep(Step):
             )
         share = changed_share(*pictures)
         if share >= ARM_SHARE:
-            beside = side_by_side([picture.astype(np.uint8) for picture in pictures])
-            visit.say("The arm elsewhere (1), and parked (2):", picture=beside)
+            beside = np.hstack(pictures).astype(np.uint8)
+            visit.say("The arm elsewhere (left), and parked (right):", picture=beside)
             raise NotAccepted(
                 f"the arm, or its shadow, is in one of the two pictures: {100 * share:.0f} % of them differs.",
                 "Park it farther from the sheet, or higher; both places are asked again.",
             )
-        visit.say(f"With the arm at both places {100 * share:.1f} % of the picture differs: it is out of both.")
+        shown = f"with the arm at both places {100 * share:.1f} % of the picture differs"
+        visit.keep({PARKED: Taught(True, shown)})
+        visit.say(f"{shown.capitalize()}: it is out of both.")
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """Places in the sheet's frame, and the travel height."""
@@ -149,7 +151,7 @@ class PlacesStep(Step):
         by_hand = "the tip was brought there by hand"
 
         def at(value: Value, how: str = by_hand, known: str = "one touch by hand, within a mm") -> Taught:
-            return taught("places", value, how, "mm", known=known)
+            return Taught(value, how, "mm", known=known)
 
         travel = f"the higher of sheet + {TRAVEL_MM:g} mm and highest rim + {RIM_CLEAR_MM:g} mm"
         lifted = "" if park_z >= safe_mm else ", and lifted to travel height"
@@ -174,7 +176,7 @@ class PlacesStep(Step):
 def tips(notebook: Notebook) -> dict[str, Point]:
     """The tip at everything that was touched, by name, in the base frame."""
     offset_mm = notebook.numbers("robot.tcp_offset_mm")
-    return {name: tip_of(touch.pose(), offset_mm) for name, touch in notebook.touches.items()}
+    return {name: tip_of(flange, offset_mm) for name, flange in notebook.touches.items()}
 
 
 def paper_of(notebook: Notebook) -> PaperConfig:
@@ -243,7 +245,7 @@ class LimitsStep(Step):
         """Show the box, have each limit confirmed, and ask the controller whether the arm reaches every corner."""
         rig = rig_of(visit.notebook.with_values(self.derived(visit.notebook)), visit.rig_path)
         picture = visit.rig_path.with_name(f"{visit.rig_path.stem}.limits.png")
-        visit.guide.working("drawing box and places")
+        visit.working("drawing box and places")
         await asyncio.to_thread(draw_rig, rig, picture)
         visit.say(
             f"{picture} shows box, sheet, board, well and park from above.",
@@ -258,8 +260,8 @@ class LimitsStep(Step):
                     "the box was not agreed.",
                     "Teach the place again that makes the box too large: `brushloop rig teach`.",
                 )
-            visit.keep("limits", AGREED, box, "agreed")
-        await visit.values("limits", *SPEEDS)
+            visit.keep({AGREED: Taught(box, "agreed")})
+        await visit.values(*SPEEDS)
         rig = rig_of(visit.notebook.with_values(self.derived(visit.notebook)), visit.rig_path)
         try:
             count = await ask_reach(visit.rig_path, rig, _to_reach(rig, visit.notebook))
@@ -273,7 +275,7 @@ class LimitsStep(Step):
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """The box around what was taught, and the defaults that were not taught otherwise."""
         cautious = {
-            asked.field: taught("limits", float(str(asked.default)), "cautious default", asked.unit)
+            asked.field: Taught(float(str(asked.default)), "cautious default", asked.unit)
             for asked in SPEEDS
             if asked.field not in notebook.values
         }
@@ -285,7 +287,7 @@ def _box(notebook: Notebook) -> dict[str, Taught]:
     beside = f"the smallest around sheet, well, wipe, pot and park position, and {MARGIN_MM:g} mm beside and above"
     floor = f"{BELOW_MM:g} mm below the deepest press and the dip; {MARGIN_MM:g} mm above travel and park"
     ranges = zip(BOX, hull(_within(notebook), MARGIN_MM), (beside, beside, floor), strict=True)
-    return {field: taught("limits", list(range_mm), how, "mm") for field, range_mm, how in ranges}
+    return {field: Taught(list(range_mm), how, "mm") for field, range_mm, how in ranges}
 
 
 def hull(

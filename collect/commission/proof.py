@@ -9,7 +9,7 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
-from brushloop.collect.commission.notebook import rig_of
+from brushloop.collect.commission.notebook import Taught, rig_of
 from brushloop.collect.commission.step import Step, Visit
 from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.open_or_resume import CollectRequest, Opening
@@ -62,7 +62,7 @@ class ProofStep(Step):
         await self._keep(visit, *read_proof(session))
 
     async def _doctor(self, visit: Visit, rig: RigConfig) -> None:
-        visit.guide.working("asking every device")
+        visit.working("asking every device")
         findings = await examine(rig, visit.clock)
         for finding in findings:
             visit.say(f"{finding.device}: {finding.identity or finding.address}; {finding.notes}")
@@ -103,18 +103,16 @@ class ProofStep(Step):
                 return
             if now.step != doing:
                 doing = now.step
-                visit.guide.working(f"run: {doing}")
+                visit.working(f"run: {doing}")
             if (asked := now.prompt) is not None:
-                engine.answer(asked.number, str(await visit.guide.ask(asked)))
+                engine.answer(asked.number, str(await visit.ask(asked, back=False)))
             await asyncio.sleep(POLL_S)
 
     async def _keep(
         self, visit: Visit, touch: ZeroTouchResult, check: SelfCheckResult, captures: list[CaptureResult]
     ) -> None:
-        plane, by_hand_mm = (
-            PaperPlane(touch.touch_z_mm, touch.slope_x, touch.slope_y),
-            visit.notebook.number(HEIGHT),
-        )
+        plane = PaperPlane(touch.touch_z_mm, touch.slope_x, touch.slope_y)
+        by_hand_mm = visit.notebook.number(HEIGHT)
         x_mm, y_mm = visit.notebook.numbers("paper.touch_point_mm")
         z_mm, worst_mm = plane.touch_z_mm(x_mm, y_mm), max(map(abs, touch.residuals_mm), default=0.0)
         sigmas_mm = [sigma_mm for point in touch.points for sigma_mm in point.sigma_mm if sigma_mm is not None]
@@ -124,10 +122,13 @@ class ProofStep(Step):
         known = f"residuals up to {worst_mm:.3f} mm; by hand it was {by_hand_mm:.2f} mm"
         again = sum(capture.retake for capture in captures)
         later = "the arm was seen to leave the picture later than it did"
-        with visit.together():
-            visit.keep("proof", HEIGHT, z_mm, how, "mm", sigma=sigma_mm, known=known)
-            visit.keep("proof", "aside.plane", [plane.z0_mm, plane.slope_x, plane.slope_y], how, "mm", sigma=sigma_mm)
-            visit.keep("proof", "camera.latency_ms", delay_ms, later, "ms", known=f"trips differ by {jitter_ms:.0f} ms")
+        visit.keep(
+            {
+                HEIGHT: Taught(z_mm, how, "mm", sigma_mm, known),
+                "aside.plane": Taught([plane.z0_mm, plane.slope_x, plane.slope_y], how, "mm", sigma_mm),
+                "camera.latency_ms": Taught(delay_ms, later, "ms", known=f"trips differ by {jitter_ms:.0f} ms"),
+            }
+        )
         visit.say(
             f"touch height {z_mm:.3f} mm ({z_mm - by_hand_mm:+.2f} mm from the touch by hand), {known}",
             f"self-check: marks {check.offset_mm[0]:+.1f}, {check.offset_mm[1]:+.1f} mm from where they were "

@@ -19,7 +19,7 @@ from scipy.optimize import least_squares
 from brushloop.calibrate.board.spec import BoardSpec, size_mm
 from brushloop.collect.commission.arm import taught_arm, tip_of, touch
 from brushloop.collect.commission.camera import board_of
-from brushloop.collect.commission.notebook import Notebook, Taught, taught
+from brushloop.collect.commission.notebook import Notebook, Taught
 from brushloop.collect.commission.step import Step, Visit
 from brushloop.collect.errors import NotAccepted
 from brushloop.collect.rig.paper import PaperPlane, fit_plane
@@ -96,17 +96,15 @@ class SheetStep(Step):
         how = f"{touches} corners of board and sheet touched by hand"
         known = f"residuals up to {max(fit.residuals_mm.values()):.2f} mm"
         leaning = f"the sheet leans by {plane.slope_deg:.2f} deg; not yet measured by touch"
-        z_mm, depth_mm = plane.touch_z_mm(*point), fit.depth_sigma_mm
+        slopes = [plane.z0_mm, plane.slope_x, plane.slope_y]
         return {
-            "paper.origin_mm": taught("sheet", list(fit.origin_mm), how, "mm", sigma=sigma_mm, known=known),
-            "paper.yaw_deg": taught("sheet", fit.yaw_deg, how, "deg", sigma=fit.yaw_sigma_deg, known=known),
-            "paper.size_mm": taught("sheet", list(fit.size_mm), how, "mm", sigma=sigma_mm, known=known),
-            "paper.touch_point_mm": taught("sheet", list(point), "beside every patch", "mm"),
-            "paper.touch_z_mm": taught("sheet", z_mm, how, "mm", sigma=depth_mm, known=leaning),
-            "board.origin_mm": taught("sheet", list(fit.board_origin_mm), how, "mm", sigma=sigma_mm, known=known),
-            "aside.plane": taught(
-                "sheet", [plane.z0_mm, plane.slope_x, plane.slope_y], how, "mm", sigma=depth_mm, known=known
-            ),
+            "paper.origin_mm": Taught(list(fit.origin_mm), how, "mm", sigma_mm, known),
+            "paper.yaw_deg": Taught(fit.yaw_deg, how, "deg", fit.yaw_sigma_deg, known),
+            "paper.size_mm": Taught(list(fit.size_mm), how, "mm", sigma_mm, known),
+            "paper.touch_point_mm": Taught(list(point), "beside every patch", "mm"),
+            "paper.touch_z_mm": Taught(plane.touch_z_mm(*point), how, "mm", fit.depth_sigma_mm, leaning),
+            "board.origin_mm": Taught(list(fit.board_origin_mm), how, "mm", sigma_mm, known),
+            "aside.plane": Taught(slopes, how, "mm", fit.depth_sigma_mm, known),
         }
 
 
@@ -300,14 +298,11 @@ def _check_askew(b: Floats, bk: list[int], s: Floats, sk: list[int], printed: Fl
         )
     own = math.atan2(along[1] - up[0], along[0] + up[1])
     askew = math.degrees(math.remainder(own - _turn_and_scale(printed[bk], b)[0], math.tau))
-    if abs(abs(askew) - 180.0) < 30.0 or abs(abs(askew) - 90.0) < 30.0:
-        raise NotAccepted(
-            f"the corners of the sheet were named turned by {askew:.0f} deg against those of the board.",
-            "The lower left corner of both is the one beside the print's name.",
-        )
     if abs(askew) > ASKEW_DEG:
         raise NotAccepted(
-            f"the sheet lies turned by {askew:+.1f} deg on its board.", "Lay its edges along the squares; touch again."
+            f"the sheet lies turned by {askew:+.1f} deg on its board.",
+            "Lay its edges along the squares, and touch again; the lower left corner of both is the one beside the "
+            "print's name.",
         )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.collect.commission.notebook import Notebook, StepName, Taught, TaughtFile, Value, taught
+from brushloop.collect.commission.notebook import Notebook, StepName, Taught, Value
 from brushloop.collect.errors import NotAccepted, StepError
 from brushloop.collect.operator import Asker, Choice, Prompt
 from brushloop.collect.rig.check import Check
@@ -26,19 +26,8 @@ ARM = Choice("a", "let it move: I look at the cell, my hand is at the emergency 
 STAY = Choice("x", "leave it where it is")
 YES, NO = Choice("y", "yes"), Choice("n", "no")
 THERE, SKIP = Choice("enter", "it is there"), Choice("k", "skip it")
-MOST_FINDINGS = 200
-"""Findings that can be scrolled back to."""
 Tone = Literal["finding", "warning", "trouble"]
 """After a warning the step can go on; trouble ends it, and its last line says what to do."""
-
-
-@dataclass(frozen=True, slots=True)
-class Shown:
-    """Something for the person to read and look at."""
-
-    lines: tuple[str, ...]
-    picture: Picture | None = None
-    tone: Tone = "finding"
 
 
 class LeftOff(Exception):
@@ -47,41 +36,6 @@ class LeftOff(Exception):
 
 class WentBack(Exception):
     """The person wants to go back one question: what was answered before this one is taken back, and asked again."""
-
-
-class Guide:
-    """Shows things to a person at the rig and asks questions; a screen reads its fields from another thread."""
-
-    def __init__(self) -> None:
-        self.asker = Asker(watched=True)
-        self.step = ""
-        """Which step is taught now."""
-        self.findings: tuple[Shown, ...] = ()
-        self.picture: Picture | None = None
-        """The newest picture of a finding."""
-        self.live: Picture | None = None
-        """What the camera sees now, while somebody guides something by it."""
-        self.doing: tuple[str, float] = ("", time.monotonic())
-        """What is at work while nothing is asked, empty where no step has said so, and since when."""
-
-    def show(self, what: Shown) -> None:
-        """Add a finding, and show its picture if it has one."""
-        self.findings = (*self.findings, what)[-MOST_FINDINGS:]
-        self.picture = self.picture if what.picture is None else what.picture
-
-    def working(self, what: str) -> None:
-        """Show what is being done until the next question."""
-        self.doing = what, time.monotonic()
-
-    async def ask(self, prompt: Prompt) -> Any:
-        """Wait for an answer that the prompt allows. Raises `WentBack` and `LeftOff`.
-
-        Where the person brings a thing somewhere, the answer is whether it is there.
-        """
-        try:
-            return await self.asker.ask(prompt)
-        finally:
-            self.working("")
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,17 +89,24 @@ def choice_of(question: str, choices: tuple[Choice, ...], default: str = "") -> 
 
 
 class Visit:
-    """One session with a person at one rig. Everything that is kept is on disk when the method returns."""
+    """One session with a person at one rig. What is kept is on disk at once; a screen in another thread reads it."""
 
-    def __init__(self, guide: Guide, rig_path: Path, clock: Clock, *, armed: bool) -> None:
+    def __init__(self, rig_path: Path, clock: Clock, *, armed: bool) -> None:
         """`armed`: the command line allows motion; the person is asked again each time. Raises `ConfigError`."""
-        self.guide = guide
         self.rig_path = rig_path
         self.clock = clock
         self.armed = armed
-        self._held = False
-        self._file = TaughtFile(rig_path)
-        self.notebook: Notebook = self._file.load()
+        self.asker = Asker(watched=True)
+        self.notebook = Notebook.load(rig_path)
+        self.step = ""
+        """Which step is taught now."""
+        self.findings: list[tuple[Tone, str]] = []
+        self.picture: Picture | None = None
+        """The newest picture of a finding."""
+        self.live: Picture | None = None
+        """What the camera sees now, while somebody guides something by it."""
+        self.doing: tuple[str, float] = ("", time.monotonic())
+        """What is at work while nothing is asked, empty where no step has said so, and since when."""
         self._answered: list[Notebook] = []
         """The notebook as it was at each question of this process that was answered."""
 
@@ -153,36 +114,16 @@ class Visit:
 
     def save(self, notebook: Notebook) -> None:
         """Replace the notebook."""
-        if not self._held:
-            self._file.save(notebook)
+        notebook.save(self.rig_path)
         self.notebook = notebook
 
-    def keep(
-        self,
-        step: StepName,
-        field: str,
-        value: Value,
-        how: str,
-        unit: str = "",
-        *,
-        sigma: float | None = None,
-        known: str = "",
-    ) -> None:
-        """Note one value."""
-        self.save(self.notebook.with_values({field: taught(step, value, how, unit, sigma=sigma, known=known)}))
+    def keep(self, values: Mapping[str, Taught]) -> None:
+        """Note values by their fields: after a loss of power all of them are known, or none."""
+        self.save(self.notebook.with_values(values))
 
-    @contextlib.contextmanager
-    def together(self) -> Generator[None]:
-        """Values kept in the block are on disk together at its end: all of them are known, or none."""
-        before, self._held = self.notebook, True
-        try:
-            yield
-        except BaseException:
-            self.notebook = before
-            raise
-        finally:
-            self._held = False
-        self.save(self.notebook)
+    def forget(self, *names: str) -> None:
+        """Take values and touches out of the notebook, so that they are asked for again."""
+        self.save(self.notebook.without(*names))
 
     @contextlib.contextmanager
     def asked_again_if_refused(self, *names: str) -> Generator[None]:
@@ -190,35 +131,44 @@ class Visit:
         try:
             yield
         except (NotAccepted, StepError):
-            self.save(self.notebook.without(*names))
+            self.forget(*names)
             raise
 
-    # The person
-
-    def say(self, *lines: str, tone: Tone = "finding", picture: Picture | None = None) -> None:
-        """Show lines to the person."""
-        self.guide.show(Shown(lines, picture, tone))
-
-    async def ask(self, prompt: Prompt) -> Any:
-        """Ask, and let going back lead here.
-
-        A step asks nothing that is in the notebook, so the notebook of now leads it to this question again; answers
-        that were not kept are one with those before them.
-        """
-        notebook = self.notebook
-        answer = await self.guide.ask(prompt)
-        if not self._answered or self._answered[-1] is not notebook:
-            self._answered.append(notebook)
-        return answer
-
-    def mark(self) -> None:
-        """Let going back lead to the notebook of now."""
+    def teach_afresh(self, step: Step) -> None:
+        """Forget what a step observed; going back undoes that."""
         self._answered.append(self.notebook)
+        self.save(self.notebook.without(*step.observes).reopened(step.name))
 
     def back(self) -> None:
         """Restore the notebook of the last answered question, if there is one, so that it is asked again."""
         if self._answered:
             self.save(self._answered.pop())
+
+    # The person
+
+    def say(self, *lines: str, tone: Tone = "finding", picture: Picture | None = None) -> None:
+        """Show lines, and a picture if there is one."""
+        self.findings.append((tone, "\n".join(lines)))
+        self.picture = self.picture if picture is None else picture
+
+    def working(self, what: str) -> None:
+        """Show what is being done until the next question."""
+        self.doing = what, time.monotonic()
+
+    async def ask(self, prompt: Prompt, *, back: bool = True) -> Any:
+        """Wait for an answer that the prompt allows, and let going `back` lead here. Raises `WentBack` and `LeftOff`.
+
+        A step asks nothing that is in the notebook, so the notebook of now leads it to this question again; answers
+        that were not kept are one with those before them.
+        """
+        notebook = self.notebook
+        try:
+            answer = await self.asker.ask(prompt)
+        finally:
+            self.working("")
+        if back and not (self._answered and self._answered[-1] is notebook):
+            self._answered.append(notebook)
+        return answer
 
     async def choose(self, question: str, choices: tuple[Choice, ...], default: str = "") -> str:
         """The key of one of the choices; `default` is taken for an empty answer, which is none if it is empty."""
@@ -234,7 +184,7 @@ class Visit:
         answers = {choice.key: choice is THERE for choice in choices}
         return bool(await self.ask(Prompt(how, choices, thing=thing, answers=answers)))
 
-    async def values(self, step: StepName, *values: Asked) -> None:
+    async def values(self, *values: Asked) -> None:
         """Ask for each of these values that is not known yet, and keep it."""
         for asked in values:
             if asked.field in self.notebook.values:
@@ -243,7 +193,7 @@ class Visit:
             value = await self.ask(prompt)
             agreed = isinstance(value, float) and prompt.default and value == float(prompt.default)
             how = "suggested, and agreed" if agreed else asked.how
-            self.keep(step, asked.field, value, how, asked.unit, sigma=asked.sigma)
+            self.keep({asked.field: Taught(value, how, asked.unit, asked.sigma)})
 
     async def may_move(self, what: str) -> None:
         """Ask for the key that lets the arm move. Raises `NotAccepted` unless both it and `--arm` are given."""

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from brushloop.calibrate.stats import student_95
 from brushloop.collect.commission.arm import ArmReader, taught_arm, tip_of, touch
-from brushloop.collect.commission.notebook import Notebook, Taught, taught
+from brushloop.collect.commission.notebook import Notebook, Taught
 from brushloop.collect.commission.step import Step, Visit
 from brushloop.collect.errors import NotAccepted
 from brushloop.collect.rig.check import brush_square
@@ -260,7 +260,7 @@ class TipStep(Step):
         if (stray := stray_touch(list(touches.values()))) is not None:
             name, off_mm = list(touches)[stray[0]], stray[1]
             visit.say(f"Touch {int(name) + 1} lies {off_mm:.1f} mm off: it is left out.", tone="warning")
-            visit.save(visit.notebook.without(f"pin {name}"))
+            visit.forget(f"pin {name}")
             return False
         x, y, z = fit.offset_mm
         if fit.error_mm > UNKNOWN_MM:
@@ -314,7 +314,7 @@ class TipStep(Step):
                 return False
         if wrong:
             visit.say(*wrong.values(), "Left out, and asked for again.", tone="warning")
-            visit.save(visit.notebook.without(*(f"upright {name}" for name in wrong)))
+            visit.forget(*(f"upright {name}" for name in wrong))
             return False
         if len(holds) >= LEAST_UPRIGHTS:
             known = f"known to {axis.sigma_deg:.2f} deg (limit {WORST_DEG:g})"
@@ -330,13 +330,13 @@ class TipStep(Step):
             f"residuals up to {max(fit.residuals_mm):.2f} mm"
         )
         how = f"the same pin touched from {len(touches)} sides by hand"
-        offset = taught("tip", list(fit.offset_mm), how, "mm", sigma=fit.error_mm, known=known)
+        offset = Taught(list(fit.offset_mm), how, "mm", fit.error_mm, known)
         if (axis := measured_axis(notebook)) is None:
-            turn = taught("tip", [0.0, 0.0, 0.0], "taken as square to the flange", "deg", known="not measured")
+            turn = Taught([0.0, 0.0, 0.0], "taken as square to the flange", "deg", known="not measured")
         else:
             how = f"held upright along a set square {axis.holds} times"
             known = f"leans by {axis.lean_deg:.2f} deg against the flange"
-            turn = taught("tip", list(axis.rotation_deg), how, "deg", sigma=axis.sigma_deg, known=known)
+            turn = Taught(list(axis.rotation_deg), how, "deg", axis.sigma_deg, known)
         return {"robot.tcp_offset_mm": offset, "robot.tcp_rotation_deg": turn}
 
 

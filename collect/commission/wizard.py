@@ -9,7 +9,7 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.commission.arm import ArmStep
 from brushloop.collect.commission.brush import BrushStep, ForceStep
 from brushloop.collect.commission.camera import CameraStep
-from brushloop.collect.commission.notebook import Notebook, Value, write_rig
+from brushloop.collect.commission.notebook import StepName, Value, write_rig
 from brushloop.collect.commission.places import LimitsStep, PlacesStep
 from brushloop.collect.commission.proof import ProofStep
 from brushloop.collect.commission.sheet import SheetStep
@@ -42,13 +42,17 @@ class Wizard:
         self._visit = visit
         self._steps = tuple(steps)
 
+    def _open(self) -> list[StepName]:
+        """Steps that are not done."""
+        return [step.name for step in self._steps if step.name not in self._visit.notebook.done]
+
     async def run(self) -> Path:
         """Teach every step that is not done, then write `rig.toml`; returns its path.
 
         Raises `CollectAborted` where the person stops: the same command resumes from there.
         """
-        while step := next((step for step in self._steps if step.name not in self._visit.notebook.done), None):
-            await self._attempt(step)
+        while names := self._open():
+            await self._attempt(next(step for step in self._steps if step.name == names[0]))
         return self._written()
 
     async def again(self, name: str) -> Path | None:
@@ -64,68 +68,58 @@ class Wizard:
             raise CollectAborted(
                 f"`{name}` depends on {', '.join(missing)}, which is not taught yet: `brushloop rig new` resumes there"
             )
-        self._forget(step)
-        while step.name not in self._visit.notebook.done:
+        self._visit.teach_afresh(step)
+        while name in self._open():
             await self._attempt(step)
-        open_steps = [step.name for step in self._steps if step.name not in self._visit.notebook.done]
-        return self._written() if open_steps in ([], ["proof"]) else None
-
-    def _forget(self, step: Step) -> None:
-        """Forget what a step observed; going back undoes that."""
-        self._visit.mark()
-        self._visit.save(self._visit.notebook.without(*step.observes).reopened(step.name))
+        return self._written() if self._open() in ([], ["proof"]) else None
 
     async def _attempt(self, step: Step) -> None:
         """Teach a step once. Where the person goes back, or where it fails, the notebook says what comes next.
 
         Raises `CollectAborted` where the person stops.
         """
-        number = self._steps.index(step) + 1
-        self._visit.guide.step = f"step {number} of {len(self._steps)}: {step.title}, about {step.minutes} min"
+        visit, number = self._visit, self._steps.index(step) + 1
+        visit.step = f"step {number} of {len(self._steps)}: {step.title}, about {step.minutes} min"
         if step.name == "proof":
             self._written()
         try:
-            await self._carry_out(step)
+            try:
+                await step.carry_out(visit)
+                self._derive(step)
+            except REFUSED as error:
+                visit.say(*_in_lines(error), tone="trouble")
+                how = choice_of("How do you want to go on?", (AGAIN, AFRESH), AGAIN.key)
+                if await visit.ask(how, back=False) == AFRESH.key:
+                    visit.teach_afresh(step)
         except LeftOff:
             raise CollectAborted(STOPPED) from None
         except WentBack:
-            self._visit.back()
+            visit.back()
 
-    async def _carry_out(self, step: Step) -> None:
-        """Teach a step and finish it, or ask how to go on where it is refused."""
-        before = self._visit.notebook
-        try:
-            await step.carry_out(self._visit)
-            self._derive(step, before)
-        except REFUSED as error:
-            self._visit.say(*_in_lines(error), tone="trouble")
-            how = choice_of("How do you want to go on?", (AGAIN, AFRESH), AGAIN.key)
-            if await self._visit.guide.ask(how) == AFRESH.key:
-                self._forget(step)
-
-    def _derive(self, step: Step, before: Notebook) -> None:
+    def _derive(self, step: Step) -> None:
         """Finish a step: compute again what depends on it, list what changed, and void an earlier proof."""
-        notebook, resting = self._visit.notebook, {step.name}
+        before = self._visit.notebook
+        notebook, resting, changed = before.with_values(step.derived(before)), {step.name}, list[str]()
         for other in self._steps:
             if resting & set(other.needs):
                 resting.add(other.name)
-            if other.name == step.name or (other.name in resting and other.name in notebook.done):
-                notebook = notebook.with_values(other.derived(notebook))
+                if other.name in notebook.done:
+                    values = other.derived(notebook)
+                    notebook = notebook.with_values(values)
+                    changed += [
+                        f"{field}: {_shown(old)} -> {_shown(new.value)}"
+                        for field, new in values.items()
+                        if (old := before.get(field)) is not None and _shown(old) != _shown(new.value)
+                    ]
         self._visit.save(notebook.finished(step.name))
-        changed = [
-            f"{field}: {_shown(old.value)} -> {_shown(new.value)}"
-            for field, new in notebook.values.items()
-            if new.step != step.name
-            and (old := before.values.get(field)) is not None
-            and _shown(old.value) != _shown(new.value)
-        ]
         if changed:
             self._visit.say("Changed with it, because it depends on this step:", *changed)
         self._visit.say(f"{step.title}: done")
 
     def _written(self) -> Path:
         """Write `rig.toml`, which says whether it is proven."""
-        path, kept = write_rig(self._visit.rig_path, self._visit.notebook)
+        path = self._visit.rig_path
+        kept = write_rig(path, self._visit.notebook)
         before = "" if kept is None else f"; as it was before: {kept}"
         self._visit.say(f"{path}: written, with how each value was obtained{before}")
         return path

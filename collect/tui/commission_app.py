@@ -10,6 +10,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable, Coroutine
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -21,7 +22,7 @@ from textual.content import Content
 from textual.screen import Screen
 from textual.widgets import Footer, Input
 
-from brushloop.collect.commission.step import Guide, LeftOff, Shown, WentBack
+from brushloop.collect.commission.step import LeftOff, Tone, Visit, WentBack
 from brushloop.collect.engine.snapshot import REFRESH_S
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.operator import Prompt, stop_signals
@@ -48,73 +49,69 @@ STOPPED = "stopped: look at the arm. The same command resumes from there"
 RED_BUTTON = "Use the emergency stop, the red button, if it moves."
 DONE = "This is done. q leaves."
 TYPING_STOP = "ctrl-c: software stop; red button: emergency stop; ctrl-q: leave, all is kept"
-TONES = {"finding": ("", ""), "warning": ("! ", "bold $text-warning"), "trouble": ("✗ ", "bold $text-error")}
-Work = Callable[[Guide], Coroutine[Any, Any, Path | None]]
+TONES: dict[Tone, tuple[str, str]] = {
+    "finding": ("", ""),
+    "warning": ("! ", "bold $text-warning"),
+    "trouble": ("✗ ", "bold $text-error"),
+}
+Work = Callable[[], Coroutine[Any, Any, Path | None]]
 
 
 class Steps:
-    """The steps in a thread of their own."""
+    """The steps of a visit in a thread of their own."""
 
     def __init__(self, work: Work) -> None:
-        self.guide = Guide()
-        self.error: BaseException | None = None
-        """What ended it."""
-        self.written: Path | None = None
-        """What the steps returned: the `rig.toml` that they wrote, if they did."""
-        self._work = work
+        """Begin at once."""
         self._stop_sent = False
-        self._started = threading.Event()
-        self._task: asyncio.Task[Path | None] | None = None
-        self._loop: asyncio.AbstractEventLoop | None = None
+        self._outcome: Future[Path | None] = Future()
+        self._runner = asyncio.Runner(loop_factory=asyncio.new_event_loop)
+        self._loop = self._runner.get_loop()
+        self._task = self._loop.create_task(work())
         self._thread = threading.Thread(target=self._run, name="first day", daemon=True)
-
-    def start(self) -> None:
-        """Begin; returns once a stop can be carried out."""
         self._thread.start()
-        self._started.wait()
 
     @property
     def finished(self) -> bool:
         """Whether it is over."""
-        return self._started.is_set() and not self._thread.is_alive()
+        return self._outcome.done()
+
+    @property
+    def failed(self) -> bool:
+        """Whether it is over because of an error or a stop."""
+        return self.finished and self._outcome.exception() is not None
 
     def stop(self) -> None:
         """Cancel what is under way: a driver stops its arm before it lets a cancelled move end. From any thread."""
-        if self._loop is not None and self._task is not None:
-            self._stop_sent = True
-            with contextlib.suppress(RuntimeError):  # the loop has just ended
-                self._loop.call_soon_threadsafe(self._task.cancel)
+        self._stop_sent = True
+        with contextlib.suppress(RuntimeError):  # the loop has just ended
+            self._loop.call_soon_threadsafe(self._task.cancel)
 
     def join(self) -> Path | None:
         """Wait for the end; return the `rig.toml` that was written, or raise what ended the steps."""
         self._thread.join()
-        if self.error is not None:
-            raise self.error
-        return self.written
+        return self._outcome.result()
 
     def _run(self) -> None:
+        async def steps() -> Path | None:
+            return await self._task
+
         try:
-            asyncio.run(self._main())
+            with self._runner as runner:
+                written = runner.run(steps())
         except asyncio.CancelledError as stopped:
             # The notes say whether the arm was seen at rest.
             notes = getattr(stopped, "__notes__", [])
-            self.error = CollectAborted(" ".join([*notes, RED_BUTTON]) if notes else STOPPED)
-        except CollectAborted as error:
-            # A run within the steps has its own word for the stop that it was sent.
-            self.error = CollectAborted(STOPPED) if self._stop_sent else error
+            self._outcome.set_exception(CollectAborted(" ".join([*notes, RED_BUTTON]) if notes else STOPPED))
         except BaseException as error:
-            self.error = error
-        finally:
-            self._started.set()
-
-    async def _main(self) -> None:
-        self._loop, self._task = asyncio.get_running_loop(), asyncio.ensure_future(self._work(self.guide))
-        self._started.set()
-        self.written = await self._task
+            # A run within the steps has its own word for the stop that it was sent.
+            of_run = isinstance(error, CollectAborted) and self._stop_sent
+            self._outcome.set_exception(CollectAborted(STOPPED) if of_run else error)
+        else:
+            self._outcome.set_result(written)
 
 
 class CommissionScreen(Screen[None], inherit_bindings=False):
-    """Shows what the guide holds; its keys answer the question."""
+    """Shows what the visit holds; its keys answer the question."""
 
     AUTO_FOCUS = ""
     """The hidden field would take the first key, if the screen came to the front after the first question."""
@@ -137,7 +134,7 @@ Page up and down turn the pages of what was found.
         height: auto; max-height: 13; padding: 0 1; border: heavy $warning; display: none;
     }
     CommissionScreen.-asking #question-box { display: block; }
-    CommissionScreen #note { height: 1; padding: 0 1; background: $panel; text-wrap: nowrap; }
+    CommissionScreen #note { height: 1; padding: 0 1; background: $panel; text-wrap: nowrap; text-overflow: ellipsis; }
     CommissionScreen #answer { display: none; height: 1; border: none; padding: 0; background: $boost; }
     CommissionScreen.-typing #answer { display: block; }
     """
@@ -149,20 +146,18 @@ Page up and down turn the pages of what was found.
         HELP_KEY,
     ]
 
-    def __init__(self, guide: Guide, name: str) -> None:
+    def __init__(self, visit: Visit) -> None:
         super().__init__()
+        self._visit = visit
+        self.prompt: Prompt | None = None
+        """The question on the screen; None while something is at work."""
         self._title, self._found = Line("title"), Line("found-text")
         self._asked, self._note = Line("question-text"), Line("note")
         self._picture = picture_widget("picture")
         self._found_pane = VerticalScroll(id="found", can_focus=False)
-        self._guide = guide
-        self._name = name
-        self.prompt: Prompt | None = None
-        """The question on the screen; None while something is at work."""
-        self._findings: tuple[Shown, ...] | None = None
         self._input = Input(id="answer", select_on_focus=False)
-        self._over = False
-        self._stop_sent = False
+        self._found_count = 0
+        self._over = self._stop_sent = False
 
     def compose(self) -> ComposeResult:
         """Lay out the parts from top to bottom."""
@@ -198,14 +193,14 @@ Page up and down turn the pages of what was found.
 
     def show(self, *, over: bool) -> None:
         """Draw what differs; `over`: the steps are done."""
-        now, prompt = self._guide, self._guide.asker.prompt
-        self._title.show(f"First day   {one_line(self._name)}   {plain(now.step)}")
-        picture = now.picture if now.live is None else now.live
+        visit, prompt, findings = self._visit, self._visit.asker.prompt, tuple(self._visit.findings)
+        self._title.show(f"First day   {one_line(str(visit.rig_path))}   {plain(visit.step)}")
+        picture = visit.picture if visit.live is None else visit.live
         self._picture.show(None if picture is None else gray(picture))
-        new_findings, new_prompt = now.findings is not self._findings, prompt is not self.prompt
+        new_findings, new_prompt = len(findings) != self._found_count, prompt is not self.prompt
         if new_findings:
-            self._findings = now.findings
-            self._found.show(Content("\n").join(_finding(shown) for shown in now.findings))
+            self._found_count = len(findings)
+            self._found.show(Content("\n").join(_finding(*finding) for finding in findings))
         if new_prompt or over != self._over:
             self._over = over
             self._ask(prompt)
@@ -213,7 +208,9 @@ Page up and down turn the pages of what was found.
             # Only after the layout is it known where the end is: the question takes its room from the findings.
             self.call_after_refresh(self._found_pane.scroll_end, animate=False)
         if prompt is None and not over and not self._stop_sent:
-            self._note.show(_busy_text(*now.doing, self.size.width - 2))
+            # Nothing may look as if it hung; and how to stop it is never cut off.
+            doing, since_s = visit.doing
+            self._note.show(f"{SHORT_STOP}   {one_line(doing or 'at work')}, {time.monotonic() - since_s:.0f} s")
 
     def _ask(self, prompt: Prompt | None) -> None:
         """Show a question, or that something is at work, or that it is over."""
@@ -227,58 +224,52 @@ Page up and down turn the pages of what was found.
         self.set_focus(self._input if self.typing else None)
         self.refresh_bindings()
 
+    def _settle(self, answer: object) -> None:
+        if self.prompt is not None:
+            self._visit.asker.settle(self.prompt.number, answer)
+
     def on_key(self, event: events.Key) -> None:
         """Answer, if the key is an answer to the question; else page through the findings."""
         answer = None if self.prompt is None else self.prompt.answer_to(event.key, event.character or "")
-        if self.prompt is not None and answer is not None:
+        if answer is not None:
             event.stop()
-            self._guide.asker.settle(self.prompt.number, answer)
+            self._settle(answer)
         elif event.key in ("pageup", "pagedown"):
             (self._found_pane.scroll_page_up if event.key == "pageup" else self._found_pane.scroll_page_down)()
 
     def action_back(self) -> None:
         """Take the answer before this question back."""
-        if self.prompt is not None:
-            self._guide.asker.settle(self.prompt.number, WentBack())
+        self._settle(WentBack())
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
         """Take the line, or say why it cannot be taken."""
         if self.prompt is not None and self.prompt.read is not None:
             try:
-                answer = self.prompt.read(event.value.strip() or self.prompt.default)
+                self._settle(self.prompt.read(event.value.strip() or self.prompt.default))
             except ValueError as error:
                 self._asked.show(Content("\n").join([question_content(self.prompt), trouble(error)]))
-            else:
-                self._guide.asker.settle(self.prompt.number, answer)
 
 
-def _finding(shown: Shown) -> Content:
-    sign, style = TONES[shown.tone]
-    return Content.styled(sign + "\n".join(plain(line) for line in shown.lines), style)
-
-
-def _busy_text(doing: str, since_s: float, columns: int) -> str:
-    """What is at work, and for how long: nothing may look as if it hung. How to stop is never cut off."""
-    after = f", {max(time.monotonic() - since_s, 0.0):.0f} s; {SHORT_STOP}"
-    what, room = one_line(doing or "at work"), max(columns - len(after), 0)
-    return (what if len(what) <= room else f"{what[: room - 1]}…") + after
+def _finding(tone: Tone, text: str) -> Content:
+    sign, style = TONES[tone]
+    return Content.styled(sign + plain(text), style)
 
 
 class CommissionApp(PlainApp):
-    """Runs the steps, shows them, and carries the keys to them."""
+    """Shows the steps, and carries the keys to them."""
 
     BINDINGS: ClassVar[list[BindingType]] = [Binding("ctrl+q", "quit", "Leave", show=False, priority=True)]
 
-    def __init__(self, work: Work, name: str) -> None:
+    def __init__(self, visit: Visit, work: Work) -> None:
         super().__init__()
+        self._visit = visit
         self.steps = Steps(work)
-        self.first_day = CommissionScreen(self.steps.guide, name)
+        self.first_day = CommissionScreen(visit)
         self._leaving = False
 
     def on_mount(self) -> None:
-        """Start the steps; then look ten times a second."""
+        """Look at the steps ten times a second."""
         self.push_screen(self.first_day)
-        self.steps.start()
         self.set_interval(REFRESH_S, self._poll)
 
     def stops(self, event: events.Key) -> bool:
@@ -313,8 +304,7 @@ class CommissionApp(PlainApp):
         if self.steps.finished:
             self.exit()
         elif self.first_day.prompt is not None:
-            self._leaving = True
-            self.steps.guide.asker.abandon(LeftOff)
+            self._visit.asker.abandon(LeftOff)
         else:
             self.push_screen(AskScreen(AT_WORK), lambda key: self.stop_and_leave() if key == YES else None)
 
@@ -327,19 +317,18 @@ class CommissionApp(PlainApp):
         """Draw; a step that was stopped or failed ends the app, and is reported in the terminal."""
         if not self.is_running or not self.first_day.is_mounted:
             return
-        over = self.steps.finished
-        if over and (self._leaving or self.steps.error is not None):
+        if self.steps.failed or (self._leaving and self.steps.finished):
             self.exit()
         else:
-            self.first_day.show(over=over)
+            self.first_day.show(over=self.steps.finished)
 
 
-def run_commission(work: Work, name: str) -> Path | None:
+def run_commission(visit: Visit, work: Work) -> Path | None:
     """Show the screen until the person leaves; returns the `rig.toml` that was written, raises what ended the steps.
 
     However the screen ends, nobody watches the arm from here on: whatever moves it is stopped.
     """
-    app = CommissionApp(work, name)
+    app = CommissionApp(visit, work)
     with stop_signals(lambda _: app.stop_and_leave()):
         try:
             app.run()

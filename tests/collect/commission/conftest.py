@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import math
 import threading
 from collections.abc import AsyncIterator, Iterator
@@ -15,10 +16,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from brushloop.collect.commission.step import Guide, LeftOff, Shown, Visit
+from brushloop.collect.commission.notebook import Taught, Value
+from brushloop.collect.commission.step import LeftOff, Tone, Visit
 from brushloop.collect.commission.wizard import Wizard
 from brushloop.collect.errors import CollectAborted
-from brushloop.collect.operator import Prompt
+from brushloop.collect.operator import Asker, Prompt
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.paper import to_base
 from brushloop.drivers.host import HostClock
@@ -30,16 +32,19 @@ from brushloop.drivers.sim.world import World, tool_of
 from tests.waiting import PATIENCE_S
 
 
-class Person(Guide):
+class Person(Asker):
     """Leaves at the first question."""
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__(watched=True)
         self.asked: list[str] = []
+        self.shown: list[tuple[Tone, str]] = []
 
-    @property
-    def said(self) -> list[str]:
-        return [line for what in self.findings for line in what.lines]
+    def visit(self, rig_path: Path, *, armed: bool = False) -> Visit:
+        """A visit that asks this person, who remembers what every visit showed."""
+        visit = Visit(rig_path, HostClock(), armed=armed)
+        visit.asker, visit.findings = self, self.shown
+        return visit
 
     async def ask(self, prompt: Prompt) -> Any:
         self.asked.append(prompt.question)
@@ -62,11 +67,15 @@ def visit_of(
     tip_mm: tuple[float, float, float] = (0.0, 0.0, 180.0),
 ) -> Visit:
     """A visit on which the arm and its tip are known."""
-    visit = Visit(person, folder / "rig.toml", HostClock(), armed=False)
-    for name, value in (("host", "127.0.0.1"), ("port", port), ("framing", "sof")):
-        visit.keep("arm", f"robot.{name}", value, "typed")
-    visit.keep("tip", "robot.tcp_offset_mm", list(tip_mm), "typed", "mm")
-    visit.keep("tip", "robot.tcp_rotation_deg", [0.0, 0.0, 0.0], "typed", "deg")
+    visit = person.visit(folder / "rig.toml")
+    values: dict[str, Value] = {
+        "robot.host": "127.0.0.1",
+        "robot.port": port,
+        "robot.framing": "sof",
+        "robot.tcp_offset_mm": list(tip_mm),
+        "robot.tcp_rotation_deg": [0.0, 0.0, 0.0],
+    }
+    visit.keep({field: Taught(value, "typed") for field, value in values.items()})
     return visit
 
 
@@ -76,22 +85,18 @@ def visit_of(
 KEYS = {"station": "i", "pump": "p", "none": "n"}
 
 
-class InLab(Guide):
+class InLab(Person):
     """A person in an unknown lab, whose servers run in another thread."""
 
     def __init__(self, lab: UnknownLab, loop: asyncio.AbstractEventLoop) -> None:
         super().__init__()
         self.lab, self.loop = lab, loop
-        self.lines: list[str] = []
-        self.asked: list[str] = []
+        self._streams = itertools.cycle(lab.streams)
         self.brought: list[str] = []
         self.leave_after: int | None = None
         """Number of requests to bring something after which the session is cut."""
         self.mends = False
         """Whether the person sees to what the wizard names, and goes on."""
-
-    def show(self, what: Shown) -> None:
-        self.lines += [f"{what.tone}: {line}" for line in what.lines]
 
     async def ask(self, prompt: Prompt) -> Any:
         if prompt.thing:
@@ -115,11 +120,12 @@ class InLab(Guide):
         return default or ("y" if "Agreed?" in question else "n")
 
     def _typed(self, question: str) -> str:
+        if question.startswith("Address of the camera"):
+            return next(self._streams)
         lab, facts = self.lab, self.lab.facts
         table, brush = facts.config.table, facts.config.brush
         read = {
             "Address of the cabinet": lab.host,
-            "Address of the camera": " ".join(lab.streams),
             "Squares along its longer": str(table.board_squares[0]),
             "Squares along its shorter": str(table.board_squares[1]),
             "Side of a square": str(facts.printed_square_mm),
@@ -140,12 +146,11 @@ class InLab(Guide):
         self.brought.append(thing)
         kind, index, *corner = thing.split(" ", 2)
         answer = await self._in_lab(self.lab.bring(kind, int(index), *corner))
-        self.lines.append(f"person: {answer['says']}")
         return bool(answer["reached"])
 
     @property
     def trouble(self) -> str:
-        return " ".join(line.partition(": ")[2] for line in self.lines if line.startswith("trouble"))
+        return " ".join(text.replace("\n", " ") for tone, text in self.shown if tone == "trouble")
 
     async def _in_lab(self, work: Any) -> Any:
         return await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(work, self.loop))
@@ -181,7 +186,7 @@ def in_lab(seed: int, trap: Trap | None = None, **options: Any) -> Iterator[InLa
 async def first_day(person: InLab, rig_path: Path, *, armed: bool = True) -> Path | None:
     """Run the wizard once; None where the person left off."""
     try:
-        return await Wizard(Visit(person, rig_path, HostClock(), armed=armed)).run()
+        return await Wizard(person.visit(rig_path, armed=armed)).run()
     except CollectAborted:
         return None
 

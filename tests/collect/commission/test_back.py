@@ -10,13 +10,12 @@ import pytest
 from brushloop.collect.commission.arm import ADDRESS
 from brushloop.collect.commission.brush import BRUSH, BUS, PORT, BrushStep, ForceStep
 from brushloop.collect.commission.camera import CameraStep
-from brushloop.collect.commission.notebook import Notebook, TaughtFile, taught
+from brushloop.collect.commission.notebook import Notebook, Taught
 from brushloop.collect.commission.step import Asked, LeftOff, Visit, WentBack
 from brushloop.collect.commission.wizard import Wizard
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.operator import Prompt
 from brushloop.drivers.errors import DeviceTimeout
-from brushloop.drivers.host import HostClock
 from brushloop.drivers.ink.station import InkStationConfig
 from tests.collect.commission.conftest import Person, visit_of
 
@@ -151,7 +150,7 @@ def test_a_line_that_cannot_be_the_value_is_refused_where_it_is_typed(
 async def test_a_step_that_is_taught_again_by_mistake_is_as_it_was_after_back(tmp_path: Path) -> None:
     await led(Typing("6", "48", "20", "", "n", ""), tmp_path)
     again = Typing(BACK)
-    visit = Visit(again, tmp_path / "rig.toml", HostClock(), armed=False)
+    visit = again.visit(tmp_path / "rig.toml")
     before = visit.notebook
     await Wizard(visit, (BrushStep(), ForceStep())).again("brush")
     assert again.asked == [R]
@@ -159,9 +158,9 @@ async def test_a_step_that_is_taught_again_by_mistake_is_as_it_was_after_back(tm
 
 
 async def test_a_step_that_is_taught_again_stays_open_until_it_is_done(tmp_path: Path) -> None:
-    source = {"camera.source": taught("camera", "http://192.0.2.8/", "typed")}
-    TaughtFile(tmp_path / "rig.toml").save(Notebook().with_values(source).finished("arm").finished("camera"))
-    visit = Visit(Person(), tmp_path / "rig.toml", HostClock(), armed=False)
+    source = {"camera.source": Taught("http://192.0.2.8/", "typed")}
+    Notebook().with_values(source).finished("arm").finished("camera").save(tmp_path / "rig.toml")
+    visit = Person().visit(tmp_path / "rig.toml")
     with pytest.raises(CollectAborted):
         await Wizard(visit, (CameraStep(),)).again("camera")
     assert (set(visit.notebook.done), visit.notebook.values) == ({"arm"}, {})
@@ -178,5 +177,5 @@ async def test_a_step_that_failed_says_in_what_state_the_arm_is(
     monkeypatch.setattr(CameraStep, "carry_out", silent)
     person = Person()
     with pytest.raises(CollectAborted):
-        await Wizard(Visit(person, tmp_path / "rig.toml", HostClock(), armed=True), (CameraStep(),)).run()
-    assert person.said[0].endswith("no reply in 1 s. A stop was sent to the arm. The arm may still be moving.")
+        await Wizard(person.visit(tmp_path / "rig.toml"), (CameraStep(),)).run()
+    assert "no reply in 1 s. A stop was sent to the arm. The arm may still be moving.\n" in person.shown[0][1]

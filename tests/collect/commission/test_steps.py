@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from brushloop.collect.commission import places, proof
 from brushloop.collect.commission.arm import ArmReader, ArmStep
-from brushloop.collect.commission.notebook import Notebook, taught, touch_of
+from brushloop.collect.commission.notebook import Notebook, Taught
 from brushloop.collect.commission.places import PlacesStep, check_pot, check_wipe
 from brushloop.collect.commission.proof import ProofStep, slowly
 from brushloop.collect.commission.sheet import BOARD, all_corners
@@ -31,7 +31,6 @@ from brushloop.drivers.arcs.controller import only_asking
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import Addresses, rig_toml
@@ -82,10 +81,10 @@ async def test_holds_that_were_not_upright_are_named_and_asked_for_again(tmp_pat
             return True  # otherwise still at the pin
 
         person.bring = hastily
-        visit = Visit(person, tmp_path / "rig.toml", HostClock(), armed=False)
+        visit = person.visit(tmp_path / "rig.toml")
         await ArmStep().carry_out(visit)
         await TipStep().carry_out(visit)
-    warned = [line.removeprefix("warning: ")[:6] for line in person.lines if line.startswith("warning: Hold ")]
+    warned = [text[:6] for tone, text in person.shown if tone == "warning" and text.startswith("Hold ")]
     assert warned == ["Hold 1", "Hold 1", "Hold 1", "Hold 7"]
     assert len(visit.notebook.touched("upright")) == 12
     turn = TipStep().derived(visit.notebook)["robot.tcp_rotation_deg"]
@@ -103,19 +102,19 @@ def test_a_direction_that_too_few_or_scattered_holds_give_is_not_measured_and_no
     notebook = Notebook()
     for number in range(8):
         pin = leaning(320.0, 150.0, 90.0, 90.0 * number + 20.0 * (number // 4), 30.0, wrist_deg=0.0)
-        notebook = notebook.with_touch(f"pin {number}", touch_of(pin))
+        notebook = notebook.with_touch(f"pin {number}", pin)
     for number in range(count):
         hold = leaning(320.0, 150.0, 90.0, 45.0 * number, tilt_deg, wrist_deg=90.0 * number)
-        notebook = notebook.with_touch(f"upright {number}", touch_of(hold))
+        notebook = notebook.with_touch(f"upright {number}", hold)
     turn = TipStep().derived(notebook)["robot.tcp_rotation_deg"]
     assert (turn.value, turn.known) == ([0.0, 0.0, 0.0], "not measured")
     assert brush_square((0.0, 0.0, 0.0)).verdict == "not measured"
 
 
 def test_a_corner_that_the_arm_does_not_reach_is_named_with_where_the_board_has_to_lie() -> None:
-    notebook = Notebook().with_values({"robot.tcp_offset_mm": taught("tip", [0.0, 0.0, 180.0], "typed")})
+    notebook = Notebook().with_values({"robot.tcp_offset_mm": Taught([0.0, 0.0, 180.0], "typed")})
     for corner in ("lower left", "lower right", "upper left"):
-        notebook = notebook.with_touch(f"{BOARD} 0 {corner}", touch_of(brush_pose(400.0, 0.0, 300.0)))
+        notebook = notebook.with_touch(f"{BOARD} 0 {corner}", brush_pose(400.0, 0.0, 300.0))
     with pytest.raises(NotAccepted, match=r"^not touched: board upper right\. .* corners are 0\.25 to 0\.7 m from"):
         all_corners(notebook, BOARD)
 
@@ -143,7 +142,7 @@ async def test_the_proof_runs_nothing_without_the_command_line_and_the_operators
     monkeypatch.setattr(proof, "rig_of", lambda *_: SimpleNamespace(brush=SimpleNamespace(max_depth_mm=22.0)))
     person = Refusing()
     with pytest.raises(NotAccepted, match=said):
-        await ProofStep().carry_out(Visit(person, tmp_path / "rig.toml", HostClock(), armed=armed))
+        await ProofStep().carry_out(person.visit(tmp_path / "rig.toml", armed=armed))
     assert len(person.asked) == armed
     assert all("The arm moves by itself, slower than 50 mm/s" in question for question in person.asked)
 
@@ -159,7 +158,7 @@ async def test_every_pose_of_the_proof_is_checked_before_the_arm_is_connected(
     low = re.sub(r"(?m)^z_mm = \[.*", "z_mm = [98.0, 170.0]", text, count=1)  # travel height is 180
     (tmp_path / "rig.toml").write_text(low)
     monkeypatch.setattr(proof, "Engine", no_engine)
-    visit = Visit(Refusing(), tmp_path / "rig.toml", HostClock(), armed=True)
+    visit = Refusing().visit(tmp_path / "rig.toml", armed=True)
     protocol = 'kind = "grid"\ndepths_mm = [11.0]\ntilts_deg = [0.0]\nrepeats = 2\n'
     with pytest.raises(ConfigError, match=r"robot\.limits: a planned pose is outside the limits: z = "):
         await ProofStep()._run(visit, tmp_path, protocol, dry=dry)
@@ -191,9 +190,9 @@ SHEET = {
 
 def touched(**places: Place) -> Notebook:
     """A well right of a level sheet of 240 x 160 mm at the origin of the base frame, and what was touched there."""
-    notebook = Notebook().with_values({field: taught("tip", value, "typed") for field, value in SHEET.items()})
+    notebook = Notebook().with_values({field: Taught(value, "typed") for field, value in SHEET.items()})
     for name, place in {"well_0": WELL, "well-rim_0": RIM, "park_0": (200.0, -300.0, 300.0), **places}.items():
-        notebook = notebook.with_touch(name.replace("_", " "), touch_of(brush_pose(*place)))
+        notebook = notebook.with_touch(name.replace("_", " "), brush_pose(*place))
     return notebook
 
 
@@ -258,9 +257,9 @@ def parked(server: ArcsServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
             [away, parked],
         )
         for field in ("aside.wipe", "aside.wash"):
-            visit.keep("places", field, False, "answered")
+            visit.keep({field: Taught(False, "answered")})
         for name, place in {"well-rim 0": RIM, "well 0": WELL}.items():
-            visit.save(visit.notebook.with_touch(name, touch_of(brush_pose(*place))))
+            visit.save(visit.notebook.with_touch(name, brush_pose(*place)))
 
         async def flange(_: ArmReader) -> Pose:
             return brush_pose(*poses.pop(0))
@@ -280,7 +279,7 @@ def parked(server: ArcsServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 async def test_two_pictures_that_agree_show_the_arm_in_neither(parked: Callable[..., Visit]) -> None:
     """The light may change in between; and the first place is asked for again if only that one was touched before."""
     visit = parked(AWAY_MM, picture(arm=False), picture(arm=False, light=0.9))
-    visit.save(visit.notebook.with_touch("clear-view 0", touch_of(brush_pose(*PARK_MM))))
+    visit.save(visit.notebook.with_touch("clear-view 0", brush_pose(*PARK_MM)))
     await PlacesStep().carry_out(visit)
     touches = visit.notebook.touches
     assert (touches["park 0"].position_mm, touches["clear-view 0"].position_mm) == (PARK_MM, AWAY_MM)
@@ -300,7 +299,7 @@ async def test_pictures_that_say_nothing_are_taken_again_at_both_places(
     visit = parked(away_mm, picture(arm=in_the_first), picture(arm=True))
     with pytest.raises(NotAccepted, match=said):
         await PlacesStep().carry_out(visit)
-    assert not {"park 0", "clear-view 0"} & set(visit.notebook.touches)
+    assert "aside.parked" not in visit.notebook.values
     assert "well 0" in visit.notebook.touches
 
 
@@ -309,5 +308,5 @@ async def test_wipe_and_pot_are_not_left_out_by_an_empty_answer(parked: Callable
     visit = parked(AWAY_MM, picture(arm=False), picture(arm=False))
     visit.save(visit.notebook.without(field))
     await PlacesStep().carry_out(visit)
-    assert isinstance(visit.guide, Parking)
-    assert visit.guide.asked == [""]
+    assert isinstance(visit.asker, Parking)
+    assert visit.asker.asked == [""]

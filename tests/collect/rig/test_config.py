@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from brushloop.collect.commission.notebook import Notebook, TaughtFile, taught
+from brushloop.collect.commission.notebook import Notebook, Taught
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.check import places_of
@@ -254,8 +254,8 @@ def test_a_picture_has_the_format_of_its_ending(rig: Path, tmp_path: Path) -> No
 
 
 def test_what_was_taught_says_what_was_never_measured(rig: Path) -> None:
-    mass = taught("arm", 0.0, "as set on the pendant", "kg", known="not weighed")
-    TaughtFile(rig).save(Notebook().with_values({"robot.payload_kg": mass}).finished("arm"))
+    mass = Taught(0.0, "as set on the pendant", "kg", known="not weighed")
+    Notebook().with_values({"robot.payload_kg": mass}).finished("arm").save(rig)
     checks = {check["name"]: check for check in json.loads(brushloop("rig", "check", rig, "--json").stdout)["checks"]}
     assert checks["robot.payload_kg"]["remedy"] == "as set on the pendant, not weighed"
     assert checks["step proof"]["remedy"] == "brushloop rig teach proof --arm"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from brushloop.collect.commission.notebook import Notebook, TaughtFile, taught
+from brushloop.collect.commission.notebook import Notebook, Taught
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.doctor import Finding, examine, numbers_only, scrubber_of, write_report
 from brushloop.drivers.arcs.controller import SafetyMode
@@ -176,11 +176,11 @@ def test_an_archive_is_never_overwritten(rig: Path, tmp_path: Path) -> None:
 def test_on_the_first_day_there_is_no_rig_yet_and_the_archive_holds_what_is_known(lab: Lab) -> None:
     robot = load_rig(lab.folder / "rig.toml").robot
     rig, report = lab.folder / "new.toml", lab.folder / "report.zip"
-    address = taught("arm", f"{robot.host}:{robot.port}", "typed")
-    stream = taught("camera", "http://cam.example/stream", "typed")
-    squares = taught("camera", [26.0, 20.0], "typed")
+    address = Taught(f"{robot.host}:{robot.port}", "typed")
+    stream = Taught("http://cam.example/stream", "typed")
+    squares = Taught([26.0, 20.0], "typed")
     values = {"aside.address": address, "camera.source": stream, "board.squares": squares}
-    TaughtFile(rig).save(Notebook().with_values(values))
+    Notebook().with_values(values).save(rig)
     ran = brushloop("doctor", "--config", rig, "--report", report)
     assert ran.returncode == 0, ran.stderr
     assert "new.toml yet" in ran.stdout

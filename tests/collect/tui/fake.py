@@ -20,7 +20,7 @@ from textual.pilot import Pilot
 from brushloop.collect.commission.arm import ADDRESS
 from brushloop.collect.commission.brush import BUS
 from brushloop.collect.commission.camera import PRINT
-from brushloop.collect.commission.step import Guide, Shown, Visit
+from brushloop.collect.commission.step import Visit
 from brushloop.collect.engine.capture import mark_of
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.engine import Engine
@@ -324,8 +324,6 @@ async def look(app: OperatorApp, pilot: Pilot[None]) -> str:
 # A first day that asks one question of each kind
 
 
-FOUND = Shown(("five directions: the tip is known to 0.11 mm", "residuals 0.10, 0.24, 0.08, 0.17, 0.21 mm"))
-WARNED = Shown(("direction 2 is like direction 1: lean the brush farther",), tone="warning")
 TAKE, TOUCH = Choice("y", "yes, take it"), Choice("n", "no, touch it again")
 
 
@@ -341,17 +339,16 @@ class Asking:
         self.kinds = kinds
         self.answers: list[object] = []
         self.at_work = self.stopped_arm = False
+        self.visit = Visit(Path("rig.toml"), HostClock(), armed=False)
 
-    async def __call__(self, guide: Guide) -> None:
-        guide.step = "step 3 of 9: Tip of the brush, about 8 min"
-        guide.show(FOUND)
-        guide.show(WARNED)
+    async def __call__(self) -> None:
+        self.visit.step = "step 3 of 9: Tip of the brush, about 8 min"
+        self.visit.say("five directions: the tip is known to 0.11 mm", "residuals 0.10, 0.24, 0.08, 0.17, 0.21 mm")
+        self.visit.say("direction 2 is like direction 1: lean the brush farther", tone="warning")
         for kind in self.kinds:
-            self.answers.append(await self._ask(guide, kind))
-        return None
+            self.answers.append(await self._ask(self.visit, kind))
 
-    async def _ask(self, guide: Guide, kind: str) -> Any:
-        visit = Visit(guide, Path("rig.toml"), HostClock(), armed=False)
+    async def _ask(self, visit: Visit, kind: str) -> Any:
         match kind:
             case "choose":
                 return await visit.choose("Take this tip?", (TAKE, TOUCH), "y")
@@ -364,7 +361,7 @@ class Asking:
             case "empty":
                 return await visit.ask(BUS.prompt(visit.notebook))
             case "bring":
-                guide.show(Shown(("the board as the camera sees it",), board()))
+                visit.say("the board as the camera sees it", picture=board())
                 how = "Guide the tip to the pin by hand, the brush leaning toward the window, then press Enter."
                 return await visit.brought("pin 2", how, may_skip=True)
             case _:
@@ -383,4 +380,4 @@ class Asking:
 
 
 def commission_app_of(asking: Asking) -> CommissionApp:
-    return CommissionApp(asking, "rig.toml")
+    return CommissionApp(asking.visit, asking)

@@ -83,7 +83,8 @@ async def test_escape_goes_back_and_q_leaves(keys: list[str], raised: type[Excep
     async with running(Asking("bring")) as (app, pilot):
         await pilot.press(*keys)
         await seen(app, pilot, lambda: app.steps.finished)
-    assert isinstance(app.steps.error, raised)
+    with pytest.raises(raised):
+        app.steps.join()
 
 
 @pytest.mark.parametrize(("key", "work"), [("s", "move"), ("ctrl+c", "move"), ("s", "run")])
@@ -92,7 +93,7 @@ async def test_a_stop_key_stops_what_is_at_work_and_ends_the_screen(key: str, wo
     async with running(asking) as (app, pilot):
         await pilot.press("y")
         await seen(app, pilot, lambda: asking.at_work and app.first_day.prompt is None)
-        assert re.search(r"at work, \d+ s; s: software stop", shown(app))
+        assert re.search(r"s: software stop; red button: emergency stop   at work, \d+ s", shown(app))
         await pilot.press(key)
         await until(lambda: not app.is_running)
     assert asking.stopped_arm
@@ -104,14 +105,13 @@ def test_a_second_stop_key_works_at_once() -> None:
     """The first one may end in an error, after which the steps ask how to go on."""
     moving = threading.Event()
 
-    async def moves_twice(_: object) -> None:
+    async def moves_twice() -> None:
         with contextlib.suppress(asyncio.CancelledError):
             await asyncio.sleep(60.0)
         moving.set()
         await asyncio.sleep(60.0)
 
     steps = Steps(moves_twice)
-    steps.start()
     steps.stop()
     assert moving.wait(PATIENCE_S)
     steps.stop()
