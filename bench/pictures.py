@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import itertools
 import re
 import shutil
 import subprocess
@@ -29,7 +30,7 @@ from textual.pilot import Pilot
 
 import brushloop
 from bench.harness import ROOT
-from brushloop.collect.commission.step import Guide, Visit
+from brushloop.collect.commission.step import Visit
 from brushloop.collect.commission.wizard import Wizard
 from brushloop.collect.engine.control import State
 from brushloop.collect.errors import CollectAborted
@@ -249,6 +250,7 @@ class _Person:
         self, app: CommissionApp, pilot: Pilot[None], lab: UnknownLab, loop: asyncio.AbstractEventLoop
     ) -> None:
         self._app, self._pilot, self._lab, self._loop = app, pilot, lab, loop
+        self._streams = itertools.cycle(lab.streams)
         self._number = 0
         self._held = 0
 
@@ -286,11 +288,12 @@ class _Person:
         await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(act, self._loop))
 
     def _typed(self, words: str) -> str:
+        if "stream" in words:
+            return next(self._streams)
         lab, facts = self._lab, self._lab.facts
         table, brush = facts.config.table, facts.config.brush
         answers = {
             "address of the cabinet": lab.host,
-            "stream": " ".join(lab.streams),
             "longer side": str(table.board_squares[0]),
             "shorter side": str(table.board_squares[1]),
             "side of a square": f"{facts.printed_square_mm:g}",
@@ -312,17 +315,13 @@ class _Person:
 
 
 async def _day(lab: UnknownLab, loop: asyncio.AbstractEventLoop) -> None:
-    rig = Path("rig.toml")
-
-    async def work(guide: Guide) -> Path | None:
-        return await Wizard(Visit(guide, rig, HostClock(), armed=True)).run()
-
-    app, taken = CommissionApp(work, str(rig)), set[str]()
+    visit, taken = Visit(Path("rig.toml"), HostClock(), armed=True), set[str]()
+    app = CommissionApp(visit, lambda: Wizard(visit).run())
     async with app.run_test(size=DAY_SIZE) as pilot:
         person = _Person(app, pilot, lab, loop)
         while (prompt := await person.question()) is not None:
             if prompt.question.startswith("How do you want to go on"):
-                raise RuntimeError("\n".join(app.steps.guide.findings[-1].lines))
+                raise RuntimeError(visit.findings[-1][1])
             words = prompt.question.lower()
             for name in (name for part, name in PICTURES.items() if part in words and name not in taken):
                 taken.add(name)
