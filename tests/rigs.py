@@ -251,15 +251,9 @@ class WirelessRig(LoopbackRig):
             for server, port in ((self.arcs, PORTS["arcs_port"]), (self.rtde, PORTS["rtde_port"])):
                 await server.start(self.address, port)
                 stack.push_async_callback(server.stop)
-            stack.push_async_callback(self._watched)
             watching = asyncio.create_task(self.faults.watch(self.arcs.cabinet.safety_stop), name="faults")
             stack.callback(watching.cancel)
             yield await stack.enter_async_context(connected(config, clock, on_notice))
-
-    async def _watched(self) -> None:
-        """What the driver could not stop is stopped by the controller's watchdog."""
-        while self.arcs.cabinet.watchdogs:
-            await asyncio.sleep(0.1)
 
 
 class SceneCamera:

@@ -122,12 +122,7 @@ class ArmReader:
         level = await self._ask("RobotConfig.getCollisionLevel")
         if type(level) is not int:
             raise ProtocolViolation(DEVICE, "getCollisionLevel", f"expected a whole number, got {level!r}")
-        payload = await self._ask("RobotConfig.getPayload")
-        try:
-            mass_kg, cog_m, *_ = payload
-            payload_kg, *centre_m = numbers("getPayload", [mass_kg, *cog_m], 4)
-        except (TypeError, ValueError):
-            raise ProtocolViolation(DEVICE, "getPayload", f"expected mass and centre, got {payload!r}") from None
+        payload_kg, centre_mm = await self._controller.payload()
         getters = ("RobotState.getRobotModeType", "RobotState.getSafetyModeType", "RobotManage.getOperationalMode")
         robot_mode, safety_mode, switch = [str(await self._ask(getter)) for getter in getters]
         return Cabinet(
@@ -135,7 +130,7 @@ class ArmReader:
             (robot_mode, safety_mode, switch),
             (*(1e3 * v for v in tool[:3]), *map(math.degrees, tool[3:])),
             payload_kg,
-            [1e3 * metres for metres in centre_m],
+            centre_mm,
             level,
         )
 

@@ -19,7 +19,7 @@ from brushloop.drivers.arcs.motion import (
     until_settled,
 )
 from brushloop.drivers.arcs.settings import ArcsTable, Departure, make_ready, power_on
-from brushloop.drivers.arcs.stopping import Stopper, Watchdog
+from brushloop.drivers.arcs.stopping import Stopper
 from brushloop.drivers.arcs.telemetry import Telemetry
 from brushloop.drivers.arcs.wire import DEVICE, RpcConnection, open_arcs
 from brushloop.drivers.devices import Identity, Pose, PoseSample, QueuedLine
@@ -57,7 +57,6 @@ class AuboArcs:
         self._connected = False
         self._enabled = False
         self._telemetry = Telemetry(self._state, table, clock, on_notice)
-        self._watchdog = Watchdog(self._state.connection, table.watchdog_s, on_notice)
         self._messages = Messages(self._motion)
         self._departure: Departure | None = None
         """Of the arm since it was enabled."""
@@ -88,7 +87,7 @@ class AuboArcs:
         return Identity(DEVICE, f"{model} ({box})", firmware, box == LOOPBACK_CONTROL_BOX)
 
     async def enable(self) -> None:
-        """Check the mode, set the tool, power on, release the brakes, arm the watchdog; moves nothing.
+        """Check the mode, set the tool, power on, release the brakes; moves nothing.
 
         Raises `MotionError`, of which are `RobotNotSafe`, `MotionRefused` and `SettingsChanged`, and `DeviceTimeout`.
         """
@@ -106,7 +105,6 @@ class AuboArcs:
         await self._ready()
         self._departure = Departure(self._motion, settings, await self._motion.pose())
         await self._messages.codes()  # those that are there concern earlier motion
-        await self._watchdog.arm()
         await self._telemetry.read()
 
     async def state(self, calls: int) -> ArmState:
@@ -253,8 +251,6 @@ class AuboArcs:
                 try:
                     await self.stop()
                 except DeviceError:
-                    # An arm that cannot be stopped from here is stopped by the controller's watchdog.
-                    await self._watchdog.abandon()
                     if under_way:
                         raise
         finally:
@@ -262,7 +258,6 @@ class AuboArcs:
 
     async def _hang_up(self) -> None:
         await self._telemetry.stop()
-        await self._watchdog.disarm()
         for controller in (self._motion, self._stop, self._state):
             await controller.connection.close()
         self._connected = self._enabled = False

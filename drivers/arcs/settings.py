@@ -44,10 +44,6 @@ class ArcsTable(BaseModel, frozen=True, extra="forbid"):
     max_pose_lag_ms: Annotated[float, Field(ge=60.0, le=5000.0)] = 100.0
     """Presses and touches during which poses arrive later than this are void: at 20 mm/s the recorded tip is 2 mm away
     from where force and camera saw it after 100 ms. Below 60 ms a busy computer's own lag would count."""
-    watchdog_s: Annotated[float, Field(ge=0.5, le=60.0)] | None = None
-    """Dead-man switch on the controller: after this long without a sign of life it makes a protective stop, which only
-    a person can release and which leaves the brush where it is. If left out, it is not armed, and a press lifts by
-    itself."""
     collision_level: Annotated[int, Field(ge=1, le=9)] | None = None
     """1 to 9 (most sensitive); if left out, the pendant's setting stays."""
     payload_kg: Annotated[float, Field(ge=0.0, le=5.0)] | None = None

@@ -1,11 +1,7 @@
-"""Stop the arm over whichever connection works, until it is seen at rest; and the controller's watchdog.
+"""Stop the arm over whichever connection works, until it is seen at rest.
 
 Two connections have no common order, so a stop on its own connection may overtake a line that is still on its way.
 That is why a stop is sent a second time behind that line, and why the arm is polled until it is seen at rest.
-
-The watchdog puts the arm in a protective stop when this host dies. How a real cabinet wants it to be fed is not known;
-here it is set again, as its description suggests. If that were wrong the arm would stop soon after it was enabled,
-which is safe and easy to see.
 """
 
 from __future__ import annotations
@@ -14,9 +10,9 @@ import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable
 
-from brushloop.drivers.arcs.controller import Controller, ReturnCode
-from brushloop.drivers.arcs.wire import DEVICE, RpcConnection
-from brushloop.drivers.errors import DeviceError, MotionFailed, RpcError
+from brushloop.drivers.arcs.controller import Controller
+from brushloop.drivers.arcs.wire import DEVICE
+from brushloop.drivers.errors import DeviceError, MotionFailed
 from brushloop.drivers.geometry import distance
 
 HEDGE_S = 0.15
@@ -137,63 +133,3 @@ def _acknowledged(done: set[asyncio.Task[None]], failures: list[DeviceError]) ->
             raise error
         failures.append(error)
     return False
-
-
-KEY = "brushloop"
-NOTHING, PROTECTIVE_STOP = 0, 3
-FEEDINGS = 4
-"""Times that it is fed per timeout: three may be lost."""
-
-
-class Watchdog:
-    """The controller's watchdog: armed while the arm is enabled, fed over the connection that telemetry uses."""
-
-    def __init__(self, connection: RpcConnection, timeout_s: float | None, on_notice: Callable[[str], None]) -> None:
-        self._connection = connection
-        self._timeout_s = timeout_s
-        self._notice = on_notice
-        self._feeding: asyncio.Task[None] | None = None
-
-    @property
-    def armed(self) -> bool:
-        """True from an accepted `arm` to `disarm`."""
-        return self._feeding is not None
-
-    async def arm(self) -> None:
-        """Arm it and keep feeding it; a controller without one is reported, not refused."""
-        if self.armed or self._timeout_s is None:
-            return
-        try:
-            code = await self._set(self._timeout_s, PROTECTIVE_STOP)
-        except RpcError as error:
-            self._notice(f"no watchdog: {error.what}")
-            return
-        if code != ReturnCode.OK:
-            self._notice(f"no watchdog: the controller refused it with {code}")
-            return
-        self._feeding = asyncio.create_task(self._feed(self._timeout_s), name="robot watchdog")
-
-    async def disarm(self) -> None:
-        """Stop refreshing the watchdog and disarm it. If the controller cannot be reached, it fires: the arm stops."""
-        if self.armed and self._timeout_s is not None:
-            await self.abandon()
-            with contextlib.suppress(DeviceError):
-                await self._set(self._timeout_s, NOTHING)
-
-    async def abandon(self) -> None:
-        """Stop refreshing the watchdog and leave it armed, so that it fires."""
-        feeding, self._feeding = self._feeding, None
-        if feeding is not None:
-            feeding.cancel()
-            await asyncio.gather(feeding, return_exceptions=True)
-
-    async def _feed(self, timeout_s: float) -> None:
-        while True:
-            await asyncio.sleep(timeout_s / FEEDINGS)
-            # A failure here shows in telemetry too; the controller stops the arm by itself.
-            with contextlib.suppress(DeviceError):
-                await self._set(timeout_s, PROTECTIVE_STOP)
-
-    async def _set(self, timeout_s: float, action: int) -> object:
-        params = {"key": KEY, "timeout": timeout_s, "action": action}
-        return await self._connection.call("RegisterControl.setWatchDog", params)

@@ -204,7 +204,6 @@ PARAMETERS: dict[str, tuple[str, ...]] = {
     "MotionControl.setSpeedFraction": ("fraction",),
     "MotionControl.stopLine": ("acc", "acc_rot"),
     "MotionControl.stopMove": ("quick", "all_tasks"),
-    "RegisterControl.setWatchDog": ("key", "timeout", "action"),
     "RobotAlgorithm.forwardKinematics": ("q",),
     "RobotAlgorithm.inverseKinematics": ("qnear", "pose"),
     "RobotConfig.setCollisionLevel": ("level",),

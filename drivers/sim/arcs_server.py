@@ -87,11 +87,6 @@ class ArcsServer(LoopbackServer):
         self.faults = faults or FaultBoard(world)
         self._methods = methods(self.cabinet)
 
-    async def stop(self) -> None:
-        """Close the listener, every client, and the cabinet's watchdogs."""
-        self.cabinet.close()
-        await super().stop()
-
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer requests in order. The motion queue continues after the client disconnects, as a cabinet's would."""
         data = await reader.read(65536)

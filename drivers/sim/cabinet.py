@@ -1,4 +1,4 @@
-"""The loopback cabinet: an arm's motion, tool, power, safety and watchdogs, and its methods by their names on the wire.
+"""The loopback cabinet: an arm's motion, tool, power and safety, and its methods by their names on the wire.
 
 It simulates what a driver can get wrong: refusals by return code, poses that are accepted first and fail in planning, a
 path that a protective stop keeps. It simulates neither accuracy nor safety functions, nor the arm's highest speeds.
@@ -6,7 +6,6 @@ path that a protective stop keeps. It simulates neither accuracy nor safety func
 
 from __future__ import annotations
 
-import asyncio
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -85,7 +84,6 @@ HARD_STOP_M_S2 = 10.0
 SOFT_STOP_M_S2 = 2.0
 POSE_OUT_OF_REACH = 30047
 BLEND_M = (0.001, 1.0)
-PROTECTIVE_STOP_ACTION = 3
 MOST_MOVES = 64
 OPERATIONAL_MODES = ("Disabled", "Automatic", "Manual")
 
@@ -105,8 +103,6 @@ class Cabinet:
         self.speed_fraction = 1.0
         self.operational_mode = "Automatic"
         self.messages: list[dict[str, Any]] = []
-        self.watchdogs: dict[str, asyncio.TimerHandle] = {}
-        """The watchdogs that wait, by key."""
 
     def now_s(self) -> float:
         """Simulated time."""
@@ -258,30 +254,6 @@ class Cabinet:
         self.motion.advance(self.now_s())
         return self.motion.size
 
-    def set_watchdog(self, p: Params) -> int:
-        """Restart the watchdog `key` from now: action 3 is a protective stop, 0 ends it. Others are not simulated.
-
-        It counts real time, as its client does.
-        """
-        key, timeout_s, action = p["key"], p["timeout"], p["action"]
-        if action not in (0, PROTECTIVE_STOP_ACTION) or not timeout_s >= 0.1:
-            return -ReturnCode.INVALID_ARGUMENT
-        if (timer := self.watchdogs.pop(key, None)) is not None:
-            timer.cancel()
-        if action:
-            self.watchdogs[key] = asyncio.get_running_loop().call_later(timeout_s, self._fire, key)
-        return ReturnCode.OK
-
-    def close(self) -> None:
-        """End the watchdogs' timers."""
-        for timer in self.watchdogs.values():
-            timer.cancel()
-        self.watchdogs.clear()
-
-    def _fire(self, key: str) -> None:
-        self.watchdogs.pop(key, None)
-        self.safety_stop(SafetyMode.PROTECTIVE_STOP)
-
     def configure(self, name: str, value: object, allowed: bool = True) -> int:
         """Set one of the cabinet's settings, if the value is allowed."""
         if not allowed:
@@ -358,6 +330,5 @@ def methods(cabinet: Cabinet) -> dict[str, Callable[[Params], Any]]:
         "RuntimeMachine.resume": lambda _: cabinet.resume(),
         # Motion from a client runs with the runtime Stopped.
         "RuntimeMachine.getRuntimeState": lambda _: "Paused" if motion.held else "Stopped",
-        "RegisterControl.setWatchDog": cabinet.set_watchdog,
     }
     return {f"{ROBOT}.{name}": method for name, method in of_robot.items()} | of_controller

@@ -6,9 +6,9 @@ The person does what `brushloop sim hand` asks for, which docs/first-day.md and 
 from __future__ import annotations
 
 import asyncio
-import itertools
 import math
 import os
+import secrets
 import zlib
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -88,8 +88,6 @@ THINGS = (
 TOUCHED = ("pin", "board-corner", "sheet-corner", "well-rim", "wash-rim")
 """Things that the tip touches; it is brought to the others by eye."""
 WALL_GRAY, WALL_NOISE = 185, 2.0
-_labs = itertools.count()
-"""Of this process: each lab has an address of its own."""
 
 
 class UnknownLab(LoopbackRig):
@@ -104,8 +102,8 @@ class UnknownLab(LoopbackRig):
         clean = draw(seed, rate, picture_px)
         self.facts, self._mended = (clean, clean) if trap is None else trapped(clean, trap)
         """The lab as it is now, and once the mistake is corrected."""
-        self.host = f"127.{16 + seed % 200}.{os.getpid() % 250 + 1}.{next(_labs) % 250 + 1}"
-        """The address that the pendant shows."""
+        self.host = f"127.{16 + seed % 200}.{os.getpid() % 250 + 1}.{secrets.randbelow(250) + 1}"
+        """The address that the pendant shows: another one each time, so that no client of an earlier lab finds it."""
         self.streams = tuple(f"http://{self.host}:{port}/stream.mjpg" for port in CAMERA_PORTS)
         """The addresses on the stickers of the cameras."""
         self.can_bus = f"{self.host}:{CAN_PORT}/{LOOPBACK_CHANNEL}"

@@ -276,8 +276,8 @@ def serve(
 ) -> None:
     """Serve until a signal, or until idle for `idle_exit_s` (0 means never); print the `rig.toml` or write it.
 
-    Raises `SimFileError` for a control socket that cannot be created, and rather than overwrite a file that no loopback
-    rig wrote.
+    Raises `SimFileError` for a control socket or a `rig.toml` that cannot be written, and rather than overwrite a file
+    that no loopback rig wrote.
     """
     if write_rig and not write_rig.parent.is_dir():
         raise SimFileError(write_rig, "", f"there is no folder {write_rig.parent}")
@@ -290,8 +290,11 @@ def serve(
             tell(*rig.toml().splitlines(), "# Ctrl-C ends")
             return
         part = write_rig.with_name(write_rig.name + ".part")
-        part.write_text(rig.toml(), encoding="utf-8")
-        part.replace(write_rig)  # a reader sees all of it or none
+        try:
+            part.write_text(rig.toml(), encoding="utf-8")
+            part.replace(write_rig)  # a reader sees all of it or none
+        except OSError as error:
+            raise SimFileError(write_rig, "", f"cannot be written: {error.strerror}") from None
         tell(f"{write_rig} is written: brushloop doctor --config {write_rig}; Ctrl-C ends")
 
     asyncio.run(serve_until_over(rig, control, idle_exit_s, announce))

@@ -131,11 +131,6 @@ def state(rpc: Any, robot: Any) -> None:
     SEEN["simulated"] = robot.getRobotManage().isSimulationEnabled()
 
 
-def watchdog(rpc: Any) -> None:
-    register = rpc.getRegisterControl()
-    SEEN["watchdog"] = [register.setWatchDog("test", 5.0, 3), register.setWatchDog("test", 5.0, 0)]
-
-
 def subscribe(port: int) -> None:
     rtde = sdk.RtdeClient()
     pushed: list[tuple[list[float], list[float], bool, bool]] = []
@@ -185,7 +180,6 @@ def main(port: int, rtde_port: int) -> None:
     joints(robot)
     blend(robot)
     state(rpc, robot)
-    watchdog(rpc)
     subscribe(rtde_port)
     go_wrong(robot)
     SEEN["power off"] = robot.getRobotManage().poweroff()

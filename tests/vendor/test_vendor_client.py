@@ -99,7 +99,6 @@ ANSWERS: dict[str, Any] = {
     "version": "0.31.1-brushloop-loopback",
     "joint state": ["JointStateType.Running"] * 6,
     "simulated": True,
-    "watchdog": [0, 0],
     "rtde connect": [0, 0],
     "rtde topic": [0, 0],
     "rtde removed": 0,

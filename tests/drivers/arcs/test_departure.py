@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 from typing import Any
 
 import pytest
 
-from brushloop.drivers.arcs import stopping
-from brushloop.drivers.arcs.controller import (
-    Controller,
-    RobotMode,
-    SafetyMode,
-)
+from brushloop.drivers.arcs.controller import Controller, RobotMode, SafetyMode
 from brushloop.drivers.arcs.motion import until_settled
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.arcs.settings import Settings, require_same
@@ -32,7 +26,6 @@ from brushloop.drivers.geometry import brush_pose, distance, from_wire, lean
 from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.kinematics import forward, pose_of
 from tests.drivers.arcs.conftest import MakeArm
-from tests.waiting import until
 
 NEAR, BEYOND = brush_pose(260.0, -220.0, 250.0), brush_pose(900.0, 0.0, 250.0)
 ABOVE, LOW = brush_pose(300.0, -200.0, 200.0), brush_pose(300.0, -200.0, 130.0)
@@ -112,64 +105,6 @@ async def test_a_target_out_of_reach_names_the_controllers_message(make_arm: Mak
         await arm.move(BEYOND, **QUICK)
     assert isinstance(caught.value.__cause__, MotionFailed)
     await arm.move(NEAR, **QUICK)
-
-
-# ---------------------------------------------------------------- the watchdog
-
-
-async def bitten(cabinet: ArcsServer) -> None:
-    """Return once the watchdog has put the arm in a protective stop."""
-    await until(lambda: not cabinet.cabinet.watchdogs, "the watchdog to bite")
-    assert cabinet.cabinet.power.safety == SafetyMode.PROTECTIVE_STOP
-
-
-async def test_the_watchdog_is_armed_while_enabled_and_fed(make_arm: MakeArm, cabinet: ArcsServer, notices: list[str]):
-    arm = make_arm(watchdog_s=0.5)
-    await arm.connect()
-    assert cabinet.cabinet.watchdogs == {}
-    await arm.enable()
-    assert list(cabinet.cabinet.watchdogs) == ["brushloop"]
-    await asyncio.sleep(5.0)
-    assert list(cabinet.cabinet.watchdogs) == ["brushloop"]
-    await arm.close()
-    await asyncio.sleep(5.0)
-    assert cabinet.cabinet.watchdogs == {}
-    assert cabinet.cabinet.power.safety == SafetyMode.NORMAL
-    assert not notices
-
-
-async def test_a_host_that_dies_leaves_a_protective_stop_and_no_motion(make_arm: MakeArm, cabinet: ArcsServer):
-    arm = await enabled(make_arm, watchdog_s=0.5)
-    await arm._motion.move_line(brush_pose(300.0, -220.0, 250.0), 0.1, 800.0)
-    for controller in (arm._state, arm._motion, arm._stop):
-        await controller.connection.close()
-    arm._enabled = False  # who is dead does not say goodbye
-    await bitten(cabinet)
-    await until(lambda: cabinet.cabinet.motion.steady(cabinet.cabinet.now_s()), "the arm to rest")
-    assert cabinet.cabinet.motion.exec_id(cabinet.cabinet.now_s()) != -1, "it rests on its way"
-
-
-async def test_a_controller_that_knows_no_watchdog_is_reported_and_used(
-    make_arm: MakeArm, cabinet: ArcsServer, notices: list[str]
-):
-    del cabinet._methods["RegisterControl.setWatchDog"]
-    arm = await enabled(make_arm, watchdog_s=2.0)
-    await arm.move(NEAR, **QUICK)
-    assert len(notices) == 1
-    assert "no watchdog" in notices[0]
-
-
-async def test_an_arm_that_cannot_be_stopped_is_left_to_the_watchdog(
-    make_arm: MakeArm, cabinet: ArcsServer, monkeypatch: pytest.MonkeyPatch
-):
-    async def fails(*_: object) -> None:
-        raise MotionFailed("robot", "stop", "not seen at rest")
-
-    arm = await enabled(make_arm, watchdog_s=0.5)
-    monkeypatch.setattr(stopping.Stopper, "stop", fails)
-    await arm.close()
-    assert list(cabinet.cabinet.watchdogs) == ["brushloop"]
-    await bitten(cabinet)
 
 
 # ---------------------------------------------------------------- what another client does meanwhile

@@ -63,6 +63,9 @@ def test_serving_ends_by_itself_and_leaves_a_rig_toml_unless_another_file_stands
     target.write_text("name = 'our rig'")
     with pytest.raises(SimFileError, match="was not written by a loopback rig"):
         serve(config, target, 0.2, lines.append, None)
+    (tmp_path / "other.toml.part").mkdir()
+    with pytest.raises(SimFileError, match=r"other\.toml: cannot be written: Is a directory"):
+        serve(config, tmp_path / "other.toml", 0.2, lines.append, None)
 
 
 async def test_a_rig_with_a_client_is_not_idle(rig: LoopbackRig):
