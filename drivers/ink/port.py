@@ -1,7 +1,7 @@
 """What ink devices share: their table in `rig.toml`, the limits on doses, errors, and the serial line.
 
-One worker thread owns the port from open to close, so that an exchange whose caller was cancelled still ends before
-the next begins: two requests at once on a half-duplex line would destroy each other.
+An exchange whose caller was cancelled still ends before the next begins: two requests at once on a half-duplex line
+would destroy each other.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, Field
@@ -28,7 +27,7 @@ from brushloop.drivers.errors import (
     NotConnected,
     ProtocolViolation,
 )
-from brushloop.drivers.host import Clock
+from brushloop.drivers.host import Clock, finished
 
 
 class InkRefused(DeviceError):
@@ -107,16 +106,13 @@ class InkDevice(ABC):
         return None
 
 
-_POLYNOMIAL = 0xA001  # 0x8005, reflected
-
-
 def crc16(data: bytes) -> int:
     """CRC-16/MODBUS of `data`: 0x4B37 for b"123456789"."""
     crc = 0xFFFF
     for byte in data:
         crc ^= byte
         for _ in range(8):
-            crc = (crc >> 1) ^ (_POLYNOMIAL if crc & 1 else 0)
+            crc = (crc >> 1) ^ (0xA001 if crc & 1 else 0)  # the polynomial 0x8005, reflected
     return crc
 
 
@@ -138,21 +134,24 @@ class SerialPort:
         self._path = path
         self._baud = baud
         self._gap_s = gap_s
-        self._worker: ThreadPoolExecutor | None = None
         self._port: Any = None
         """A `serial.Serial`; pyserial ships no types."""
+        self._turn = asyncio.Lock()
         self._closing = threading.Event()
 
     async def open(self) -> None:
         """Open the port for this process alone. Raises `ConnectionLost`."""
+        import serial
+
         await self.close()
-        self._closing = threading.Event()
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix=f"serial {self._path}")
+        self._closing.clear()
         try:
-            await asyncio.get_running_loop().run_in_executor(self._worker, self._open)
-        except BaseException:
-            await self.close()
-            raise
+            self._port = await asyncio.to_thread(
+                serial.Serial, self._path, self._baud, timeout=POLL_S, write_timeout=1.0, exclusive=True
+            )
+        except (OSError, ValueError) as error:
+            why = f"cannot open {self._path}: {error}"
+            raise ConnectionLost(self._device, "connect", why, remedy=REPLUG) from None
 
     async def exchange(
         self, op: str, request: bytes, find: Callable[[bytes], T | None], *, timeout_s: float, condition: str = ""
@@ -162,12 +161,11 @@ class SerialPort:
         Raises `DeviceTimeout` if nothing arrived, `ProtocolViolation` if something else arrived, `ConnectionLost`,
         `NotConnected`, each with `condition`.
         """
-        if self._worker is None:
+        if self._port is None:
             raise NotConnected(self._device, op, "not connected")
-        loop, closing = asyncio.get_running_loop(), self._closing
-        asking = loop.run_in_executor(self._worker, lambda: self._ask(op, request, find, timeout_s, closing))
+        asking = asyncio.create_task(self._in_turn(op, request, find, timeout_s))
         try:
-            received, reply = await asking
+            received, reply = await asyncio.shield(asking)
         except OSError as error:  # pyserial's own error is an OSError
             what = f"{self._path}: {error.strerror or error}"
             raise ConnectionLost(self._device, op, what, condition=condition, remedy=REPLUG) from None
@@ -181,39 +179,29 @@ class SerialPort:
         raise DeviceTimeout(self._device, op, what, condition=condition, remedy="Check power and cable.")
 
     async def close(self) -> None:
-        """Abandon a pending exchange, close the port and join the worker; may be repeated."""
+        """Abandon a pending exchange and close the port; may be repeated."""
         self._closing.set()
-        worker, self._worker = self._worker, None
-        if worker is not None:
-            worker.submit(self._close)
-            await asyncio.shield(asyncio.to_thread(worker.shutdown))
+        await finished(self._close())
 
-    def _open(self) -> None:
-        import serial
+    async def _close(self) -> None:
+        async with self._turn:
+            port, self._port = self._port, None
+            if port is not None:
+                with contextlib.suppress(OSError):
+                    await asyncio.to_thread(port.close)
 
-        try:
-            self._port = serial.Serial(self._path, self._baud, timeout=POLL_S, write_timeout=1.0, exclusive=True)
-        except (OSError, ValueError) as error:
-            why = f"cannot open {self._path}: {error}"
-            raise ConnectionLost(self._device, "connect", why, remedy=REPLUG) from None
-
-    def _close(self) -> None:
-        port, self._port = self._port, None
-        if port is not None:
-            with contextlib.suppress(OSError):
-                port.close()
+    async def _in_turn(
+        self, op: str, request: bytes, find: Callable[[bytes], T | None], timeout_s: float
+    ) -> tuple[bytes, T | None]:
+        async with self._turn:
+            return await asyncio.to_thread(self._ask, op, request, find, timeout_s)
 
     def _ask(
-        self,
-        op: str,
-        request: bytes,
-        find: Callable[[bytes], T | None],
-        timeout_s: float,
-        closing: threading.Event,
+        self, op: str, request: bytes, find: Callable[[bytes], T | None], timeout_s: float
     ) -> tuple[bytes, T | None]:
         """Everything received, and the reply in it. Raises `NotConnected` if the port was closed, `OSError`."""
         port = self._port
-        if port is None or closing.is_set():
+        if port is None or self._closing.is_set():
             raise NotConnected(self._device, op, "closed while waiting")
         time.sleep(self._gap_s)
         if waiting := port.in_waiting:
@@ -222,7 +210,7 @@ class SerialPort:
         port.write(request)
         received = b""
         while time.monotonic() < deadline_s and len(received) <= MAX_REPLY_BYTES:
-            if closing.is_set():
+            if self._closing.is_set():
                 raise NotConnected(self._device, op, "closed while waiting")
             received += port.read(max(1, port.in_waiting))
             if (reply := find(received)) is not None:

@@ -16,11 +16,10 @@ from typing import Protocol, Self
 
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.ink import pump
-from brushloop.drivers.ink.pump import MAX_RPM, RUN_REGISTER, SPEED_REGISTER, STOP, WRITE_REGISTER, exception
-from brushloop.drivers.ink.station import NUMBERS, number_of, seal, unseal
+from brushloop.drivers.ink.pump import MAX_RPM, RUN_REGISTER, SPEED_REGISTER, START, STOP, WRITE_REGISTER, exception
+from brushloop.drivers.ink.station import number_of, seal, unseal
 
 GARBAGE = b"\xff\x00*\n\x86\x01ok 1*0000\n"
-BYTE_S = 0.001
 
 
 class Instrument(Protocol):
@@ -32,14 +31,6 @@ class Instrument(Protocol):
 
     def answer(self, request: bytes) -> bytes | None:
         """Carry out the request and reply; None for silence."""
-        ...
-
-    def damage(self, reply: bytes) -> bytes:
-        """The reply with a wrong checksum."""
-        ...
-
-    def mistake(self, reply: bytes) -> bytes:
-        """A valid reply, but not to this request."""
         ...
 
 
@@ -100,7 +91,7 @@ class PtyLine:
                 os.write(self._terminal[0], reply)
 
     def _meet(self, request: bytes) -> None:
-        fault, later = self.next_fault(), asyncio.get_running_loop().call_later
+        fault = self.next_fault()
         if fault == "unplug":
             self.unplug()
             return
@@ -113,16 +104,7 @@ class PtyLine:
             case "garbage":
                 self._write(GARBAGE)
             case "late":
-                later(self._late_s, self._write, reply)
-            case "split":
-                for index in range(len(reply)):
-                    later(index * BYTE_S, self._write, reply[index : index + 1])
-            case "damaged":
-                self._write(self.instrument.damage(reply))
-            case "mistaken":
-                self._write(self.instrument.mistake(reply))
-            case "echo":
-                self._write(request)
+                asyncio.get_running_loop().call_later(self._late_s, self._write, reply)
             case _:
                 self._write(reply)
 
@@ -201,15 +183,6 @@ class StationFirmware:
         self._memory = (request, reply)
         return reply
 
-    def damage(self, reply: bytes) -> bytes:
-        """One character of the checksum changed."""
-        return reply[:-2] + (b"0" if reply[-2:-1] != b"0" else b"1") + b"\n"
-
-    def mistake(self, reply: bytes) -> bytes:
-        """A reply with the number of the previous request."""
-        number, text = unseal(reply)
-        return seal((number - 1) % NUMBERS, text)
-
     def _obey(self, words: list[str]) -> str:
         match words:
             case ["identify"]:
@@ -241,32 +214,27 @@ class StationFirmware:
         return f"ok {volume_ml:.3f}"
 
 
-FULL_SPEED = 2
 REQUEST_BYTES = 8
 
 
 class PumpFirmware:
-    """A simulated pump with `now_s` as its clock; the pumped volume can be read at any time."""
+    """A simulated pump, unit 1 on its line; the pumped volume can be read at any time."""
 
     def __init__(
         self,
         *,
-        unit: int = 1,
         ml_per_revolution: float = 0.1,
         reservoir_ml: float = math.inf,
         on_pumped: Callable[[float], None] = lambda _volume_ml: None,
-        now_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.unit = unit
         self.rpm = 0.0
         self.starts = 0
         self._ml_per_revolution = ml_per_revolution
         self._reservoir_ml = reservoir_ml
         self._on_pumped = on_pumped
-        self._now_s = now_s
         self._run = STOP
         self._pumped_ml = 0.0
-        self._since_s = now_s()
+        self._since_s = time.monotonic()
 
     @property
     def running(self) -> bool:
@@ -290,14 +258,14 @@ class PumpFirmware:
     def answer(self, request: bytes) -> bytes | None:
         """The reply; None for a wrong CRC or another unit, as Modbus requires."""
         unit, function, register, value = struct.unpack(">BBHH", request[:-2])
-        if pump.seal(request[:-2]) != request or unit != self.unit:
+        if pump.seal(request[:-2]) != request or unit != 1:
             return None
         if function != WRITE_REGISTER:
             return exception(unit, function & 0x7F, 1)
         self._settle()
         if register not in (SPEED_REGISTER, RUN_REGISTER):
             return exception(unit, function, 2)
-        if value > (MAX_RPM * 100 if register == SPEED_REGISTER else FULL_SPEED):
+        if value > (MAX_RPM * 100 if register == SPEED_REGISTER else START):
             return exception(unit, function, 3)
         if register == SPEED_REGISTER:
             self.rpm = value / 100
@@ -306,18 +274,9 @@ class PumpFirmware:
             self._run = value
         return request
 
-    def damage(self, reply: bytes) -> bytes:
-        """The reply with the last byte of its CRC changed."""
-        return reply[:-1] + bytes([reply[-1] ^ 0x55])
-
-    def mistake(self, reply: bytes) -> bytes:
-        """A valid confirmation of another register."""
-        return pump.seal(bytes([self.unit, WRITE_REGISTER, 0x00, 0x77, 0x00, 0x00]))
-
     def _settle(self) -> None:
-        now_s = self._now_s()
-        rpm = {STOP: 0.0, FULL_SPEED: MAX_RPM}.get(self._run, self.rpm)
-        turned_ml = rpm / 60.0 * self._ml_per_revolution * (now_s - self._since_s)
+        now_s = time.monotonic()
+        turned_ml = (self.rpm if self.running else 0.0) / 60.0 * self._ml_per_revolution * (now_s - self._since_s)
         volume_ml = min(turned_ml, self._reservoir_ml - self._pumped_ml)  # an empty tube pumps air
         self._pumped_ml += volume_ml
         self._on_pumped(volume_ml)

@@ -100,7 +100,7 @@ KINDS: dict[Device, frozenset[str]] = {
     Device.ROBOT: LOST | REPLIES | STOPS.keys(),
     Device.TELEMETRY: frozenset({"mute", "late"}),
     Device.CAMERA: frozenset({"stale", "black", "frozen", "torn"}),
-    Device.INK: frozenset({"deaf", "mute", "garbage", "late", "split", "damaged", "mistaken", "echo", "unplug"}),
+    Device.INK: frozenset({"deaf", "mute", "garbage", "late", "unplug"}),
     Device.FORCE: frozenset({"silence", "no-second", "nan", "inf", "bus-error", "bus-off", "stuck"}),
 }
 """What each kind does is in docs/faults.md."""

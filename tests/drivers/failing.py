@@ -65,13 +65,13 @@ def heard(instrument: Any, clock: PatientClock) -> Any:
     return instrument
 
 
-def fail_requests(line: PtyLine, clock: PatientClock, *faults: str) -> None:
+def fail_requests(line: PtyLine, clock: PatientClock, *faults: str | None) -> None:
     """Apply these faults to the next requests on the line, one each; time runs out for those that spoil the reply."""
     coming = iter(faults)
 
     def next_fault() -> str | None:
         fault = next(coming, None)
-        if fault not in (None, "split", "unplug"):
+        if fault not in (None, "unplug"):
             clock.jump_soon()
         return fault
 
@@ -97,12 +97,6 @@ class Script:
         expected, reply = self.left.pop(0) if self.left else (b"", b"")
         if request != expected:
             self.surprises.append(f"expected {expected!r}, got {request!r}")
-        return reply
-
-    def damage(self, reply: bytes) -> bytes:
-        return reply
-
-    def mistake(self, reply: bytes) -> bytes:
         return reply
 
 
