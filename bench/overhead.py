@@ -205,7 +205,6 @@ def _write_protocol(path: Path, strokes: int, seed: int) -> None:
 
 async def _controller(path: Path, seed: int) -> None:
     """Serves the rig; each line on the input is answered with the spans of time in which the arm moved."""
-    from brushloop.drivers.force.sri_m8123 import MOST_STALE_LOOPBACK_MS
     from brushloop.drivers.sim.config import SimConfig
     from brushloop.drivers.sim.rig import LoopbackRig
 
@@ -216,7 +215,7 @@ async def _controller(path: Path, seed: int) -> None:
         # for one falls silent. No brush is in danger: the longest silence that the loopback bus may have is allowed.
         text = rig.toml()
         assert SILENCE in text, "the rig does not limit the silence of its force sensor as expected"
-        path.write_text(text.replace(SILENCE, f"stale_ms = {MOST_STALE_LOOPBACK_MS:g}\n"), encoding="utf-8")
+        path.write_text(text.replace(SILENCE, "stale_ms = 2000\n"), encoding="utf-8")
         questions = await lines_of_input()
         tell("ready")
         while await questions.readline():

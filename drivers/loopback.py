@@ -25,7 +25,6 @@ from brushloop.drivers.errors import ProtocolViolation
 
 START_S = 120.0
 """Longest start; a busy machine may need most of it."""
-POLL_S = 0.05
 RATE = 30.0
 
 
@@ -71,7 +70,7 @@ def start(config: Path, log: Path, *options: str, detached: bool = False) -> Loo
         if process.poll() is not None or time.monotonic() > deadline:
             rig.end()
             raise RigDidNotStart(f"the loopback rig did not start; {log} says: {log.read_text(errors='replace')}")
-        time.sleep(POLL_S)
+        time.sleep(0.05)
     return rig
 
 
@@ -97,11 +96,6 @@ def simulate(
             rig.end()
 
 
-TIMEOUT_S = 5.0
-GUIDING_S = 120.0
-"""Longest wait for an act of the person in the lab."""
-
-
 class FaultRefused(Exception):
     """No rig listens, or the rig refused the request."""
 
@@ -112,7 +106,7 @@ def ask(path: Path, request: Mapping[str, object]) -> dict[str, Any]:
     """Send a request; return the rig's answer. Raises `FaultRefused`, with one line, if it is missing or a refusal."""
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
-            client.settimeout(GUIDING_S if request["do"] == "hand" else TIMEOUT_S)
+            client.settimeout(120.0 if request["do"] == "hand" else 5.0)  # a person takes longer
             client.connect(str(path))
             client.sendall(json.dumps(request).encode() + b"\n")
             answer: Any = json.loads(client.makefile("rb").readline())
@@ -127,10 +121,6 @@ def ask(path: Path, request: Mapping[str, object]) -> dict[str, Any]:
             raise FaultRefused(error)
         case _:
             raise FaultRefused(f"{path}: not the control socket of a rig")
-
-
-TURNS_TO_BEGIN = 3
-"""Turns of the event loop from accepting a connection to the first step of its task."""
 
 
 class LoopbackServer:
@@ -164,7 +154,7 @@ class LoopbackServer:
             # asyncio leaves a connection open that is accepted in the turn of the loop in which the server closes.
             await asyncio.sleep(0)
             server.close()
-            for _ in range(TURNS_TO_BEGIN):
+            for _ in range(3):  # from accepting a connection to the first step of its task
                 await asyncio.sleep(0)
             self.drop_clients()
             await asyncio.gather(*self._clients, return_exceptions=True)

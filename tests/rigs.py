@@ -293,7 +293,6 @@ class LoopRounds(force_driver.RoundStream):
         assert rig.force is not None
         self._rig, self._board = rig, rig.force.board
         self._board.streaming = True
-        self.identity = Identity("force", "SRI M8123B2 on the loopback rig", "", True)
         self._task = asyncio.get_running_loop().create_task(self._read(), name="force rounds")
 
     def stop(self, timeout_s: float = 5.0) -> None:

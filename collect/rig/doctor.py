@@ -181,16 +181,17 @@ async def _robot(finding: Finding, config: RigConfig, clock: Clock) -> Finding:
     robot = make_robot(config, clock, notices.append)
     try:
         identity = await robot.connect()
-        state = await robot.state(CALLS)
+        _, latency_ms = await _timed(CALLS, robot.where)
+        mode, safety = await robot.modes()
     finally:
         await robot.close()
     problem = remedy = ""
-    if state.safety not in MOVING_ALLOWED:
-        problem, remedy = f"safety mode is {state.safety}", "Look at the pendant; this program clears nothing."
-    elif state.mode not in (RobotMode.POWER_OFF, RobotMode.IDLE, RobotMode.RUNNING):
-        problem, remedy = f"robot mode is {state.mode}", "Look at the pendant."
-    notes = "; ".join([*notices, f"{state.mode}, safety {state.safety}"])
-    return finding.answered(identity, state.latency_ms, notes, problem, remedy)
+    if safety not in MOVING_ALLOWED:
+        problem, remedy = f"safety mode is {safety}", "Look at the pendant; this program clears nothing."
+    elif mode not in (RobotMode.POWER_OFF, RobotMode.IDLE, RobotMode.RUNNING):
+        problem, remedy = f"robot mode is {mode}", "Look at the pendant."
+    notes = "; ".join([*notices, f"{mode}, safety {safety}"])
+    return finding.answered(identity, latency_ms, notes, problem, remedy)
 
 
 def doctor_table(findings: list[Finding]) -> Table:

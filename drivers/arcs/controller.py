@@ -6,11 +6,9 @@
 from __future__ import annotations
 
 import asyncio
-import statistics
 import time
 from collections.abc import AsyncGenerator, Awaitable, Callable
 from contextlib import asynccontextmanager, suppress
-from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from typing import Any
 
@@ -106,15 +104,6 @@ NOT_RUNNING = -1
 """Return code of a motion in any robot mode but Running."""
 
 
-@dataclass(frozen=True, slots=True)
-class ArmState:
-    """The controller's names of its robot and safety modes, and the median time of a call."""
-
-    mode: str
-    safety: str
-    latency_ms: float
-
-
 class Controller:
     """One connection and the name of the robot behind it. Every method may raise what `RpcConnection.call` raises."""
 
@@ -162,19 +151,13 @@ class Controller:
         """The robot mode."""
         return str(await self.ask("RobotState.getRobotModeType"))
 
-    async def state(self, calls: int) -> ArmState:
-        """Read the modes and time `calls` consecutive calls of one kind; sets nothing."""
-        took_s: list[float] = []
-        for _ in range(calls):
-            began_s = time.monotonic()
-            await self.pose()
-            took_s.append(time.monotonic() - began_s)
-        safety = str(await self.ask("RobotState.getSafetyModeType"))
-        return ArmState(await self.mode(), safety, statistics.median(took_s) * 1e3)
+    async def safety(self) -> str:
+        """The safety mode."""
+        return str(await self.ask("RobotState.getSafetyModeType"))
 
     async def require_safe(self, op: str) -> None:
         """Raise `RobotNotSafe`, with condition and remedy, unless the mode allows motion."""
-        mode = str(await self.ask("RobotState.getSafetyModeType"))
+        mode = await self.safety()
         if mode not in MOVING_ALLOWED:
             raise RobotNotSafe(DEVICE, op, mode, *CONDITION_AND_REMEDY.get(mode, UNKNOWN_CONDITION))
 

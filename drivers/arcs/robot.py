@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 from collections.abc import AsyncGenerator, Callable, Sequence
 
-from brushloop.drivers.arcs.controller import LOOPBACK_CONTROL_BOX, ArmState, Controller
+from brushloop.drivers.arcs.controller import LOOPBACK_CONTROL_BOX, Controller
 from brushloop.drivers.arcs.motion import (
     Leg,
     Messages,
@@ -27,7 +27,7 @@ from brushloop.drivers.errors import DeviceError, MotionFailed, NotConnected
 from brushloop.drivers.host import Clock, finished
 from brushloop.drivers.limits import Limits
 
-__all__ = ["ArcsTable", "ArmState", "AuboArcs"]
+__all__ = ["ArcsTable", "AuboArcs"]
 
 STOP_ACC_M_S2 = 2.0
 
@@ -107,9 +107,9 @@ class AuboArcs:
         await self._messages.codes()  # those that are there concern earlier motion
         await self._telemetry.read()
 
-    async def state(self, calls: int) -> ArmState:
-        """The arm's current modes, and the time of a call; see `Controller.state`."""
-        return await self._motion.state(calls)
+    async def modes(self) -> tuple[str, str]:
+        """The controller's names of its robot mode and its safety mode."""
+        return await self._motion.mode(), await self._motion.safety()
 
     def check(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
         """Raise `LimitExceeded` where the target is not allowed, without asking the controller."""

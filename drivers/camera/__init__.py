@@ -48,7 +48,6 @@ SAMPLE_STEP = 7
 BLACK_BELOW = 25
 LIGHT_SHARE = 0.005
 """A frame in which fewer of the sampled pixels than this are lighter than `BLACK_BELOW` is black."""
-SATURATED_SHARE = 0.5
 TORN_BAND_SHARE = 0.02
 """Share of the rows, at the bottom, that are uniform if the decoder ran out of data."""
 BURST_SHARE = 0.5
@@ -87,7 +86,7 @@ def looked_at(picture: Picture) -> NDArray[np.uint8] | FrameFault:
     sample = image[::SAMPLE_STEP, ::SAMPLE_STEP]
     if np.count_nonzero(sample >= BLACK_BELOW) < LIGHT_SHARE * sample.size:
         return FrameFault.BLACK
-    if float(np.mean(sample >= 255)) > SATURATED_SHARE:
+    if float(np.mean(sample >= 255)) > 0.5:
         return FrameFault.SATURATED
     band = image[-max(8, round(TORN_BAND_SHARE * image.shape[0])) :]
     if int(band.max()) - int(band.min()) <= 1 and int(band.min()) < 254:  # clipped white is light, not loss
@@ -231,27 +230,22 @@ class _Grabber:
             after_ns = arrival.exposed_after_ns + 1
 
     def _arrived(self, after_ns: int, until_s: float, skipped_before: Counter[FrameFault]) -> _Arrival:
-        def late_enough() -> _Arrival | None:
-            newest = self._newest
-            return newest if newest is not None and newest.exposed_after_ns >= after_ns else None
-
-        def over() -> bool:
-            return self._ended is not None or self._closing.is_set()
-
-        left_s = until_s - time.monotonic()
         with self._condition:
-            if left_s < 0.0 or not self._condition.wait_for(lambda: late_enough() or over(), left_s):
-                raise DeviceTimeout(
-                    DEVICE,
-                    "fresh",
-                    f"no valid new frame from {self._table.source} in {self._table.timeout_s:g} s"
-                    + self._why(self._skipped - skipped_before),
-                    remedy="Check cable, light and stream; the arm does not move meanwhile.",
-                )
-            arrival = late_enough()
-            if arrival is not None and not self._closing.is_set():
-                return arrival
-            raise self._ended or ConnectionLost(DEVICE, "fresh", "closed while waiting")
+            while (left_s := until_s - time.monotonic()) >= 0.0:
+                if self._closing.is_set():
+                    raise ConnectionLost(DEVICE, "fresh", "closed while waiting")
+                if self._newest is not None and self._newest.exposed_after_ns >= after_ns:
+                    return self._newest
+                if self._ended is not None:
+                    raise self._ended
+                self._condition.wait(left_s)
+        raise DeviceTimeout(
+            DEVICE,
+            "fresh",
+            f"no valid new frame from {self._table.source} in {self._table.timeout_s:g} s"
+            + self._why(self._skipped - skipped_before),
+            remedy="Check cable, light and stream; the arm does not move meanwhile.",
+        )
 
     def _why(self, skipped: Counter[FrameFault]) -> str:
         """Why no valid frame came, in brackets; empty if that is not known."""

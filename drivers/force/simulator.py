@@ -74,14 +74,7 @@ class ForceBoard:
         if fault == "stuck" and self._before is not None:
             fx, fy, fz, mx, my, mz = self._before
         self._before = (fx, fy, fz, mx, my, mz)
-        wrench = (
-            fx,
-            fy,
-            math.nan if fault == "nan" else fz,
-            math.inf if fault == "inf" else mx,
-            my,
-            mz,
-        )
+        wrench = (fx, fy, math.nan if fault == "nan" else fz, mx, my, mz)
         for place, (can_id, data) in enumerate(encode_round(wrench)):
             if fault != "no-second" or place != 1:
                 yield CanFrame(can_id, data)

@@ -23,7 +23,6 @@ import logging
 import statistics
 import struct
 import threading
-from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -120,7 +119,6 @@ AXES = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 CONNECT_S = 10.0
 """Time to open the bus, even through a gateway, and get a first round."""
 RECEIVE_S = 0.05
-RATE_WINDOW = 200
 SILENT_S = 1.0
 """A board that streamed and then sends nothing for this long is lost: a gateway that goes away gives no notice."""
 STUCK_MS, STUCK_ROUNDS = 100.0, 10
@@ -130,12 +128,6 @@ STILL_N, STILL_NM = 0.05, 0.01
 """The largest standard deviation, in each axis, at which the sensor counts as still."""
 MIN_BIAS_ROUNDS = 10
 NO_BIAS: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-
-
-MOST_STALE_MS = 100.0
-"""Longest silence allowed: at 20 mm/s the brush goes down 2 mm in this time without being felt."""
-MOST_STALE_LOOPBACK_MS = 2000.0
-"""The same on the loopback rig's bus, where simulated time may run faster than the sensor's rounds arrive."""
 
 
 class ForceTable(BaseModel, frozen=True, extra="forbid"):
@@ -162,7 +154,9 @@ class ForceTable(BaseModel, frozen=True, extra="forbid"):
     def _coherent(self) -> ForceTable:
         if (self.interface == "socketcand") != (self.host is not None and self.port is not None):
             raise ValueError("host and port belong to the interface socketcand, and to no other")
-        most_ms = MOST_STALE_LOOPBACK_MS if self.channel == LOOPBACK_CHANNEL else MOST_STALE_MS
+        # At 20 mm/s the brush goes down 2 mm in 100 ms without being felt. On the loopback rig's bus simulated time may
+        # run faster than the sensor's rounds arrive.
+        most_ms = 2000.0 if self.channel == LOOPBACK_CHANNEL else 100.0
         if self.stale_ms > most_ms:
             raise ValueError(
                 f"stale_ms = {self.stale_ms:g}: must be from 20 to {most_ms:g}; the brush is blind that long"
@@ -185,8 +179,9 @@ class RoundStream:
         self._clock = clock
         self._on_round = on_round
         self._closing = threading.Event()
-        self._arrivals_ns: deque[int] = deque(maxlen=RATE_WINDOW)
         self.rounds = self.bus_errors = 0
+        self._first_ns = 0
+        """Time at which the first round arrived."""
         self.newest: Round | None = None
         self.alike = 0
         """Number of newest rounds in a row that exactly equal the one before; a strain gauge is never that still."""
@@ -194,7 +189,6 @@ class RoundStream:
         """Time at which the first round equal to the newest arrived."""
         self.loss: tuple[str, str] | None = None
         """Why the stream ended, and what to do about it."""
-        self.identity = Identity(DEVICE, "SRI M8123B2", "", False)
         self.collecting: list[Wrench] | None = None
         """Collects every round while an average is taken."""
         self._thread = threading.Thread(target=self._run, name="force reader", daemon=True)
@@ -206,10 +200,9 @@ class RoundStream:
         self._thread.join(timeout_s)
 
     def rate_hz(self) -> float:
-        """Rate of the newest rounds; 0 before the second round."""
-        arrivals_ns = self._arrivals_ns.copy()
-        span_ns = arrivals_ns[-1] - arrivals_ns[0] if len(arrivals_ns) > 1 else 0
-        return (len(arrivals_ns) - 1) * 1e9 / span_ns if span_ns else 0.0
+        """Mean rate of the rounds so far; 0 before the second round."""
+        span_ns = self.newest[0].host_ns - self._first_ns if self.newest is not None else 0
+        return (self.rounds - 1) * 1e9 / span_ns if span_ns else 0.0
 
     def _run(self) -> None:
         try:
@@ -221,7 +214,6 @@ class RoundStream:
             self._lose(f"cannot open {self._name}: {error}", "Check the adapter and that its interface is up.")
             return
         try:
-            self.identity = self._identity(bus)
             bus.send(command(START), timeout=1.0)
             heard, quiet_s = False, 0.0
             while self.loss is None and not self._closing.is_set():
@@ -253,12 +245,6 @@ class RoundStream:
         gateway: dict[str, Any] = {} if table.host is None else {"host": table.host, "port": table.port}
         return can.Bus(table.channel, table.interface, ignore_config=True, bitrate=table.bitrate, **gateway)
 
-    def _identity(self, bus: can.BusABC) -> Identity:
-        """The board has no identification. No real board can be on a virtual bus or on the loopback rig's bus."""
-        interface, channel = self._table.interface, self._table.channel
-        simulated = interface == "virtual" or (interface, channel) == ("socketcand", LOOPBACK_CHANNEL)
-        return Identity(DEVICE, f"SRI M8123B2 on {bus.channel_info}", "", simulated)
-
     def _take(self, message: can.Message) -> None:
         if message.is_error_frame:
             self.bus_errors += 1
@@ -272,7 +258,7 @@ class RoundStream:
             return
         device_ns = round(message.timestamp * 1e9) or None  # 0: the adapter has no clock
         now_ns = self._clock.now_ns()
-        self._arrivals_ns.append(now_ns)
+        self._first_ns = self._first_ns or now_ns
         stamp = Stamp(now_ns, device_ns, self.rounds)
         self.rounds += 1
         if self.newest is not None and wrench == self.newest[1]:
@@ -349,7 +335,10 @@ class SriM8123:
         except BaseException:
             await self.close()
             raise
-        return stream.identity
+        # The board has no identification. No real board can be on a virtual bus or on the loopback rig's bus.
+        interface, channel = self._table.interface, self._table.channel
+        simulated = interface == "virtual" or (interface, channel) == ("socketcand", LOOPBACK_CHANNEL)
+        return Identity(DEVICE, f"SRI M8123B2 on {interface} {channel}", "", simulated)
 
     def latest(self) -> ForceSample:
         """The newest sample; never blocks. Raises `Stale`, `Stuck`, `ConnectionLost`, `NotConnected`."""

@@ -101,7 +101,7 @@ KINDS: dict[Device, frozenset[str]] = {
     Device.TELEMETRY: frozenset({"mute", "late"}),
     Device.CAMERA: frozenset({"stale", "black", "frozen", "torn"}),
     Device.INK: frozenset({"deaf", "mute", "garbage", "late", "unplug"}),
-    Device.FORCE: frozenset({"silence", "no-second", "nan", "inf", "bus-error", "bus-off", "stuck"}),
+    Device.FORCE: frozenset({"silence", "no-second", "nan", "bus-error", "bus-off", "stuck"}),
 }
 """What each kind does is in docs/faults.md."""
 

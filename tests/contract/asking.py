@@ -13,7 +13,7 @@ import pytest
 
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import make_robot, sole_driver
-from brushloop.drivers.arcs.robot import ArmState, AuboArcs
+from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.devices import Identity, Pose
 from brushloop.drivers.host import HostClock
 
@@ -66,16 +66,16 @@ def permission_refused(config: pytest.Config, rig: RigConfig, tests: int) -> str
     return None if answer in ("y", "yes") else f"--rig: the answer to whether the arm may move was {answer or 'no'!r}"
 
 
-async def _look(rig: RigConfig) -> tuple[Identity, Pose, ArmState]:
+async def _look(rig: RigConfig) -> tuple[Identity, Pose, tuple[str, str]]:
     """Connect and ask; powers, sets and moves nothing."""
     robot = make_robot(rig, HostClock(), lambda _text: None)
     try:
-        return await robot.connect(), await robot.where(), await robot.state(1)
+        return await robot.connect(), await robot.where(), await robot.modes()
     finally:
         await robot.close()
 
 
-def _announcement(rig: RigConfig, identity: Identity, where: Pose, state: ArmState, tests: int) -> str:
+def _announcement(rig: RigConfig, identity: Identity, where: Pose, modes: tuple[str, str], tests: int) -> str:
     robot, limits = rig.robot, rig.robot.limits
     what = "the loopback rig, simulated" if identity.simulated else "A REAL ARM"
     x, y, z = where.position_mm
@@ -83,7 +83,7 @@ def _announcement(rig: RigConfig, identity: Identity, where: Pose, state: ArmSta
 {tests} tests are about to power an arm and move it.
   robot    {identity.model}, {identity.firmware}: {what}
   address  {robot.host}:{robot.port}, framing {robot.framing}; rig {rig.name!r}
-  state    robot mode {state.mode}, safety mode {state.safety}
+  state    robot mode {modes[0]}, safety mode {modes[1]}
   tip      x {x:.1f}, y {y:.1f}, z {z:.1f} mm with the tool that the controller has now; the rig's tool is set first
   box      straight up by at most {LIFT_MM:g} mm from where the tip stands, and back; not lower, not sideways, no turn
   step     {LIFT_MM:g} mm at most, at {SPEED_MM_S:g} mm/s and {ACC_MM_S2:g} mm/s2 at most

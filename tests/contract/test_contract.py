@@ -138,8 +138,8 @@ async def test_connecting_and_closing_leaves_the_arm_where_it_is(rig: RigConfig,
 
 @pytest.mark.moves
 async def test_enabling_readies_the_arm_and_moves_nothing(enabled: Enabled):
-    state = await enabled.robot.state(1)
-    assert state.mode == "Running"
+    mode, _ = await enabled.robot.modes()
+    assert mode == "Running"
     assert_there(await assert_still(enabled.robot), enabled.start)
 
 

@@ -98,7 +98,7 @@ async def test_connecting_starts_the_board_and_closing_stops_it(board: ForceBoar
     sensor = sensor_on(channel)
     assert isinstance(sensor, ForceSensor)
     identity = await sensor.connect()
-    assert identity.model.startswith("SRI M8123B2 on Virtual bus")
+    assert identity.model == f"SRI M8123B2 on virtual {channel}"
     assert identity.simulated
     assert sensor.latest().force_n == WRENCH[:3]
     assert sensor.latest().torque_nm == WRENCH[3:]
@@ -142,7 +142,7 @@ def latest_error(sensor: SriM8123) -> DeviceError | None:
     return None
 
 
-@pytest.mark.parametrize("fault", ["silence", "nan", "inf"])
+@pytest.mark.parametrize("fault", ["silence", "nan"])
 async def test_silence_and_what_is_no_number_make_the_sample_stale_until_it_measures_again(
     board: ForceBoard, channel: str, fault: str
 ):
