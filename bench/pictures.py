@@ -294,8 +294,7 @@ class _Person:
         table, brush = facts.config.table, facts.config.brush
         answers = {
             "address of the cabinet": lab.host,
-            "longer side": str(table.board_squares[0]),
-            "shorter side": str(table.board_squares[1]),
+            "squares of the print": "{}x{}".format(*table.board_squares),
             "side of a square": f"{facts.printed_square_mm:g}",
             "side of a marker": f"{facts.printed_marker_mm:g}",
             "r: radius": f"{brush.radius_mm:g}",

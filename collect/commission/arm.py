@@ -5,21 +5,19 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-from collections.abc import AsyncGenerator, Sequence
+from collections.abc import Sequence
+from contextlib import AbstractAsyncContextManager
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import numpy as np
-from scipy.spatial.transform import Rotation
 
 from brushloop.collect.commission.notebook import Notebook, Taught
 from brushloop.collect.commission.step import Asked, Step, Visit
 from brushloop.collect.rig.doctor import Finding, Scrubber, numbers_only, transcript, write_archive
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, Controller, only_asking
+from brushloop.drivers.arcs.settings import read_back
 from brushloop.drivers.arcs.wire import DEVICE, Framing, answers, numbers
 from brushloop.drivers.devices import Pose
-from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, ProtocolViolation, RpcError
-from brushloop.drivers.geometry import distance, from_wire
+from brushloop.drivers.errors import DeviceError, DeviceTimeout, ProtocolViolation, RpcError
+from brushloop.drivers.geometry import distance, from_wire, inverse, product, turned
 
 ARCS_PORT, RTDE_PORT = 30004, 30010
 NAMES = {
@@ -57,99 +55,50 @@ ADDRESS = Asked(
 )
 
 
-class Cabinet(NamedTuple):
-    """What a cabinet reports about itself and its arm."""
+async def flange_at_rest(controller: Controller) -> Pose:
+    """Wait until the arm is held still, and return the pose of the flange in the base frame.
 
-    who: str
-    """Model, control box and software."""
-    modes: tuple[str, str, str]
-    """Of the robot, of its safety, and of the mode switch."""
-    tcp_mm_deg: tuple[float, ...]
-    """Flange to tool as set on the pendant: x, y, z in mm, rx, ry, rz in deg."""
-    payload_kg: float
-    payload_cog_mm: list[float]
-    collision_level: int
+    Raises `DeviceTimeout` if the arm keeps moving, and other `DeviceError`s.
+    """
+    if controller.connection.lost:
+        await controller.connection.open()
+    before = await _flange(controller)
+    try:
+        async with asyncio.timeout(PATIENCE_S):
+            while True:
+                await asyncio.sleep(STILL_S)
+                here = await _flange(controller)
+                moved_mm, turned_deg = distance(before, here)
+                if moved_mm < STILL_MM and turned_deg < STILL_DEG:
+                    return here
+                before = here
+    except TimeoutError:
+        raise DeviceTimeout(
+            DEVICE, "getTcpPose", f"the arm did not rest for {PATIENCE_S:g} s", remedy="Hold it still."
+        ) from None
 
 
-class ArmReader:
-    """One connection on which nothing but what is below is asked. Every method may raise `DeviceError`."""
-
-    def __init__(self, controller: Controller) -> None:
-        self._controller = controller
-
-    async def _ask(self, method: str) -> Any:
-        if self._controller.connection.lost:
-            await self._controller.connection.open()
-        return await self._controller.ask(method)
-
-    async def flange(self) -> Pose:
-        """Wait until the arm is held still, and return the pose of the flange in the base frame.
-
-        Raises `DeviceTimeout` if the arm keeps moving.
-        """
-        before = await self._flange_now()
-        try:
-            async with asyncio.timeout(PATIENCE_S):
-                while True:
-                    await asyncio.sleep(STILL_S)
-                    here = await self._flange_now()
-                    moved_mm, turned_deg = distance(before, here)
-                    if moved_mm < STILL_MM and turned_deg < STILL_DEG:
-                        return here
-                    before = here
-        except TimeoutError:
-            raise DeviceTimeout(
-                DEVICE, "getTcpPose", f"the arm did not rest for {PATIENCE_S:g} s", remedy="Hold it still."
-            ) from None
-
-    async def _flange_now(self) -> Pose:
-        """From the cabinet's tool pose, with its tool taken off again: whatever is set there does not matter."""
-        tool = numbers("getTcpOffset", await self._ask("RobotConfig.getTcpOffset"))
-        at = from_wire(numbers("getTcpPose", await self._ask("RobotState.getTcpPose")))
-        turn = Rotation.from_quat(at.quaternion) * Rotation.from_euler("ZYX", tool[5:2:-1]).inv()
-        x, y, z = np.array(at.position_mm) - turn.apply(1e3 * np.array(tool[:3]))
-        qx, qy, qz, qw = (float(v) for v in turn.as_quat())
-        return Pose(float(x), float(y), float(z), qx, qy, qz, qw)
-
-    async def cabinet(self) -> Cabinet:
-        """Everything that the cabinet reports about itself."""
-        call = self._controller.connection.call
-        software = f"interface {await call('SystemInfo.getInterfaceVersionCode')}"
-        with contextlib.suppress(RpcError):
-            software += f", {await call('SystemInfo.getControlSoftwareFullVersion')}"
-        model, box = await self._ask("RobotConfig.getRobotType"), await self._ask("RobotConfig.getControlBoxType")
-        tool = numbers("getTcpOffset", await self._ask("RobotConfig.getTcpOffset"))
-        level = await self._ask("RobotConfig.getCollisionLevel")
-        if type(level) is not int:
-            raise ProtocolViolation(DEVICE, "getCollisionLevel", f"expected a whole number, got {level!r}")
-        payload_kg, centre_mm = await self._controller.payload()
-        getters = ("RobotState.getRobotModeType", "RobotState.getSafetyModeType", "RobotManage.getOperationalMode")
-        robot_mode, safety_mode, switch = [str(await self._ask(getter)) for getter in getters]
-        return Cabinet(
-            f"{model} ({box}), {software}",
-            (robot_mode, safety_mode, switch),
-            (*(1e3 * v for v in tool[:3]), *map(math.degrees, tool[3:])),
-            payload_kg,
-            centre_mm,
-            level,
-        )
+async def _flange(controller: Controller) -> Pose:
+    """From the cabinet's tool pose, with its tool taken off again: whatever is set there does not matter."""
+    tool = from_wire(numbers("getTcpOffset", await controller.ask("RobotConfig.getTcpOffset")))
+    tip = await controller.pose()
+    turn = product(tip.quaternion, inverse(tool.quaternion))
+    x, y, z = (at - offset for at, offset in zip(tip.position_mm, turned(turn, tool.position_mm), strict=True))
+    return Pose(x, y, z, *turn)
 
 
 def tip_of(flange: Pose, offset_mm: Sequence[float]) -> tuple[float, float, float]:
     """Where the tip is while the flange is there, in the base frame."""
-    x, y, z = np.array(flange.position_mm) + Rotation.from_quat(flange.quaternion).apply(offset_mm)
-    return float(x), float(y), float(z)
+    x, y, z = (at + offset for at, offset in zip(flange.position_mm, turned(flange.quaternion, offset_mm), strict=True))
+    return x, y, z
 
 
-@contextlib.asynccontextmanager
-async def taught_arm(notebook: Notebook) -> AsyncGenerator[ArmReader]:
+def taught_arm(notebook: Notebook) -> AbstractAsyncContextManager[Controller]:
     """The arm that was taught, for reading only."""
-    host, port = str(notebook.get("robot.host")), int(notebook.number("robot.port"))
-    async with only_asking(host, port, notebook.framing) as controller:
-        yield ArmReader(controller)
+    return only_asking(str(notebook.get("robot.host")), int(notebook.number("robot.port")), notebook.framing)
 
 
-async def touch(visit: Visit, reader: ArmReader, thing: str, how: str, *, may_skip: bool = False) -> Pose | None:
+async def touch(visit: Visit, arm: Controller, thing: str, how: str, *, may_skip: bool = False) -> Pose | None:
     """Ask for the tip to be brought to a thing, and note the flange's pose there; None if the person skips it.
 
     A thing that was touched before is not asked for again.
@@ -158,26 +107,33 @@ async def touch(visit: Visit, reader: ArmReader, thing: str, how: str, *, may_sk
         return visit.notebook.touches[thing]
     if not await visit.brought(thing, how, may_skip=may_skip):
         return None
-    flange = await reader.flange()
+    flange = await flange_at_rest(arm)
     visit.save(visit.notebook.with_touch(thing, flange))
     x, y, z = flange.position_mm
     visit.say(f"{thing}: the flange is at ({x:.2f}, {y:.2f}, {z:.2f}) mm")
     return flange
 
 
-async def find_framing(host: str, port: int) -> tuple[Framing, Cabinet]:
-    """The framing that the controller answers, and what it reports. Raises the first framing's `DeviceError`."""
-    first: DeviceError | None = None
+async def find_framing(host: str, port: int) -> tuple[Framing, str]:
+    """The framing that the controller answers, and who it is. Raises the first framing's `DeviceError`."""
+    errors = list[DeviceError]()
     for framing in FRAMINGS:
         try:
             async with only_asking(host, port, framing) as controller:
-                return framing, await ArmReader(controller).cabinet()
-        except ConnectionLost:
-            raise
+                return framing, await _name(controller)
         except (DeviceTimeout, ProtocolViolation) as error:
-            first = first or error
-    assert first is not None
-    raise first
+            errors.append(error)
+    raise errors[0]
+
+
+async def _name(controller: Controller) -> str:
+    """Model, control box and software."""
+    call = controller.connection.call
+    software = f"interface {await call('SystemInfo.getInterfaceVersionCode')}"
+    with contextlib.suppress(RpcError):
+        software += f", {await call('SystemInfo.getControlSoftwareFullVersion')}"
+    model, box = [await controller.ask(f"RobotConfig.{getter}") for getter in ("getRobotType", "getControlBoxType")]
+    return f"{model} ({box}), {software}"
 
 
 class ArmStep(Step):
@@ -194,41 +150,40 @@ class ArmStep(Step):
         await visit.values(ADDRESS)
         host, port = address_of(str(visit.notebook.get(ADDRESS.field)))
         visit.working(f"asking {host}:{port} who it is")
-        framing, cabinet = await find_framing(host, port)
-        robot_mode, safety_mode, switch = cabinet.modes
-        tcp = [f"{v:.1f}" for v in cabinet.tcp_mm_deg]
+        framing, name = await find_framing(host, port)
+        async with only_asking(host, port, framing) as controller:
+            settings, state = await read_back(controller), await controller.state(1)
         visit.say(
-            f"{host}:{port} answers in the {framing} framing: {cabinet.who}",
-            f"robot mode {robot_mode}, safety {safety_mode}, mode switch {switch}",
-            f"tool set on the pendant: {', '.join(tcp[:3])} mm, turned by {', '.join(tcp[3:])} deg; "
-            f"payload {cabinet.payload_kg:g} kg; collision level {cabinet.collision_level}",
+            f"{host}:{port} answers in the {framing} framing: {name}",
+            f"robot mode {state.mode}, safety {state.safety}",
+            f"set on the pendant: {'; '.join(f'{setting} {value}' for setting, value in settings.words().items())}",
         )
-        tool_mm = math.hypot(*cabinet.tcp_mm_deg[:3])
+        tool_mm = math.hypot(*settings.tool.position_mm)
         if tool_mm and not SHORTEST_TOOL_MM <= tool_mm <= LONGEST_TOOL_MM:
             visit.say(
                 f"The pendant's tool is {tool_mm:.3g} mm long: perhaps metres were typed where millimetres are taken, "
                 "or millimetres where metres are. It is measured in the third step and replaced.",
                 tone="warning",
             )
-        if safety_mode not in MOVING_ALLOWED:
+        if state.safety not in MOVING_ALLOWED:
             visit.say(
-                f"The safety mode is {safety_mode}: the arm cannot be guided by hand until it is released.",
+                f"The safety mode is {state.safety}: the arm cannot be guided by hand until it is released.",
                 "Look at the pendant; this program clears nothing.",
                 tone="warning",
             )
-        as_set = "as set on the pendant"
+        as_set, (payload_kg, *cog_mm) = "as set on the pendant", settings.payload
         values = {
-            "robot.kind": Taught("aubo-arcs", f"{cabinet.who} answered"),
+            "robot.kind": Taught("aubo-arcs", f"{name} answered"),
             "robot.host": Taught(host, "typed, and answered"),
             "robot.port": Taught(port, "answered"),
             "robot.framing": Taught(framing, "the first that the controller answered"),
-            "robot.payload_kg": Taught(cabinet.payload_kg, as_set, "kg", known="not weighed"),
-            "robot.payload_cog_mm": Taught(cabinet.payload_cog_mm, as_set, "mm", known="not measured"),
+            "robot.payload_kg": Taught(payload_kg, as_set, "kg", known="not weighed"),
+            "robot.payload_cog_mm": Taught(cog_mm, as_set, "mm", known="not measured"),
         }
         if await answers(host, RTDE_PORT):
             values["robot.rtde_port"] = Taught(RTDE_PORT, "answered, and sends poses")
-        if cabinet.collision_level:
-            values["robot.collision_level"] = Taught(cabinet.collision_level, as_set)
+        if settings.collision_level:
+            values["robot.collision_level"] = Taught(int(settings.collision_level), as_set)
         visit.keep(values)
 
 

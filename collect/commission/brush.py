@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import math
-import statistics
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from brushloop.collect.commission.notebook import Notebook, Taught
@@ -14,7 +14,7 @@ from brushloop.collect.commission.sheet import inside_corners
 from brushloop.collect.commission.step import Asked, Step, Visit
 from brushloop.collect.errors import NotAccepted
 from brushloop.collect.operator import Choice
-from brushloop.collect.rig.check import Check, brush_shorter_than_tool, deepest_press
+from brushloop.collect.rig.check import brush_shorter_than_tool, deepest_press
 from brushloop.collect.rig.paper import PaperPlane
 from brushloop.drivers.devices import ForceSample
 from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL, ForceTable, SriM8123
@@ -26,47 +26,30 @@ DEEPEST_SHARE = 0.45
 """A bundle that is pressed deeper than this share of its length comes near to its ferrule."""
 PRIME_ML = 0.5
 NONE, STATION, PUMP = Choice("n", "nothing: by hand"), Choice("i", "an ink station"), Choice("p", "a Modbus pump")
-CALIPERS = "measured with calipers and typed"
-
-
-def _hair(notebook: Notebook, length_mm: float) -> Check:
-    x, y, z = notebook.numbers("robot.tcp_offset_mm")
-    return brush_shorter_than_tool((x, y, z), length_mm)
-
-
 BRUSH = (
-    Asked(
-        "brush.radius_mm",
-        "R: radius of the wet bundle at the ferrule, by calipers",
-        "mm",
-        0.5,
-        50.0,
-        CALIPERS,
-        sigma=0.1,
-    ),
+    Asked("brush.radius_mm", "R: radius of the wet bundle at the ferrule, by calipers", "mm", 0.5, 50.0, 0.1),
     Asked(
         "brush.length_mm",
         "L: length of the hair from the ferrule to the tip, by calipers",
         "mm",
         3.0,
         200.0,
-        CALIPERS,
-        sigma=0.5,
-        check=_hair,
+        0.5,
+        check=lambda book, length_mm: brush_shorter_than_tool(book.numbers("robot.tcp_offset_mm"), length_mm),
     ),
     Asked(
         "brush.max_depth_mm",
-        "Deepest press that this brush can take",
+        f"Deepest press that this brush can take; {DEEPEST_SHARE:.0%} of L is cautious",
         "mm",
         1.0,
         100.0,
-        f"agreed; {DEEPEST_SHARE:.0%} of L is cautious",
         default=lambda book: f"{int(DEEPEST_SHARE * book.number('brush.length_mm'))}",
         check=lambda book, depth_mm: deepest_press(depth_mm, book.number("brush.length_mm")),
     ),
     Asked("brush.name", "Name of the brush, for the record", default="brush"),
     Asked("aside.ink", "What keeps the ink well filled?", choices=(NONE, STATION, PUMP)),
 )
+NAME_OF_INK = Asked("ink.name", "Name of the ink, for the record", default="ink")
 
 
 def _line_named(line: str) -> str:
@@ -77,14 +60,7 @@ def _line_named(line: str) -> str:
 
 
 PORT = Asked("ink.device.port", "Its serial line, such as /dev/serial/by-id/usb-…", read=_line_named)
-DELIVERY = Asked(
-    "ink.device.ml_per_revolution",
-    "Delivery per revolution, by weighing ten of them",
-    "ml",
-    0.001,
-    10.0,
-    "weighed and typed",
-)
+DELIVERY = Asked("ink.device.ml_per_revolution", "Delivery per revolution, by weighing ten of them", "ml", 0.001, 10.0)
 
 
 class BrushStep(Step):
@@ -110,7 +86,7 @@ class BrushStep(Step):
                 device = ModbusPumpConfig(kind="modbus-pump", port=port, ml_per_revolution=ml)
             await self._primed(visit, device)
             visit.keep({"ink.device.kind": Taught(device.kind, "answered on its line")})
-        await visit.values(Asked("ink.name", "Name of the ink, for the record", default="ink"))
+        await visit.values(NAME_OF_INK)
 
     async def _primed(self, visit: Visit, config: InkTable) -> None:
         visit.working(f"asking {config.port} who it is")
@@ -151,9 +127,7 @@ BUS = Asked(
     "aside.bus", "CAN bus of the force sensor: can0, or HOST:PORT/can0 of a gateway; Enter: no sensor", read=_bus
 )
 REST_S = 1.0
-"""How long the sensor is listened to with nothing touching."""
-WAIT_S = 8.0
-"""How long a push is waited for after the person has said that it was done."""
+"""How long the sensor is listened to with nothing touching, before the push and after it."""
 LEAST_PUSH_N, MOST_PUSH_N = 0.3, 60.0
 """A finger pushes with more than the first and less than the second: otherwise the scale is wrong."""
 MOST_NOISE_N = 0.05
@@ -201,7 +175,7 @@ class ForceStep(Step):
             await sensor.bias(REST_S)
             sensor.listen(samples.append)
             await asyncio.sleep(REST_S)
-            noise_n = _noise(samples)
+            noise_n = float(np.std([sample.force_n for sample in samples], axis=0).max()) if samples else math.inf
             visit.say(f"{identity.model}: {sensor.stream.rate_hz():.0f} rounds/s, noise {noise_n:.4f} N")
             samples.clear()
             how = (
@@ -209,8 +183,8 @@ class ForceStep(Step):
                 "then take the finger away."
             )
             await visit.brought("push-sensor 0", how)
-            visit.working("waiting for the end of the push")
-            force_n = await self._push(samples)
+            await asyncio.sleep(REST_S)
+            force_n = strongest(samples)
         finally:
             sensor.listen(None)
             await sensor.close()
@@ -224,20 +198,10 @@ class ForceStep(Step):
         known = "direction within 35 deg, sign certain"
         visit.keep({"touch.force.push_axis": Taught(axis, how, known=known)})
 
-    async def _push(self, samples: list[ForceSample]) -> NDArray[np.float64]:
-        """Mean force of the strongest tenth of a second, once the push is over or has been waited for."""
-        for _ in range(int(WAIT_S / 0.1)):
-            pushed = strongest(samples)
-            if np.linalg.norm(pushed) > LEAST_PUSH_N and samples and math.hypot(*samples[-1].force_n) < LEAST_PUSH_N:
-                return pushed
-            await asyncio.sleep(0.1)
-        return strongest(samples)
-
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """How zero touch is done: by force, or by jogging, at four points."""
-        size_x_mm, size_y_mm = notebook.numbers("paper.size_mm")
         method, why = ("force", "a sensor was found") if notebook.get("aside.bus") else ("jog", "no sensor")
-        points = inside_corners((size_x_mm, size_y_mm), INSET_MM)
+        points = inside_corners(notebook.numbers("paper.size_mm"), INSET_MM)
         lean_deg = PaperPlane(*notebook.numbers("aside.plane")).slope_deg
         widest_deg = min(max(math.ceil(10.0 * (lean_deg + LEAN_ROOM_DEG)) / 10.0, 1.0), 3.0)
         leans = f"the sheet leans by {lean_deg:.2f} deg, and {LEAN_ROOM_DEG:g} deg more"
@@ -253,8 +217,7 @@ def strongest(samples: list[ForceSample], over: int = 20) -> NDArray[np.float64]
     forces = np.array([sample.force_n for sample in samples], np.float64).reshape(-1, 3)
     if len(forces) < over:
         return np.zeros(3)
-    sums = np.cumsum(np.vstack([np.zeros(3), forces]), axis=0)
-    means = (sums[over:] - sums[:-over]) / over
+    means = sliding_window_view(forces, over, axis=0).mean(axis=-1)
     return np.asarray(means[int(np.argmax(np.linalg.norm(means, axis=1)))], np.float64)
 
 
@@ -266,15 +229,10 @@ def judged_push(force_n: NDArray[np.float64], noise_n: float) -> list[float]:
             f"the sensor's noise is {noise_n:.3f} N, limit {MOST_NOISE_N:g} N.",
             "Let nothing touch the brush; check shielding and termination.",
         )
-    if size_n < LEAST_PUSH_N:
+    if not LEAST_PUSH_N <= size_n <= MOST_PUSH_N:
         raise NotAccepted(
-            f"no push was felt (at most {size_n:.3f} N).",
-            "Push harder and longer; check that this is the sensor's bus.",
-        )
-    if size_n > MOST_PUSH_N:
-        raise NotAccepted(
-            f"the push reads {size_n:.0f} N, more than a finger gives.",
-            "The sensor's scale or unit is wrong: see its sheet.",
+            f"the push reads {size_n:.3g} N; a finger gives {LEAST_PUSH_N:g} to {MOST_PUSH_N:g} N.",
+            "Push harder and longer; check that this is the sensor's bus, and its scale and unit by its sheet.",
         )
     if abs(float(force_n[2])) < STRAIGHT * size_n:
         listed = ", ".join(f"{v:+.2f}" for v in force_n.tolist())
@@ -283,8 +241,3 @@ def judged_push(force_n: NDArray[np.float64], noise_n: float) -> list[float]:
             "Push along the brush; the sensor's z must lie along the tool.",
         )
     return [0.0, 0.0, math.copysign(1.0, float(force_n[2]))]
-
-
-def _noise(samples: list[ForceSample]) -> float:
-    axes = list(zip(*(sample.force_n for sample in samples), strict=True))
-    return max((statistics.stdev(axis) for axis in axes if len(axis) > 1), default=0.0)

@@ -53,25 +53,34 @@ MIRRORED = (
 OTHER_PRINT = (
     "Count the squares of the print again, the outermost ones too, and measure one; then teach the camera again."
 )
-FROM_PRINT = "typed from the board's print"
+
+
+def _squares(line: str) -> list[float]:
+    """Both numbers of squares from `26x20`. Raises ValueError, worded for the person who typed it."""
+    across, _, along = line.lower().partition("x")
+    if not (across.strip().isdecimal() and along.strip().isdecimal()):
+        raise ValueError(f"{line!r} is not two numbers of squares like 26x20")
+    return [int(across), int(along)]
+
+
 PRINT = (
-    Asked("aside.squares_across", "Squares along its longer side, as printed", "squares", 3, 50, whole=True),
-    Asked("aside.squares_along", "Squares along its shorter side, as printed", "squares", 3, 50, whole=True),
     Asked(
-        "board.square_mm", "Side of a square (ten of them by calipers, divided by ten)", "mm", 2.0, 100.0, FROM_PRINT
+        "board.squares",
+        "Squares of the print of `brushloop camera board`, along its longer and its shorter side, as 26x20",
+        read=_squares,
     ),
+    Asked("board.square_mm", "Side of a square (ten of them by calipers, divided by ten)", "mm", 2.0, 100.0),
     Asked(
         "board.marker_mm",
         "Side of a marker",
         "mm",
         1.0,
         100.0,
-        FROM_PRINT,
         default=lambda book: f"{0.75 * book.number('board.square_mm'):g}",
     ),
-    Asked("board.dictionary", "Markers of the print", how=FROM_PRINT, default="DICT_5X5_1000"),
+    Asked("board.dictionary", "Markers of the print", default="DICT_5X5_1000"),
 )
-PRINTED = ("board.squares", "board.square_mm", "board.marker_mm", "board.dictionary", "aside.squares_")
+PRINTED = tuple(asked.field for asked in PRINT)
 
 
 class CameraStep(Step):
@@ -85,8 +94,12 @@ class CameraStep(Step):
 
     async def carry_out(self, visit: Visit) -> None:
         """Ask for source and print, measure the rest. Raises `NotAccepted`, `DeviceError`, `CalibrationError`."""
-        if "board.squares" not in visit.notebook.values:
-            await self._print(visit)
+        await visit.values(*PRINT)
+        with visit.asked_again_if_refused(*PRINTED):
+            try:
+                board_of(visit.notebook)
+            except ValueError as error:
+                raise NotAccepted(f"no such board: {error}".splitlines()[0] + ".", "Read the print again.") from None
         if "camera.source" not in visit.notebook.values:
             await self._source(visit)
         async with taught_camera(visit.notebook, visit.clock) as camera:
@@ -94,29 +107,23 @@ class CameraStep(Step):
             await _board_in(visit, await still(camera, visit.clock), "camera", lying=True)
             await self._lens(visit, camera)
 
-    async def _print(self, visit: Visit) -> None:
-        visit.say("The board: a print of `brushloop camera board`. Its name stands along its lower edge.")
-        await visit.values(*PRINT)
-        squares: list[float] = [int(visit.notebook.number(f"aside.squares_{side}")) for side in ("across", "along")]
-        values = {"board.squares": Taught(squares, FROM_PRINT)}
-        with visit.asked_again_if_refused(*PRINTED):
-            try:
-                board_of(visit.notebook.with_values(values))
-            except ValueError as error:
-                raise NotAccepted(f"no such board: {error}".splitlines()[0] + ".", "Read the print again.") from None
-        visit.keep(values)
-
     async def _source(self, visit: Visit) -> None:
         """Ask for a camera and show its picture, until the person says that it is the one over the sheet."""
         devices = sorted((p.name[5:] for p in Path("/dev").glob("video*") if p.name[5:].isdecimal()), key=int)
         number = f", or the number of a video device ({', '.join(devices)})" if devices else ""
         question = Prompt(f"Address of the camera's stream, as http://192.0.2.8/stream.mjpg{number}", read=str)
-        while True:
+        source = over_sheet = ""
+        while over_sheet != YES.key:
             source = str(await visit.ask(question))
-            board_seen = await self._looked_at(visit, source)
-            over_sheet = "Is this the picture of the camera over the sheet?"
-            if await visit.choose(over_sheet, (YES, NO), (YES if board_seen else NO).key) == YES.key:
-                break
+            visit.working(f"waiting for a picture of {source}")
+            async with opened(source, visit.clock) as camera:
+                picture = await still(camera, visit.clock)
+            view = await _board_in(visit, picture, source, lying=False)
+            corners, (height, width) = 0 if view is None else len(view.ids), picture.shape
+            visit.say(f"{source}: {width} x {height} px; {corners} corners of the board are seen", picture=picture)
+            over_sheet = await visit.choose(
+                "Is this the picture of the camera over the sheet?", (YES, NO), (YES if corners else NO).key
+            )
         # What a device chose by itself; the settings of a stream only its own set-up can change.
         locked = await asyncio.to_thread(found_settings, int(source), SETTLE_S) if source.isdecimal() else {}
         if not locked:
@@ -134,20 +141,6 @@ class CameraStep(Step):
         values["camera.kind"] = Taught("opencv", "the only kind")
         values["camera.source"] = Taught(source, "typed, and its picture was seen")
         visit.keep(values)
-
-    async def _looked_at(self, visit: Visit, source: str) -> bool:
-        """Show a picture of a camera; whether the board is in it. Raises `NotAccepted` for a mirror or no picture."""
-        visit.working(f"waiting for a picture of {source}")
-        try:
-            async with opened(source, visit.clock) as camera:
-                picture = await still(camera, visit.clock)
-        except DeviceError as error:
-            raise NotAccepted(f"{source}: {error.what}.", "Check power, cable and address; then try again.") from None
-        height, width = picture.shape
-        view = await _board_in(visit, picture, source, lying=False)
-        corners = 0 if view is None else len(view.ids)
-        visit.say(f"{source}: {width} x {height} px; {corners} corners of the board are seen", picture=picture)
-        return view is not None
 
     async def _lens(self, visit: Visit, camera: OpenCvCamera) -> None:
         """Fit the lens to photographs of the held board; nothing where the person skips the first ones."""

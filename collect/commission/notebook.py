@@ -26,7 +26,7 @@ from brushloop.collect.rig.config import RigConfig, with_optics
 from brushloop.collect.rig.config_file import Config, Finite, read_text, refusal
 from brushloop.drivers.arcs.wire import Framing
 from brushloop.drivers.devices import Pose
-from brushloop.sessions.disk import fsync_folder, sync
+from brushloop.sessions.disk import fsync_folder, set_aside, sync
 
 MAX_BYTES = 1024 * 1024
 ENDING, ASIDE = ".taught.json", "aside."
@@ -209,13 +209,8 @@ def write_rig(rig_path: Path, notebook: Notebook) -> Path | None:
     """Write `rig.toml`; returns where an older file with another text is kept. Raises `ConfigError`, OSError."""
     rig_of(notebook, rig_path)
     text = rig_text(notebook, rig_path)
-    old = rig_path.read_text(encoding="utf-8") if rig_path.exists() else text
-    kept = None
-    if old != text:
-        names = (f"{rig_path.name}.bak{number}" for number in ("", *(f"-{n}" for n in range(2, 10_000))))
-        kept = next(path for name in names if not (path := rig_path.with_name(name)).exists())
-        with kept.open("x", encoding="utf-8") as file:
-            file.write(old)
+    changed = rig_path.exists() and rig_path.read_text(encoding="utf-8") != text
+    kept = set_aside(rig_path, "bak") if changed else None
     write_whole(rig_path, text)
     return kept
 

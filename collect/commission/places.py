@@ -9,17 +9,18 @@ from collections.abc import Sequence
 import numpy as np
 
 from brushloop.calibrate.files import read_gray
-from brushloop.collect.commission.arm import ArmReader, taught_arm, tip_of, touch
+from brushloop.collect.commission.arm import taught_arm, tip_of, touch
 from brushloop.collect.commission.camera import shown_live, still, taught_camera
 from brushloop.collect.commission.notebook import Notebook, Taught, Value, rig_of
 from brushloop.collect.commission.sheet import Point, corners_of
-from brushloop.collect.commission.step import Asked, Step, Visit
+from brushloop.collect.commission.step import NO, YES, Asked, Step, Visit
 from brushloop.collect.errors import ConfigError, NotAccepted
 from brushloop.collect.photograph.frames import ARM_SHARE, Thumbnail, changed_share, thumbnail
 from brushloop.collect.rig.check import draw_rig
 from brushloop.collect.rig.config import TRAVEL_CLEARANCE_MM, PaperConfig, RigConfig
 from brushloop.collect.rig.paper import PaperPlane, to_base, to_paper
 from brushloop.collect.walk import ask_reach
+from brushloop.drivers.arcs.controller import Controller
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose
 
@@ -41,6 +42,12 @@ AWAY = {
 }
 PARKED = "aside.parked"
 INK = ("well-rim", "well", "wash-rim", "wash-pot")
+WIPE = Asked(
+    "aside.wipe",
+    "Shall each dip end with a wipe across the rim of the well, which takes the drop off?",
+    choices=(YES, NO),
+)
+WASH = Asked("aside.wash", "Is there a pot of water to wash the brush in?", choices=(YES, NO))
 MARGIN_MM = 25.0
 """Room beside what was taught: a brush lifted along a tool axis that leans by 15 deg moves aside by as much."""
 BELOW_MM = 2.0
@@ -65,51 +72,33 @@ class PlacesStep(Step):
     title = "Well, wash and park"
     minutes = 5
     needs = ("camera", "tip", "sheet")
-    observes = (*INK, *AWAY, "aside.wipe", "ink.wipe.", "aside.wash", "ink.wash.", PARKED)
+    observes = (*INK, *AWAY, WIPE.field, "ink.wipe.", WASH.field, "ink.wash.", PARKED)
 
     async def carry_out(self, visit: Visit) -> None:
         """Have the tip brought to each place; look whether the parked arm is out of the picture."""
-        async with taught_arm(visit.notebook) as reader:
-            await touch(visit, reader, "well-rim 0", "Bring the tip to the rim of the ink well.")
+        async with taught_arm(visit.notebook) as arm:
+            await touch(visit, arm, "well-rim 0", "Bring the tip to the rim of the ink well.")
             how = "Bring the tip into the middle of the well, as deep as a dip should go: a few mm above its bottom."
-            await touch(visit, reader, "well 0", how)
+            await touch(visit, arm, "well 0", how)
             with visit.asked_again_if_refused("well-rim", "well"):
                 visit.say(check_pot(visit.notebook, "well-rim 0", "well 0", "well"))
-            await self._wipe(visit, reader)
-            await self._wash(visit, reader)
+            await visit.values(WIPE)
+            if visit.notebook.get(WIPE.field) == YES.key:
+                how = "Bring the tip to the rim on the side where the drop shall be wiped off, away from the sheet."
+                await touch(visit, arm, "well-rim 1", how)
+                with visit.asked_again_if_refused("well-rim 1"):
+                    check_wipe(visit.notebook)
+            await visit.values(WASH)
+            if visit.notebook.get(WASH.field) == YES.key:
+                await touch(visit, arm, "wash-rim 0", "Bring the tip to the rim of the pot of water.")
+                how = "Bring the tip into the middle of the pot of water, as deep as a wash should go."
+                await touch(visit, arm, "wash-pot 0", how)
+                with visit.asked_again_if_refused("wash-rim", "wash-pot"):
+                    check_pot(visit.notebook, "wash-rim 0", "wash-pot 0", "pot of water")
             if PARKED not in visit.notebook.values:
-                await self._park(visit, reader)
+                await self._park(visit, arm)
 
-    async def _wipe(self, visit: Visit, reader: ArmReader) -> None:
-        """Have the side of the rim touched at which a drop is wiped off, if there is to be a wipe."""
-        if "aside.wipe" in visit.notebook.values:
-            return
-        wipe = "well-rim 1" in visit.notebook.touches or await visit.yes(
-            "Shall each dip end with a wipe across the rim of the well, which takes the drop off?"
-        )
-        if wipe:
-            how = "Bring the tip to the rim on the side where the drop shall be wiped off: the one away from the sheet."
-            wipe = await touch(visit, reader, "well-rim 1", how, may_skip=True) is not None
-        if wipe:
-            with visit.asked_again_if_refused("well-rim 1"):
-                check_wipe(visit.notebook)
-        visit.keep({"aside.wipe": Taught(wipe, "answered")})
-
-    async def _wash(self, visit: Visit, reader: ArmReader) -> None:
-        """Have rim and middle of a pot of water touched, if there is one."""
-        if "aside.wash" in visit.notebook.values:
-            return
-        question = "Is there a pot of water to wash the brush in?"
-        wash = "wash-rim 0" in visit.notebook.touches or await visit.yes(question)
-        if wash:
-            await touch(visit, reader, "wash-rim 0", "Bring the tip to the rim of the pot of water.")
-            how = "Bring the tip into the middle of the pot of water, as deep as a wash should go."
-            await touch(visit, reader, "wash-pot 0", how)
-            with visit.asked_again_if_refused("wash-rim", "wash-pot"):
-                check_pot(visit.notebook, "wash-rim 0", "wash-pot 0", "pot of water")
-        visit.keep({"aside.wash": Taught(wash, "answered")})
-
-    async def _park(self, visit: Visit, reader: ArmReader) -> None:
+    async def _park(self, visit: Visit, arm: Controller) -> None:
         """Have the arm brought out of the picture, to two places.
 
         Raises `NotAccepted` unless the pictures from there show the same.
@@ -120,7 +109,7 @@ class PlacesStep(Step):
         async with taught_camera(visit.notebook, visit.clock) as camera:
             for kind, how in AWAY.items():
                 async with shown_live(visit, camera):
-                    await touch(visit, reader, f"{kind} 0", how)
+                    await touch(visit, arm, f"{kind} 0", how)
                 visit.working("waiting for a picture without the arm")
                 pictures.append(thumbnail(await still(camera, visit.clock)))
         places = tips(visit.notebook)
@@ -146,7 +135,8 @@ class PlacesStep(Step):
         paper, places = paper_of(notebook), tips(notebook)
         x, y, dip_z_mm = places["well 0"]
         highest_rim_mm = max(z for name, (_, _, z) in places.items() if name.split(" ")[0] in ("well-rim", "wash-rim"))
-        safe_mm = max(max(sheet_heights(notebook)) + TRAVEL_MM, highest_rim_mm + RIM_CLEAR_MM)
+        highest_mm = max(z for _, _, z in sheet_corners(notebook))
+        safe_mm = max(highest_mm + TRAVEL_MM, highest_rim_mm + RIM_CLEAR_MM)
         park_x, park_y, park_z = places["park 0"]
         by_hand = "the tip was brought there by hand"
 
@@ -181,20 +171,13 @@ def tips(notebook: Notebook) -> dict[str, Point]:
 
 def paper_of(notebook: Notebook) -> PaperConfig:
     """The sheet as it was taught."""
-    names = ("origin_mm", "yaw_deg", "touch_z_mm", "size_mm", "touch_point_mm")
-    return PaperConfig.model_validate({"name": "sheet"} | {name: notebook.get(f"paper.{name}") for name in names})
-
-
-def sheet_heights(notebook: Notebook) -> list[float]:
-    """Touch height at the four corners of the sheet, in the base frame."""
-    plane, (size_x_mm, size_y_mm) = PaperPlane(*notebook.numbers("aside.plane")), notebook.numbers("paper.size_mm")
-    return [plane.touch_z_mm(x, y) for x, y in corners_of(size_x_mm, size_y_mm).tolist()]
+    return PaperConfig.model_validate(notebook.table("paper."))
 
 
 def sheet_corners(notebook: Notebook) -> list[Point]:
-    """The corners of the sheet in the base frame."""
-    paper, heights = paper_of(notebook), sheet_heights(notebook)
-    return [(*to_base(paper, x, y), z) for (x, y), z in zip(corners_of(*paper.size_mm).tolist(), heights, strict=True)]
+    """The corners of the sheet in the base frame, at touch height."""
+    paper, plane = paper_of(notebook), PaperPlane(*notebook.numbers("aside.plane"))
+    return [(*to_base(paper, x, y), plane.touch_z_mm(x, y)) for x, y in corners_of(*paper.size_mm).tolist()]
 
 
 def check_pot(notebook: Notebook, rim: str, middle: str, what: str, way_out: str = "") -> str:
@@ -242,8 +225,10 @@ class LimitsStep(Step):
     observes = (AGREED, *(asked.field for asked in SPEEDS))
 
     async def carry_out(self, visit: Visit) -> None:
-        """Show the box, have each limit confirmed, and ask the controller whether the arm reaches every corner."""
-        rig = rig_of(visit.notebook.with_values(self.derived(visit.notebook)), visit.rig_path)
+        """Have each limit and the box confirmed, and ask the controller whether the arm reaches every corner."""
+        await visit.values(*SPEEDS)
+        box = _box(visit.notebook)
+        rig = rig_of(visit.notebook.with_values(box), visit.rig_path)
         picture = visit.rig_path.with_name(f"{visit.rig_path.stem}.limits.png")
         visit.working("drawing box and places")
         await asyncio.to_thread(draw_rig, rig, picture)
@@ -251,18 +236,14 @@ class LimitsStep(Step):
             f"{picture} shows box, sheet, board, well and park from above.",
             picture=await asyncio.to_thread(read_gray, picture),
         )
-        box = "; ".join(
-            f"{field} {value.value} {value.unit}: {value.how}" for field, value in _box(visit.notebook).items()
-        )
-        if visit.notebook.get(AGREED) != box:
-            if not await visit.yes(f"The box of the tip in the base frame. {box}. Agreed?"):
+        text = "; ".join(f"{field} {value.value} {value.unit}: {value.how}" for field, value in box.items())
+        if visit.notebook.get(AGREED) != text:
+            if not await visit.yes(f"The box of the tip in the base frame. {text}. Agreed?"):
                 raise NotAccepted(
                     "the box was not agreed.",
                     "Teach the place again that makes the box too large: `brushloop rig teach`.",
                 )
-            visit.keep({AGREED: Taught(box, "agreed")})
-        await visit.values(*SPEEDS)
-        rig = rig_of(visit.notebook.with_values(self.derived(visit.notebook)), visit.rig_path)
+            visit.keep({AGREED: Taught(text, "agreed")})
         try:
             count = await ask_reach(visit.rig_path, rig, _to_reach(rig, visit.notebook))
         except ConfigError as error:
@@ -273,47 +254,33 @@ class LimitsStep(Step):
         visit.say(f"The controller finds joints for all {count} corners of the space above sheet and well.")
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
-        """The box around what was taught, and the defaults that were not taught otherwise."""
-        cautious = {
-            asked.field: Taught(float(str(asked.default)), "cautious default", asked.unit)
-            for asked in SPEEDS
-            if asked.field not in notebook.values
-        }
-        return _box(notebook) | cautious
+        """The box around what was taught."""
+        return _box(notebook)
 
 
 def _box(notebook: Notebook) -> dict[str, Taught]:
-    """The smallest box around everything that was taught."""
+    """The smallest box around everything that the tip must reach, in the base frame."""
+    places, corners = tips(notebook), sheet_corners(notebook)
+    x, y, lowest_mm = min(corners, key=lambda corner: corner[2])
+    heights_mm = (
+        notebook.number("motion.safe_z_mm"),
+        lowest_mm - notebook.number("brush.max_depth_mm") - BELOW_MM,
+        notebook.number("ink.dip_z_mm") - BELOW_MM,
+    )
+    park_x, park_y, park_z = notebook.numbers("motion.park_mm")
+    reached = [point for name, point in places.items() if name.split(" ")[0] in INK]
+    points = [*reached, (park_x, park_y, park_z), *corners, *((x, y, z) for z in heights_mm)]
     beside = f"the smallest around sheet, well, wipe, pot and park position, and {MARGIN_MM:g} mm beside and above"
     floor = f"{BELOW_MM:g} mm below the deepest press and the dip; {MARGIN_MM:g} mm above travel and park"
-    ranges = zip(BOX, hull(_within(notebook), MARGIN_MM), (beside, beside, floor), strict=True)
-    return {field: Taught(list(range_mm), how, "mm") for field, range_mm, how in ranges}
+    ranges = zip(BOX, hull(points, MARGIN_MM), (beside, beside, floor), strict=True)
+    return {field: Taught(range_mm, how, "mm") for field, range_mm, how in ranges}
 
 
-def hull(
-    points: Sequence[Point], margin_mm: float
-) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float]]:
+def hull(points: Sequence[Point], margin_mm: float) -> list[list[float]]:
     """Ranges of x, y and z around these points, widened by the margin in x and y, and upward in z; rounded outward."""
-    low, high = np.min(points, axis=0), np.max(points, axis=0)
-    return (
-        (math.floor(low[0] - margin_mm), math.ceil(high[0] + margin_mm)),
-        (math.floor(low[1] - margin_mm), math.ceil(high[1] + margin_mm)),
-        (math.floor(10.0 * low[2]) / 10.0, math.ceil(high[2] + margin_mm)),
-    )
-
-
-def _within(notebook: Notebook) -> list[Point]:
-    """Everything that the tip must reach, in the base frame."""
-    places, safe_mm = tips(notebook), notebook.number("motion.safe_z_mm")
-    reached = [
-        point for name, point in places.items() if name.split(" ")[0] in ("well-rim", "well", "wash-pot", "wash-rim")
-    ]
-    park_x, park_y, park_z = notebook.numbers("motion.park_mm")
-    corners = sheet_corners(notebook)
-    deepest_mm = min(sheet_heights(notebook)) - notebook.number("brush.max_depth_mm") - BELOW_MM
-    x, y, _ = corners[0]
-    dip_mm = notebook.number("ink.dip_z_mm") - BELOW_MM
-    return [*reached, (park_x, park_y, park_z), *corners, (x, y, deepest_mm), (x, y, dip_mm), (x, y, safe_mm)]
+    low, high = np.min(points, axis=0), np.ceil(np.max(points, axis=0) + margin_mm)
+    floors = [*np.floor(low[:2] - margin_mm), math.floor(10.0 * low[2]) / 10.0]
+    return [[float(least), float(most)] for least, most in zip(floors, high, strict=True)]
 
 
 def _to_reach(rig: RigConfig, notebook: Notebook) -> list[tuple[Pose, float, str]]:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import itertools
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -51,13 +49,14 @@ class ProofStep(Step):
         depth_mm = min(PRESS_SHARE * rig.brush.max_depth_mm, DEEPEST_DRY_MM)
         protocol = f'kind = "grid"\ndepths_mm = [{depth_mm:g}]\ntilts_deg = [0.0]\nrepeats = {PRESSES}\n'
         await visit.may_move(f"Dry run, {ABOVE_MM:g} mm above the sheet")
-        with tempfile.TemporaryDirectory(prefix="brushloop-proof-") as folder:
-            await self._run(visit, Path(folder), protocol, dry=True)
+        with tempfile.TemporaryDirectory(prefix="brushloop-proof-") as dry_folder:
+            await self._run(visit, Path(dry_folder), protocol, dry=True)
         visit.say("The dry run made every move of a press without touching anything.")
         await visit.may_move(
             f"Touch the sheet, press three marks and {PRESSES} strokes: the well must hold ink, the sheet be blank"
         )
-        session = await self._run(visit, folder_beside(visit.rig_path), protocol, dry=False)
+        folder = tempfile.mkdtemp(prefix=f"{visit.rig_path.stem}.proof-", dir=visit.rig_path.parent)
+        session = await self._run(visit, Path(folder), protocol, dry=False)
         visit.say(f"Recorded in {session}.")
         await self._keep(visit, *read_proof(session))
 
@@ -174,17 +173,4 @@ def read_proof(session: Path) -> tuple[ZeroTouchResult, SelfCheckResult, list[Ca
             f"({', '.join(why) or 'the others were not made'}).",
             "Look at their pictures above: ink, light, sheet; then run the proof again.",
         )
-    touches, checks = state.results(ZeroTouchResult), state.results(SelfCheckResult)
-    if not touches or not checks:
-        raise NotAccepted("the run had no touch or no self-check.", "Report this as a defect.")
-    return touches[-1], checks[-1], captures
-
-
-def folder_beside(rig_path: Path) -> Path:
-    """A new folder for the recording of a proof: `rig.proof-1`, `rig.proof-2` and so on beside `rig.toml`."""
-    for number in itertools.count(1):
-        folder = rig_path.with_name(f"{rig_path.stem}.proof-{number}")
-        with contextlib.suppress(FileExistsError):
-            folder.mkdir()
-            return folder
-    raise AssertionError("unreachable")
+    return state.results(ZeroTouchResult)[-1], state.results(SelfCheckResult)[-1], captures

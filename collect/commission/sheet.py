@@ -1,7 +1,6 @@
 """Step 4: the sheet and the board under it, by their touched corners; and which corners were mistaken.
 
-A sheet that was named turned by half a turn together with its board looks right here; the three marks of the proof's
-self-check show it.
+A sheet that was named turned by half a turn together with its board looks right here; the proof's self-check shows it.
 """
 
 from __future__ import annotations
@@ -43,8 +42,6 @@ GOOD_MM = 0.13
 """Standard error of the sheet's origin, in each axis, at which touching ends."""
 MOST_ROUNDS = 5
 WORST_MM = 0.25
-EASY_M = (0.25, 0.7)
-"""Distances from the foot of the arm at which it holds a brush upright without being folded up or stretched out."""
 INSET_MM = 2.0
 """Distance of the touch point from the sheet's edges: beside every patch."""
 
@@ -65,28 +62,29 @@ class SheetStep(Step):
             "along the squares.",
             "Touch each corner with the brush upright (hold a set square beside it), and hold still.",
         )
-        async with taught_arm(visit.notebook) as reader:
+        async with taught_arm(visit.notebook) as arm:
+            sigma_mm = math.inf
             for number in range(MOST_ROUNDS):
                 for kind, thing in THINGS:
-                    if number and kind == BOARD and number % 2:
+                    if kind == BOARD and number % 2:
                         continue  # the sheet's own corners give its origin, and need more touches
                     for corner in CORNERS:
                         how = f"Bring the tip to the {corner} corner of {thing}" + (" once more." if number else ".")
-                        await touch(visit, reader, f"{kind} {number} {corner}", how, may_skip=True)
+                        await touch(visit, arm, f"{kind} {number} {corner}", how, may_skip=True)
                     if kind == BOARD:
                         with visit.asked_again_if_refused(BOARD):
                             check_board(all_corners(visit.notebook, BOARD), board_of(visit.notebook))
                 with visit.asked_again_if_refused(SHEET):
                     fit = fitted(visit.notebook)
                 visit.say(*in_words(fit))
-                if fit.origin_sigma_mm <= GOOD_MM:
-                    break
-            with visit.asked_again_if_refused(BOARD, SHEET):
-                if (sigma_mm := fitted(visit.notebook).origin_sigma_mm) > WORST_MM:
-                    raise NotAccepted(
-                        f"the corner of the sheet is known to {sigma_mm:.2f} mm only.",
-                        "Fix the sheet, hold still while you press Enter, and touch the corners again.",
-                    )
+                if (sigma_mm := fit.origin_sigma_mm) <= GOOD_MM:
+                    return
+            if sigma_mm > WORST_MM:
+                visit.forget(BOARD, SHEET)
+                raise NotAccepted(
+                    f"the corner of the sheet is known to {sigma_mm:.2f} mm only.",
+                    "Fix the sheet, hold still while you press Enter, and touch the corners again.",
+                )
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """Everything that follows from the touched corners and the tip."""
@@ -120,14 +118,12 @@ def all_corners(notebook: Notebook, kind: str) -> dict[str, list[Point]]:
     offset_mm, corners = notebook.numbers("robot.tcp_offset_mm"), defaultdict[str, list[Point]](list)
     for name, flange in notebook.touched(kind).items():
         corners[name.split(" ", 1)[1]].append(tip_of(flange, offset_mm))
-    thing = kind.removesuffix("-corner")
-    if missing := [f"{thing} {name}" for name in CORNERS if name not in corners]:
-        nearest_m, farthest_m = EASY_M
+    if missing := [f"{kind.removesuffix('-corner')} {name}" for name in CORNERS if name not in corners]:
         raise NotAccepted(
             f"not touched: {', '.join(missing)}.",
             "All four corners of both are needed. What the arm does not reach by hand is out of its reach: move the "
-            f"board with the sheet, so that all corners are {nearest_m:g} to {farthest_m:g} m from the arm's foot, or "
-            "turn its wrist the other way round, and touch all corners again.",
+            "board with the sheet, so that all corners are 0.25 to 0.7 m from the arm's foot, or turn its wrist the "
+            "other way round, and touch all corners again.",
         )
     return dict(corners)
 
@@ -179,7 +175,7 @@ def corners_of(size_x_mm: float, size_y_mm: float) -> Floats:
     return np.array([[0.0, 0.0], [size_x_mm, 0.0], [size_x_mm, size_y_mm], [0.0, size_y_mm]])
 
 
-def inside_corners(size_mm: tuple[float, float], by_mm: float) -> Floats:
+def inside_corners(size_mm: Sequence[float], by_mm: float) -> Floats:
     """(4, 2) points inside the corners of a sheet, this far from its edges, in the order of `CORNERS`."""
     middle = np.array(size_mm) / 2.0
     return middle + (corners_of(*size_mm) - middle) * (1.0 - by_mm / middle)
@@ -190,18 +186,26 @@ def check_board(board: Mapping[str, Sequence[Point]], spec: BoardSpec) -> None:
 
     Names swapped or given as in a mirror, a print of another size, or one corner that was touched badly.
     """
-    printed = corners_of(*size_mm(spec))
+    printed, (size_x_mm, size_y_mm) = corners_of(*size_mm(spec)), size_mm(spec)
     touched = np.array([np.mean(board[name], axis=0)[:2] for name in CORNERS])
-    if problem := _mixed_up(touched, printed):
-        raise NotAccepted(
-            f"the corners of the board {problem}.",
-            "The name on the print is along its lower edge; seen from above, the corners follow counter-clockwise.",
-        )
-    _, scale = _turn_and_scale(printed, touched)
-    distances = _distances(printed * scale, touched)
-    if max(distances) > WORST_CORNER_MM:
-        listed = ", ".join(f"{name} {off:.1f}" for name, off in zip(CORNERS, distances, strict=True))
-        size_x_mm, size_y_mm = size_mm(spec)
+    _, scale, off_mm = _similarity(printed, touched)
+    if off_mm.max() > WORST_CORNER_MM:
+        # Either pair of opposite corners gives the same shape.
+        renamed = {
+            "as in a mirror": touched * [1.0, -1.0],
+            "if two opposite corners are swapped": touched[[2, 1, 0, 3]],
+        }
+        for a, b in itertools.pairwise([0, 1, 2, 3, 0]):
+            swapped = touched.copy()
+            swapped[[a, b]] = touched[[b, a]]
+            renamed[f"if {CORNERS[a]} and {CORNERS[b]} are swapped"] = swapped
+        left_mm, how = min((float(_similarity(printed, points)[2].max()), how) for how, points in renamed.items())
+        if left_mm <= max(LEAST_MM, EXPLAINED * off_mm.max()):
+            raise NotAccepted(
+                f"the corners of the board fit only {how} (off by {off_mm.max():.1f} mm otherwise).",
+                "The name on the print is along its lower edge; seen from above, the corners follow counter-clockwise.",
+            )
+        listed = ", ".join(f"{name} {off:.1f}" for name, off in zip(CORNERS, off_mm, strict=True))
         raise NotAccepted(
             f"the corners of the board do not form its rectangle of {size_x_mm:g} x {size_y_mm:g} mm (off by, in mm: "
             f"{listed}).",
@@ -216,28 +220,6 @@ def check_board(board: Mapping[str, Sequence[Point]], spec: BoardSpec) -> None:
         )
 
 
-def _mixed_up(touched: Floats, printed: Floats) -> str:
-    """Why the corners do not fit: a mirror, or two names that were exchanged; empty if nothing explains it."""
-    as_named = max(_distances(printed, touched))
-    if as_named <= WORST_CORNER_MM:
-        return ""
-    enough_mm = max(LEAST_MM, EXPLAINED * as_named)
-    if max(_distances(printed, touched * [1.0, -1.0])) <= enough_mm:
-        return (
-            f"fit only as in a mirror (off by {as_named:.1f} mm otherwise): were they named from the other side, or is "
-            "the photograph mirrored?"
-        )
-    exchanges = list[tuple[float, str]]()
-    for a, b in itertools.combinations(range(len(CORNERS)), 2):
-        exchanged = touched.copy()
-        exchanged[[a, b]] = touched[[b, a]]
-        exchanges.append((max(_distances(printed, exchanged)), f"{CORNERS[a]} and {CORNERS[b]}"))
-    off_mm, pair = min(exchanges)
-    if off_mm > enough_mm:
-        return ""
-    return f"fit only if {pair} are swapped (off by {as_named:.1f} mm otherwise): one was touched in the other's place"
-
-
 def fit_sheet(board: Mapping[str, Sequence[Point]], sheet: Mapping[str, Sequence[Point]], spec: BoardSpec) -> SheetFit:
     """Least squares over all touches of four board corners and four sheet corners, by name; base frame, in mm.
 
@@ -245,32 +227,28 @@ def fit_sheet(board: Mapping[str, Sequence[Point]], sheet: Mapping[str, Sequence
     that lies askew on its board or whose corners were named otherwise, and `StepError` where it leans too much.
     """
     printed = corners_of(*size_mm(spec))
-    on_board = [(CORNERS.index(name), point) for name, points in board.items() for point in points]
-    on_sheet = [(CORNERS.index(name), point) for name, points in sheet.items() for point in points]
-    b, bk = np.array([p[:2] for _, p in on_board]), [k for k, _ in on_board]
-    s, sk = np.array([p[:2] for _, p in on_sheet]), [k for k, _ in on_sheet]
-    _check_askew(b, bk, s, sk, printed)
+    (bk, b), (sk, s) = _stacked(board), _stacked(sheet)
+    yaw0, scale, _ = _similarity(printed[bk], b[:, :2])
+    straight = [s[sk == k, :2].mean(axis=0) @ _rotation(yaw0) for k in range(len(CORNERS))]
+    size0 = _size_along_board(straight)
 
     def off(values: Floats) -> Floats:
-        yaw, bx, by, sx, sy, width, height = values
+        yaw, board_mm, sheet_mm, (width, height) = values[0], values[1:3], values[3:5], values[5:]
         turn = _rotation(yaw)
-        board_at, sheet_at = printed[bk] @ turn.T + [bx, by], corners_of(width, height)[sk] @ turn.T + [sx, sy]
-        return np.concatenate([(b - board_at).ravel(), (s - sheet_at).ravel()])
+        board_at, sheet_at = printed[bk] @ turn.T + board_mm, corners_of(width, height)[sk] @ turn.T + sheet_mm
+        return np.concatenate([(b[:, :2] - board_at).ravel(), (s[:, :2] - sheet_at).ravel()])
 
-    yaw0, scale = _turn_and_scale(printed[bk], b)
-    local = s @ _rotation(yaw0)
-    low, high = local.min(axis=0), local.max(axis=0)
-    board0 = b.mean(axis=0) - _rotation(yaw0) @ printed[bk].mean(axis=0)
-    solved = least_squares(off, np.array([yaw0, *board0, *(_rotation(yaw0) @ low), *(high - low)]))
+    board0 = b[:, :2].mean(axis=0) - _rotation(yaw0) @ printed[bk].mean(axis=0)
+    solved = least_squares(off, np.array([yaw0, *board0, *(_rotation(yaw0) @ straight[0]), *size0]))
     yaw, bx, by, sx, sy, width, height = (float(v) for v in solved.x)
     residuals = np.asarray(solved.fun, np.float64).reshape(-1, 2)
     noise_mm = max(math.sqrt(float((residuals**2).sum()) / max(residuals.size - 7, 1)), HAND_MM)
     slopes = np.asarray(solved.jac, np.float64)
     sigmas = noise_mm * np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))
-    turn, origin = _rotation(yaw), np.array([sx, sy])
-    board_x, board_y = (float(v) for v in (np.array([bx, by]) - origin) @ turn)
-    points = [p for _, p in (*on_board, *on_sheet)]
-    plane = fit_plane([(*((np.array(p[:2]) - origin) @ turn).tolist(), p[2]) for p in points])
+    points, origin = np.vstack([b, s]), np.array([sx, sy])
+    points[:, :2] = (points[:, :2] - origin) @ _rotation(yaw)
+    plane = fit_plane([(float(x), float(y), float(z)) for x, y, z in points])
+    board_x, board_y = (float(v) for v in (np.array([bx, by]) - origin) @ _rotation(yaw))
     names = [f"board {CORNERS[k]}" for k in bk] + [f"sheet {CORNERS[k]}" for k in sk]
     lengths = [float(v) for v in np.linalg.norm(residuals, axis=1)]
     above_mm = max(math.sqrt(sum(r * r for r in plane.residuals_mm) / max(len(points) - 3, 1)), HAND_MM)
@@ -288,22 +266,31 @@ def fit_sheet(board: Mapping[str, Sequence[Point]], sheet: Mapping[str, Sequence
     )
 
 
-def _check_askew(b: Floats, bk: list[int], s: Floats, sk: list[int], printed: Floats) -> None:
-    mean = [s[[k for k, number in enumerate(sk) if number == corner]].mean(axis=0) for corner in range(4)]
-    along = (mean[1] - mean[0]) + (mean[2] - mean[3])
-    up = (mean[3] - mean[0]) + (mean[2] - mean[1])
+def _stacked(touched: Mapping[str, Sequence[Point]]) -> tuple[NDArray[np.int64], Floats]:
+    """(n,) numbers of the corners that were touched, and the (n, 3) touches."""
+    pairs = [(CORNERS.index(name), point) for name, points in touched.items() for point in points]
+    return np.array([number for number, _ in pairs]), np.array([point for _, point in pairs])
+
+
+def _size_along_board(corners: Sequence[Floats]) -> tuple[float, float]:
+    """Width and height of a sheet by its corners in the board's directions. Raises `NotAccepted` if it lies askew."""
+    lower_left, lower_right, upper_right, upper_left = corners
+    along, up = (
+        0.5 * (lower_right - lower_left + upper_right - upper_left),
+        0.5 * (upper_left - lower_left + upper_right - lower_right),
+    )
     if along[0] * up[1] - along[1] * up[0] <= 0.0:
         raise NotAccepted(
             "the corners of the sheet were named as in a mirror.", "Seen from above they follow counter-clockwise."
         )
-    own = math.atan2(along[1] - up[0], along[0] + up[1])
-    askew = math.degrees(math.remainder(own - _turn_and_scale(printed[bk], b)[0], math.tau))
-    if abs(askew) > ASKEW_DEG:
+    askew_deg = math.degrees(math.atan2(along[1] - up[0], along[0] + up[1]))
+    if abs(askew_deg) > ASKEW_DEG:
         raise NotAccepted(
-            f"the sheet lies turned by {askew:+.1f} deg on its board.",
+            f"the sheet lies turned by {askew_deg:+.1f} deg on its board.",
             "Lay its edges along the squares, and touch again; the lower left corner of both is the one beside the "
             "print's name.",
         )
+    return float(np.linalg.norm(along)), float(np.linalg.norm(up))
 
 
 def _rotation(angle: float) -> Floats:
@@ -311,15 +298,9 @@ def _rotation(angle: float) -> Floats:
     return np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
 
 
-def _turn_and_scale(printed: Floats, touched: Floats) -> tuple[float, float]:
-    """Angle in rad of the rigid fit, and touched over printed size."""
+def _similarity(printed: Floats, touched: Floats) -> tuple[float, float, Floats]:
+    """Angle in rad and scale of the best turn and scale of (n, 2) points onto others; (n,) distances that are left."""
     a, b = printed - printed.mean(axis=0), touched - touched.mean(axis=0)
     dot, cross = float((a * b).sum()), float((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum())
-    return math.atan2(cross, dot), math.hypot(dot, cross) / float((a**2).sum())
-
-
-def _distances(printed: Floats, touched: Floats) -> list[float]:
-    """Residuals of the rigid fit."""
-    turn = _rotation(_turn_and_scale(printed, touched)[0])
-    off = touched - touched.mean(axis=0) - (printed - printed.mean(axis=0)) @ turn.T
-    return [float(v) for v in np.linalg.norm(off, axis=1)]
+    angle, scale = math.atan2(cross, dot), math.hypot(dot, cross) / float((a**2).sum())
+    return angle, scale, np.asarray(np.linalg.norm(b - scale * a @ _rotation(angle).T, axis=1), np.float64)

@@ -48,16 +48,13 @@ class Asked:
     low: float = 0.0
     high: float = 0.0
     """Range of a number; a text or a choice has none."""
-    how: str = "typed"
     sigma: float | None = None
     default: str | Callable[[Notebook], str] = ""
     """What an empty line stands for; an empty text if it is no answer."""
     choices: tuple[Choice, ...] = ()
     check: Callable[[Notebook, float], Check] | None = None
     """Compares the number with what is known already."""
-    whole: bool = False
-    """Whether it is a whole number."""
-    read: Callable[[str], str] = str
+    read: Callable[[str], Value] = str
     """Reads a text; raises ValueError, worded for the person, where it cannot be used."""
 
     def prompt(self, notebook: Notebook) -> Prompt:
@@ -80,7 +77,7 @@ class Asked:
             raise ValueError(f"{value:g} is outside {self.low:g} to {self.high:g} {self.unit}")
         if self.check is not None and (check := self.check(notebook, value)).verdict == "contradicts":
             raise ValueError(f"{value:g} {self.unit} cannot be ({check.allowed}). {check.remedy}")
-        return int(value) if self.whole else value
+        return value
 
 
 def choice_of(question: str, choices: tuple[Choice, ...], default: str = "") -> Prompt:
@@ -192,7 +189,7 @@ class Visit:
             prompt = asked.prompt(self.notebook)
             value = await self.ask(prompt)
             agreed = isinstance(value, float) and prompt.default and value == float(prompt.default)
-            how = "suggested, and agreed" if agreed else asked.how
+            how = "suggested, and agreed" if agreed else f"typed: {asked.question}"
             self.keep({asked.field: Taught(value, how, asked.unit, asked.sigma)})
 
     async def may_move(self, what: str) -> None:

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from brushloop.calibrate.stats import student_95
-from brushloop.collect.commission.arm import ArmReader, taught_arm, tip_of, touch
+from brushloop.collect.commission.arm import taught_arm, tip_of, touch
 from brushloop.collect.commission.notebook import Notebook, Taught
 from brushloop.collect.commission.step import Step, Visit
 from brushloop.collect.errors import NotAccepted
 from brushloop.collect.rig.check import brush_square
+from brushloop.drivers.arcs.controller import Controller
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import distance
 
@@ -52,8 +52,6 @@ class TipFit:
     """Standard error of each component of the offset."""
     freedom: int
     """Degrees of freedom of the noise's estimate."""
-    condition: float
-    """Ratio of the largest to the smallest singular value of the equations."""
 
     @property
     def touch_mm(self) -> float:
@@ -64,11 +62,6 @@ class TipFit:
     def error_mm(self) -> float:
         """Root mean square of the distance by which the offset may be wrong."""
         return math.hypot(*self.sigma_mm)
-
-    @property
-    def reach_mm(self) -> float:
-        """Half width of the 95 % interval of the worst component, by Student's t."""
-        return student_95(self.freedom) * max(self.sigma_mm)
 
 
 def find_tip(flanges: Sequence[Pose]) -> TipFit:
@@ -100,7 +93,6 @@ def find_tip(flanges: Sequence[Pose]) -> TipFit:
         tuple(float(r) for r in np.linalg.norm(off, axis=1)),
         _triple(spread[:3]),
         freedom,
-        condition,
     )
 
 
@@ -129,7 +121,6 @@ class AxisFit:
 
     rotation_deg: tuple[float, float, float]
     """As `robot.tcp_rotation_deg`: about x, then y, then z of the flange."""
-    lean_deg: float
     sigma_deg: float
     """Standard error of the lean in each direction; infinite for a single hold."""
     off_deg: tuple[float, ...]
@@ -161,17 +152,14 @@ def find_axis(flanges: Sequence[Pose]) -> AxisFit:
         middle = weights @ down / weights.sum()
     typical_deg = float(np.sort(_angles_deg(down, middle))[(len(down) - 1) // 2])
     agree = _angles_deg(down, middle) <= max(LEAST_OFF_DEG, OUTLIER_SHARE * typical_deg)
-    mean = np.asarray(down[agree].mean(axis=0) / np.linalg.norm(down[agree].mean(axis=0)), np.float64)
+    mean = np.asarray(down[agree].mean(axis=0), np.float64)
     count, off_deg = int(agree.sum()), _angles_deg(down, mean)
     squares = float((off_deg[agree] ** 2).sum())
     sigma_deg = math.sqrt(squares / (2.0 * (count - 1)) / count) if count > 1 else math.inf
-    across = np.cross([0.0, 0.0, 1.0], mean)
-    lean = math.atan2(float(np.linalg.norm(across)), float(mean[2]))
-    axis = across / max(float(np.linalg.norm(across)), 1e-12)
-    rz, ry, rx = Rotation.from_rotvec(lean * axis).as_euler("ZYX", degrees=True)
+    lean, _ = Rotation.align_vectors(mean[None], [[0.0, 0.0, 1.0]])
+    rz, ry, rx = lean.as_euler("ZYX", degrees=True)
     return AxisFit(
         (float(rx), float(ry), float(rz)),
-        math.degrees(lean),
         sigma_deg,
         tuple(off_deg.tolist()),
         tuple(np.flatnonzero(~agree).tolist()),
@@ -194,8 +182,6 @@ GOOD_MM = 0.18
 """Root mean square error of the tip at which touching ends."""
 WORST_MM = 0.35
 """Above this after the last touch, the tip is not accepted."""
-UNKNOWN_MM = 20.0
-"""Error above which no place of the tip is shown."""
 LEAST_UPRIGHTS, UPRIGHTS, MOST_UPRIGHTS = 3, 12, 24
 """Times that the brush is held against a set square, each with another turn of the wrist. Twelve times, each accurate
 to 0.15 deg, leave a standard error of 0.04 deg."""
@@ -222,73 +208,68 @@ class TipStep(Step):
             "Fix a pin upright where all sides of it can be reached; put the pendant into hand guiding.",
             "Touch its point with the tip of the dry brush, each time leaning to another side, and hold still.",
         )
-        async with taught_arm(visit.notebook) as reader:
-            await self._pin(visit, reader)
+        async with taught_arm(visit.notebook) as arm:
+            await self._pin(visit, arm)
             visit.say("Now the direction of the brush: hold it upright, a set square on the table beside it.")
-            await self._uprights(visit, reader)
+            await self._uprights(visit, arm)
 
-    async def _pin(self, visit: Visit, reader: ArmReader) -> None:
+    async def _pin(self, visit: Visit, arm: Controller) -> None:
+        """Have the pin touched until the tip is known well enough. Raises `NotAccepted`."""
         for index in range(MOST_TOUCHES):
             if f"pin {index}" in visit.notebook.touches:
                 continue
-            if self._known(visit):
+            if self._tip_error_mm(visit) <= GOOD_MM:
                 return
             how = (
                 f"Touch {index + 1}: bring the tip to the pin, the brush leaning by 30 deg or more "
                 f"{SIDES[index % 4]}; lean it without turning the wrist with it."
             )
-            await touch(visit, reader, f"pin {index}", how, may_skip=True)
-        if self._known(visit):
-            return
-        with visit.asked_again_if_refused("pin"):
-            fit = find_tip(list(visit.notebook.touched("pin").values()))
-            if fit.error_mm > WORST_MM:
-                raise NotAccepted(
-                    f"after {MOST_TOUCHES} touches the tip is known to {fit.error_mm:.2f} mm only.",
-                    "Fix pin and brush firmly, hold still while you press Enter, and touch the pin again.",
-                )
+            await touch(visit, arm, f"pin {index}", how, may_skip=True)
+        if (error_mm := self._tip_error_mm(visit)) > WORST_MM:
+            visit.forget("pin")
+            raise NotAccepted(
+                f"after {MOST_TOUCHES} touches the tip is known to {error_mm:.2f} mm only.",
+                "Fix pin and brush firmly, hold still while you press Enter, and touch the pin again.",
+            )
 
-    def _known(self, visit: Visit) -> bool:
+    def _tip_error_mm(self, visit: Visit) -> float:
+        """How well the tip is known, shown to the person; infinite if it is not. Forgets a touch that strays."""
         touches = visit.notebook.touched("pin")
         if len(touches) < LEAST_TOUCHES:
-            return False
+            return math.inf
         try:
             fit = find_tip(list(touches.values()))
         except NotAccepted as error:
             visit.say(str(error), tone="warning")
-            return False
+            return math.inf
         if (stray := stray_touch(list(touches.values()))) is not None:
             name, off_mm = list(touches)[stray[0]], stray[1]
             visit.say(f"Touch {int(name) + 1} lies {off_mm:.1f} mm off: it is left out.", tone="warning")
             visit.forget(f"pin {name}")
-            return False
+            return math.inf
         x, y, z = fit.offset_mm
-        if fit.error_mm > UNKNOWN_MM:
-            more = f"{len(touches)} touches do not give the tip yet; if Enter was pressed too early, the next"
-            visit.say(f"{more} touches will show which one lies off.", tone="warning")
-            return False
         visit.say(
             f"{len(touches)} touches: the tip is at ({x:.2f}, {y:.2f}, {z:.2f}) mm from the flange, with a standard "
             f"error of {fit.error_mm:.3f} mm (goal: {GOOD_MM:g} mm); "
             f"no touch is more than {max(fit.residuals_mm):.2f} mm off."
         )
-        return fit.error_mm <= GOOD_MM
+        return fit.error_mm
 
-    async def _uprights(self, visit: Visit, reader: ArmReader) -> None:
+    async def _uprights(self, visit: Visit, arm: Controller) -> None:
         """Have the brush held upright until its direction is known well enough. Raises `NotAccepted`."""
         while not self._direction_known(visit):
             free = (n for n in range(MOST_UPRIGHTS) if f"upright {n}" not in visit.notebook.touches)
             if (index := next(free, None)) is None:
-                with visit.asked_again_if_refused("upright"):
-                    raise NotAccepted(
-                        f"after {MOST_UPRIGHTS} holds the direction of the brush is not known to {WORST_DEG:g} deg.",
-                        "Hold the brush along a set square, not by eye; or skip the holds: it is then not measured.",
-                    )
+                visit.forget("upright")
+                raise NotAccepted(
+                    f"after {MOST_UPRIGHTS} holds the direction of the brush is not known to {WORST_DEG:g} deg.",
+                    "Hold the brush along a set square, not by eye; or skip the holds: it is then not measured.",
+                )
             how = (
-                f"Upright {index + 1} of {UPRIGHTS}: the brush upright along the set square"
-                f"{', the wrist turned differently than before' if index else ''}, anywhere over the table."
+                f"Upright {index + 1} of {UPRIGHTS}: the brush upright along the set square, the wrist turned "
+                "differently each time, anywhere over the table."
             )
-            if await touch(visit, reader, f"upright {index}", how, may_skip=True) is None:
+            if await touch(visit, arm, f"upright {index}", how, may_skip=True) is None:
                 if measured_axis(visit.notebook) is None:
                     visit.say("The direction of the brush is not measured.", tone="warning")
                 return
@@ -298,23 +279,18 @@ class TipStep(Step):
         holds = visit.notebook.touched("upright")
         if not holds:
             return False
-        *before, newest = holds
-        flanges, axis = list(holds.values()), find_axis(list(holds.values()))
-        names = [f"Hold {int(name) + 1}" for name in holds]
-        square = brush_square(find_axis(flanges[-1:]).rotation_deg)
+        names, flanges = list(holds), list(holds.values())
+        axis, square = find_axis(flanges), brush_square(find_axis(flanges[-1:]).rotation_deg)
+        wrong, sure = {names[k]: f"is {axis.off_deg[k]:.1f} deg from the others" for k in axis.strays}, axis.clear
         if square.verdict == "contradicts":
-            said = f"{names[-1]}: the brush would lean by {square.value} against the flange ({square.allowed})"
-            wrong = {newest: f"{said}: it was not upright"}
-        elif before and distance(flanges[-2], flanges[-1])[1] < LEAST_TURN_DEG:
-            wrong = {newest: f"{names[-1]} is {names[-2].lower()} again: turn the wrist in between"}
-        else:
-            wrong = {list(holds)[k]: f"{names[k]} is {axis.off_deg[k]:.1f} deg from the others" for k in axis.strays}
-            if wrong and not axis.clear:
-                visit.say(*wrong.values(), "The next holds will show which were not upright.", tone="warning")
-                return False
+            wrong, sure = {names[-1]: f"would make the brush lean by {square.value} ({square.allowed})"}, True
+        elif len(holds) > 1 and distance(flanges[-2], flanges[-1])[1] < LEAST_TURN_DEG:
+            wrong, sure = {names[-1]: "is the one before again: turn the wrist in between"}, True
         if wrong:
-            visit.say(*wrong.values(), "Left out, and asked for again.", tone="warning")
-            visit.forget(*(f"upright {name}" for name in wrong))
+            verdict = "Left out, and asked for again." if sure else "The next holds will show which were not upright."
+            visit.say(*(f"Hold {int(name) + 1} {why}" for name, why in wrong.items()), verdict, tone="warning")
+            if sure:
+                visit.forget(*(f"upright {name}" for name in wrong))
             return False
         if len(holds) >= LEAST_UPRIGHTS:
             known = f"known to {axis.sigma_deg:.2f} deg (limit {WORST_DEG:g})"
@@ -325,18 +301,14 @@ class TipStep(Step):
         """The offset, and how the brush leans against the flange."""
         touches = list(notebook.touched("pin").values())
         fit = find_tip(touches)
-        known = (
-            f"95 % interval of the worst component +-{fit.reach_mm:.2f} mm, condition {fit.condition:.0f}, "
-            f"residuals up to {max(fit.residuals_mm):.2f} mm"
-        )
+        known = f"residuals up to {max(fit.residuals_mm):.2f} mm"
         how = f"the same pin touched from {len(touches)} sides by hand"
         offset = Taught(list(fit.offset_mm), how, "mm", fit.error_mm, known)
         if (axis := measured_axis(notebook)) is None:
             turn = Taught([0.0, 0.0, 0.0], "taken as square to the flange", "deg", known="not measured")
         else:
             how = f"held upright along a set square {axis.holds} times"
-            known = f"leans by {axis.lean_deg:.2f} deg against the flange"
-            turn = Taught(list(axis.rotation_deg), how, "deg", axis.sigma_deg, known)
+            turn = Taught(list(axis.rotation_deg), how, "deg", axis.sigma_deg)
         return {"robot.tcp_offset_mm": offset, "robot.tcp_rotation_deg": turn}
 
 

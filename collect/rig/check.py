@@ -215,7 +215,7 @@ def brush_square(rotation_deg: tuple[float, float, float]) -> Check:
     return within("brush to the flange's axis", lean_deg, 0.0, 20.0, "deg", remedy)
 
 
-def brush_shorter_than_tool(offset_mm: tuple[float, float, float], length_mm: float) -> Check:
+def brush_shorter_than_tool(offset_mm: Sequence[float], length_mm: float) -> Check:
     """Length of the hair, which is a part of the tool."""
     remedy = "The hair is longer than the whole tool: measure brush.length_mm, or teach the tip."
     return within("hair of the brush", length_mm, 5.0, round(math.hypot(*offset_mm), 1), "mm", remedy)

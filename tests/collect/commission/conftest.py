@@ -126,8 +126,7 @@ class InLab(Person):
         table, brush = facts.config.table, facts.config.brush
         read = {
             "Address of the cabinet": lab.host,
-            "Squares along its longer": str(table.board_squares[0]),
-            "Squares along its shorter": str(table.board_squares[1]),
+            "Squares of the print": "{}x{}".format(*table.board_squares),
             "Side of a square": str(facts.printed_square_mm),
             "Side of a marker": str(facts.printed_marker_mm),
             "Markers of the print": table.board_dictionary,
@@ -193,8 +192,7 @@ async def first_day(person: InLab, rig_path: Path, *, armed: bool = True) -> Pat
 
 def newest_session(rig_path: Path) -> Path:
     """The folder of the last proof's recording."""
-    proofs = sorted(rig_path.parent.glob("rig.proof-*"), key=lambda folder: int(folder.name.rpartition("-")[2]))
-    return max((proofs[-1] / "sessions").iterdir())
+    return max(rig_path.parent.glob("rig.proof-*/sessions/*"), key=lambda session: session.stat().st_mtime)
 
 
 @dataclass(frozen=True, slots=True)

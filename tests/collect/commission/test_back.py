@@ -20,7 +20,7 @@ from brushloop.drivers.ink.station import InkStationConfig
 from tests.collect.commission.conftest import Person, visit_of
 
 BACK, HOW, GIVE, LINE = "<", "How do you want to go on?", "Give 0.5 ml", "Its serial line"
-R, L, DEEPEST, NAME = "R", "L", "Deepest press that this brush can take", "Name of the brush"
+R, L, DEEPEST, NAME = "R", "L", "Deepest press that this brush can take; 45% of L is cautious", "Name of the brush"
 WELL, INK, CAN = "What keeps the ink well filled?", "Name of the ink", "CAN bus of the force sensor"
 
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from brushloop.collect.commission import places, proof
-from brushloop.collect.commission.arm import ArmReader, ArmStep
+from brushloop.collect.commission import arm, places, proof
+from brushloop.collect.commission.arm import ArmStep
 from brushloop.collect.commission.notebook import Notebook, Taught
 from brushloop.collect.commission.places import PlacesStep, check_pot, check_wipe
 from brushloop.collect.commission.proof import ProofStep, slowly
@@ -27,33 +27,13 @@ from brushloop.collect.operator import Prompt
 from brushloop.collect.photograph.frames import Thumbnail
 from brushloop.collect.rig.check import brush_square
 from brushloop.collect.rig.config import load_rig
-from brushloop.drivers.arcs.controller import only_asking
 from brushloop.drivers.devices import Pose
-from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import Addresses, rig_toml
 from brushloop.drivers.sim.world import tool_of
 from tests.collect.commission.conftest import Person, in_lab, visit_of
-
-
-@pytest.mark.parametrize(
-    ("getter", "answer"),
-    [
-        ("getPayload", [math.nan, [0.0, 0.0, 0.0]]),
-        ("getPayload", ["1.5", [0.0, 0.0, 0.0]]),
-        ("getCollisionLevel", None),
-        ("getTcpOffset", [0.0, 0.0, math.inf, 0.0, 0.0, 0.0]),
-    ],
-)
-async def test_an_answer_that_is_no_number_is_refused_by_its_getter(
-    server: ArcsServer, getter: str, answer: object
-) -> None:
-    server._methods[f"rob1.RobotConfig.{getter}"] = lambda _: answer
-    async with only_asking("127.0.0.1", server.port, "sof") as controller:
-        with pytest.raises(ProtocolViolation, match=getter):
-            await ArmReader(controller).cabinet()
 
 
 def leaning(x_mm: float, y_mm: float, z_mm: float, toward_deg: float, tilt_deg: float, wrist_deg: float) -> Pose:
@@ -257,17 +237,17 @@ def parked(server: ArcsServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
             [away, parked],
         )
         for field in ("aside.wipe", "aside.wash"):
-            visit.keep({field: Taught(False, "answered")})
+            visit.keep({field: Taught("n", "answered")})
         for name, place in {"well-rim 0": RIM, "well 0": WELL}.items():
             visit.save(visit.notebook.with_touch(name, brush_pose(*place)))
 
-        async def flange(_: ArmReader) -> Pose:
+        async def flange_at_rest(_: object) -> Pose:
             return brush_pose(*poses.pop(0))
 
         async def still(*_: object) -> Thumbnail:
             return pictures.pop(0)
 
-        monkeypatch.setattr(ArmReader, "flange", flange)
+        monkeypatch.setattr(arm, "flange_at_rest", flange_at_rest)
         monkeypatch.setattr(places, "still", still)
         monkeypatch.setattr(places, "taught_camera", lambda *_: contextlib.nullcontext())
         monkeypatch.setattr(places, "shown_live", lambda *_: contextlib.nullcontext())

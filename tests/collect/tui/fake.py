@@ -18,8 +18,7 @@ from textual.app import App
 from textual.pilot import Pilot
 
 from brushloop.collect.commission.arm import ADDRESS
-from brushloop.collect.commission.brush import BUS
-from brushloop.collect.commission.camera import PRINT
+from brushloop.collect.commission.brush import BRUSH, BUS
 from brushloop.collect.commission.step import Visit
 from brushloop.collect.engine.capture import mark_of
 from brushloop.collect.engine.control import State
@@ -355,7 +354,7 @@ class Asking:
             case "no default":
                 return await visit.yes("Is there a pot of water?")
             case "number":
-                return await visit.ask(PRINT[0].prompt(visit.notebook))
+                return await visit.ask(BRUSH[0].prompt(visit.notebook))
             case "text":
                 return await visit.ask(replace(ADDRESS, default="192.0.2.7").prompt(visit.notebook))
             case "empty":
