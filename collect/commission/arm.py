@@ -152,10 +152,11 @@ class ArmStep(Step):
         visit.working(f"asking {host}:{port} who it is")
         framing, name = await find_framing(host, port)
         async with only_asking(host, port, framing) as controller:
-            settings, state = await read_back(controller), await controller.state(1)
+            settings, mode = await read_back(controller), await controller.mode()
+            safety = str(await controller.ask("RobotState.getSafetyModeType"))
         visit.say(
             f"{host}:{port} answers in the {framing} framing: {name}",
-            f"robot mode {state.mode}, safety {state.safety}",
+            f"robot mode {mode}, safety {safety}",
             f"set on the pendant: {'; '.join(f'{setting} {value}' for setting, value in settings.words().items())}",
         )
         tool_mm = math.hypot(*settings.tool.position_mm)
@@ -165,9 +166,9 @@ class ArmStep(Step):
                 "or millimetres where metres are. It is measured in the third step and replaced.",
                 tone="warning",
             )
-        if state.safety not in MOVING_ALLOWED:
+        if safety not in MOVING_ALLOWED:
             visit.say(
-                f"The safety mode is {state.safety}: the arm cannot be guided by hand until it is released.",
+                f"The safety mode is {safety}: the arm cannot be guided by hand until it is released.",
                 "Look at the pendant; this program clears nothing.",
                 tone="warning",
             )
