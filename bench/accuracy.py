@@ -35,14 +35,15 @@ from bench.brushes import (
 from bench.harness import BenchError, Result, at_most, brushloop, machine, rounds_of
 from bench.prior import BRISTLE
 from brushloop.calibrate.compare import TABLE_2
-from brushloop.calibrate.fit.captures import Captures, by_cell, read_presses
 from brushloop.calibrate.fit.descent import Prior, fit_presses, learned
-from brushloop.calibrate.fit.heldout import BEZIER, FITTED, Refit, held_out_scores, image_of, leave_cell_out, refit
+from brushloop.calibrate.fit.heldout import BEZIER, FITTED, Refit, held_out_scores, leave_cell_out, refit
+from brushloop.calibrate.presses import read_for_fit
 from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.writing.compare import HEADLINE, REFERENCE, SIMULATED, read_written
 from brushloop.drivers.sim.brush.spec import PAPER, load_brush
 from brushloop.model.fitted import FittedPress
 from brushloop.model.generator import SHIPPED_GENERATOR
+from brushloop.model.presses import Presses, image_of
 from brushloop.twin.run import TWIN, fit_twin, workers
 
 BRUSHES = (*NAMED, *BRISTLE_SETS)
@@ -67,14 +68,12 @@ WITHIN_POINTS = {"max": 4.0, "min": 4.0, "avg": 2.0}
 def fit(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     """Points below the ceiling of the fitted brush, each condition predicted from all others: `n` brushes (seven)."""
     results: list[Result] = []
-    for name, captures, prior in _pressed(n, seed):
-        brush = captures.radius_mm, captures.length_mm
-        press = fit_presses(captures.strokes, captures.grid, *brush, prior=prior)
-        rows = leave_cell_out(captures.strokes, captures.grid, press, prior)
+    for name, presses, prior in _pressed(n, seed):
+        rows = leave_cell_out(presses, fit_presses(presses, prior=prior), prior)
         csim = {row.model: row.csim for row in rows}
         where = f"simulated; ceiling {csim[CEILING]:.2f}, refitted Bezier {csim[BEZIER]:.2f} %; {machine()}"
-        gap, presses = csim[CEILING] - csim[FITTED], len(captures.strokes)
-        results.append(at_most(f"fit.gap.{name}", gap, POINTS, FULL_POINTS, presses, seed, where))
+        gap = csim[CEILING] - csim[FITTED]
+        results.append(at_most(f"fit.gap.{name}", gap, POINTS, FULL_POINTS, len(presses), seed, where))
     return results
 
 
@@ -82,18 +81,18 @@ def few(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     """The same from one press of each of the first 5 and 9 conditions of the fixed design: mean and worst of `n` (3)
     draws of these presses, over all other conditions."""
     draws, results = rounds_of(n, 3), list[Result]()
-    for name, captures, prior in _pressed(None, seed):
-        cells = by_cell(captures.strokes)
+    for name, presses, prior in _pressed(None, seed):
+        cells = presses.cells
         for size, goal in FEW_POINTS.items():
             gaps: list[float] = []
             for draw in range(draws):
                 rng = np.random.default_rng([seed, draw, size])
                 chosen = [cells[cell][rng.integers(len(cells[cell]))] for cell in DESIGN[:size]]
-                job = Refit(chosen, captures.grid, captures.radius_mm, captures.length_mm, prior)
-                press = FittedPress(job.radius_mm, job.length_mm, **refit(job))
+                brush = refit(Refit(presses.pick(chosen), prior))
+                press = FittedPress(presses.radius_mm, presses.length_mm, **brush)
                 left_out = DESIGN[size:]
-                images = [{FITTED: image_of(press.outline(*cell), captures.grid)} for cell in left_out]
-                predicted = [(cells[cell], drawn) for cell, drawn in zip(left_out, images, strict=True)]
+                images = [{FITTED: image_of(press.outline(*cell), presses.grid)} for cell in left_out]
+                predicted = [(presses.ink[cells[cell]], drawn) for cell, drawn in zip(left_out, images, strict=True)]
                 csim = {row.model: row.csim for row in held_out_scores(predicted, (FITTED,))}
                 gaps.append(csim[CEILING] - csim[FITTED])
             where = f"simulated; worst draw {max(gaps):.2f}; {machine()}"
@@ -101,7 +100,7 @@ def few(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     return results
 
 
-def _pressed(n: int | None, seed: int) -> Iterator[tuple[str, Captures, Prior]]:
+def _pressed(n: int | None, seed: int) -> Iterator[tuple[str, Presses, Prior]]:
     """The presses of the first `n` brushes, and the prior that does not know their family."""
     for name in BRUSHES[: rounds_of(n, len(BRUSHES))]:
         prior = learned((BRISTLE,)) if name in BRISTLE_SETS else learned()
@@ -115,7 +114,7 @@ def _pressed(n: int | None, seed: int) -> Iterator[tuple[str, Captures, Prior]]:
             except BenchError as error:
                 sys.stderr.write(f"left out: {error}\n")
                 continue
-            yield name, read_presses(session), prior
+            yield name, read_for_fit(session)[1], prior
 
 
 def intervals(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
@@ -217,17 +216,17 @@ def twin(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     """A twin fitted to 45 presses of each of `n` brushes (seven): points below the ceiling on conditions left out, how
     well it repeats itself, and for frozen brushes the share of the intervals that hold the constant."""
     results: list[Result] = []
-    for name, captures, _ in _pressed(n, seed):
-        strokes = [press for group in by_cell(captures.strokes).values() for press in group[:TWIN_REPEATS]]
+    for name, every, _ in _pressed(n, seed):
+        presses = every.pick([k for numbers in every.cells.values() for k in numbers[:TWIN_REPEATS]])
         with workers() as pool:
-            fitted = fit_twin(strokes, captures.grid, captures.radius_mm, captures.length_mm, pool)
+            fitted = fit_twin(presses, pool)
         csim = {row.model: row.csim for row in fitted.held_out}
         where = f"simulated; ceiling {csim[CEILING]:.2f}, refitted Bezier {csim[BEZIER]:.2f} %; {machine()}"
         gap = csim[CEILING] - csim[TWIN]
-        results.append(at_most(f"twin.gap.{name}", gap, POINTS, TWIN_POINTS, len(strokes), seed, where))
+        results.append(at_most(f"twin.gap.{name}", gap, POINTS, TWIN_POINTS, len(presses), seed, where))
         if spread := fitted.spread:
             off, label = abs(spread.captured_percent - spread.twin_percent), f"twin.repeats.{name}"
-            results.append(at_most(label, off, POINTS, TWIN_REPEAT_POINTS, len(strokes), seed, where))
+            results.append(at_most(label, off, POINTS, TWIN_REPEAT_POINTS, len(presses), seed, where))
         if name in NAMED:
             # A brush bows by bow_mm times a draw of its individual, which the twin does not have.
             known = [one for one in fitted.estimates if one.determined and one.constant.name != "bow_mm"]

@@ -13,7 +13,7 @@ import json
 import math
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,9 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.brushes import BRISTLE_SETS, CELLS, bristle_session
-from brushloop.calibrate.fit.captures import Grid, Pressed, read_presses
 from brushloop.calibrate.fit.descent import FILE, KnownBrush, about, fit_presses
+from brushloop.calibrate.presses import read_for_fit
 from brushloop.model.fitted import chance_within, published
+from brushloop.model.presses import Grid, Presses
 
 BRISTLE = "bristle simulation"
 SIZE_PX, PX_MM, TOUCH_MM = 128, 0.3, (29.1, 19.2)
@@ -61,8 +62,8 @@ class MadeUp:
     length_tilt: float
     heel_tilt: float
 
-    def press(self, depth_mm: float, tilt_deg: float, grid: Grid) -> Pressed:
-        """The press, without any variation."""
+    def ink(self, depth_mm: float, tilt_deg: float, grid: Grid) -> Floats:
+        """The ink of a press, without any variation, (len(y_mm), len(x_mm))."""
         reach = self.reach_mm * ((depth_mm + self.reach_offset_mm) / 15.0) ** self.reach_power
         reach *= 1.0 + self.length_tilt * tilt_deg
         half = self.half_mm * ((depth_mm + self.half_offset_mm) / 15.0) ** self.half_power
@@ -73,7 +74,7 @@ class MadeUp:
         u = grid.x_mm - widest
         share = np.where(u > 0.0, u / heel, u / tip)
         edge = np.where(np.abs(share) < 1.0, half * self.shape(np.clip(share, -1.0, 1.0)), -1.0)
-        return Pressed(depth_mm, tilt_deg, chance_within(edge, grid.y_mm, EDGE_MM))
+        return chance_within(edge, grid.y_mm, EDGE_MM)
 
 
 def made_up(family: str, number: int, seed: int = 0) -> MadeUp:
@@ -135,21 +136,20 @@ def known() -> Iterator[KnownBrush]:
     """Every brush of the prior, fitted. Raises BenchError where a bristle set is not at hand."""
     for name in BRISTLE_SETS:
         with tempfile.TemporaryDirectory() as folder:
-            captures = read_presses(bristle_session(Path(folder) / name, name))
-        yield _fitted(name, BRISTLE, captures.strokes, captures.grid, captures.radius_mm, captures.length_mm)
+            _, presses, _ = read_for_fit(bristle_session(Path(folder) / name, name))
+        yield _fitted(name, BRISTLE, presses)
     centres = np.asarray((np.arange(SIZE_PX) + 0.5) * PX_MM, np.float64)
     grid = Grid(centres - TOUCH_MM[0], (TOUCH_MM[1] - centres)[ROWS])
     for family in FAMILIES:
         for number in range(BRUSHES):
             brush = made_up(family, number)
-            strokes = [brush.press(*cell, grid) for cell in CELLS]
-            yield _fitted(f"{family} {number + 1}", family, strokes, grid, brush.radius_mm, brush.length_mm)
+            ink = np.array([brush.ink(*cell, grid) for cell in CELLS])
+            presses = Presses(brush.radius_mm, brush.length_mm, grid, np.array(CELLS), ink)
+            yield _fitted(f"{family} {number + 1}", family, presses)
 
 
-def _fitted(
-    name: str, family: str, strokes: Sequence[Pressed], grid: Grid, radius_mm: float, length_mm: float
-) -> KnownBrush:
-    press = fit_presses(strokes, grid, radius_mm, length_mm, residual=False, prior=about(published()))
+def _fitted(name: str, family: str, presses: Presses) -> KnownBrush:
+    press = fit_presses(presses, residual=False, prior=about(published()))
     return KnownBrush(name=name, family=family, values=tuple(round(float(v), 5) for v in press.values))
 
 

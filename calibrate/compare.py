@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from brushloop.calibrate.stroke import Prepared
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.outline import Outline
+from brushloop.model.presses import Grid
 from brushloop.model.similarity import csim_and_ssim, inked_window
 from brushloop.model.strokes import StrokeModel
 from brushloop.sessions.records import Header
@@ -83,6 +84,13 @@ def field_around(anchor_mm: tuple[float, float]) -> tuple[float, float, float, f
     """(x, y, width, height) in mm of the field around a zero-touch point, both in the paper frame (y upward)."""
     left, top = ANCHOR_MM
     return anchor_mm[0] - left, anchor_mm[1] - (FIELD_MM - top), FIELD_MM, FIELD_MM
+
+
+def field_grid() -> Grid:
+    """The pixel centres of the millimetre field around the point of touch."""
+    left, top = ANCHOR_MM
+    centres = np.asarray((np.arange(SIZE_PX) + 0.5) * MM_PER_PX, np.float64)
+    return Grid(np.asarray(centres - left), np.asarray(top - centres))
 
 
 def covered(prepared: Prepared) -> Image:

@@ -7,16 +7,28 @@ is prepared side by side and kept.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import astuple, dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
-from brushloop.calibrate.compare import ANCHOR_MM, FIELD_MM, KEYS, Image, Pixels, captured, covered, field_around
-from brushloop.calibrate.errors import CaptureRefused
+from brushloop.calibrate.compare import (
+    ANCHOR_MM,
+    FIELD_MM,
+    KEYS,
+    Image,
+    Pixels,
+    brush_of,
+    captured,
+    covered,
+    field_around,
+    field_grid,
+)
+from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.report import source_label
-from brushloop.calibrate.session import Calibration, OpenSession
+from brushloop.calibrate.session import Calibration, OpenSession, open_session
 from brushloop.calibrate.stroke import (
     BACKGROUND_MM,
     PX_PER_MM,
@@ -31,6 +43,7 @@ from brushloop.calibrate.stroke import (
     rescale,
 )
 from brushloop.calibrate.work import Arrays, Scheduler, key_of, threads
+from brushloop.model.presses import Presses
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.recording import Capture, bad_stills
 from brushloop.sessions.records import Condition, Header, Stroke
@@ -119,6 +132,26 @@ def read_presses(
             refused.append((stroke.stroke_id, reason))
         elif press is not None:
             yield press
+
+
+def read_for_fit(path: Path, progress: Progress = unseen) -> tuple[OpenSession, Presses, list[Refused]]:
+    """Read every whole press of a session, and name the others.
+
+    Raises `CalibrationError` where it holds none, or was not calibrated.
+    """
+    session, refused = open_session(path, "press"), list[Refused]()
+    usable = list(read_presses(session, refused, uncommanded, cut, progress=progress))
+    if not usable:
+        raise CalibrationError(str(session.recording.path), "holds no press that can be used for a fit")
+    return session, for_fit(usable, session.header), refused
+
+
+def for_fit(presses: Sequence[Press], header: Header) -> Presses:
+    """Presses of one session as a fit uses them: their ink on the millimetre field."""
+    brush = brush_of(header)
+    commands = [(press.condition.depth_mm, press.condition.tilt_deg) for press in presses]
+    ink = np.array([press.coverage for press in presses], np.float64)
+    return Presses(float(brush.radius_mm), float(brush.length_mm), field_grid(), np.array(commands), ink)
 
 
 def prepare_job(job: tuple[Capture, Calibration | None]) -> Arrays:

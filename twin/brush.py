@@ -19,10 +19,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.fit.captures import Cell, Grid
 from brushloop.drivers.sim.brush.brush import Brush, Descent
 from brushloop.drivers.sim.brush.paper import Footprint
 from brushloop.drivers.sim.brush.spec import ALLOWED, BrushSpec
+from brushloop.model.presses import Cell, Grid
 
 Vector = NDArray[np.float64]
 Images = NDArray[np.float32]

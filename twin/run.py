@@ -25,11 +25,12 @@ from brushloop.calibrate.artefact import made_by
 from brushloop.calibrate.commands import TwinRequest
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written, check_target, write_whole
-from brushloop.calibrate.fit.captures import Cell, Grid, Pressed, by_cell, near_ink, read_presses
-from brushloop.calibrate.fit.heldout import BEZIER, HeldOut, Predicted, held_out_scores, image_of, refit_bezier
+from brushloop.calibrate.fit.heldout import BEZIER, HeldOut, Predicted, held_out_scores
+from brushloop.calibrate.presses import read_for_fit
 from brushloop.calibrate.report import source_note
 from brushloop.calibrate.work import Store, key_of
 from brushloop.drivers.sim.brush.spec import BrushSpec, SoundHead
+from brushloop.model.presses import Cell, Grid, Presses, image_of, refit_bezier
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.terminal import Progress, unseen
@@ -119,18 +120,17 @@ def twin(request: TwinRequest, progress: Progress = unseen) -> Written:
     check_target(target, ".toml")
     if target.exists() and not request.replace:
         raise CalibrationError(str(target), "exists: give --out FILE or --replace")
-    captures = read_presses(request.session, progress)
-    header, store = captures.session.header, captures.session.store
-    strokes, grid = near_ink(captures.strokes, captures.grid)
+    session, presses, refused = read_for_fit(request.session, progress)
+    header = session.header
     with workers() as pool:
         try:
-            fitted = fit_twin(strokes, grid, captures.radius_mm, captures.length_mm, pool, progress, store)
+            fitted = fit_twin(presses.near_ink(), pool, progress, session.store)
         except ValueError as error:
             raise CalibrationError(str(recording.path), str(error)) from None
     text = twin_toml(fitted, header.session_id, noise_gray(recording))
     write_whole(target, text)
-    said = [f"{source_note(header.source, header.brush)}; twin of {len(captures.strokes)} presses"]
-    said += (f"left out: {name}: {why}" for name, why in captures.refused)
+    said = [f"{source_note(header.source, header.brush)}; twin of {len(presses)} presses"]
+    said += (f"left out: {name}: {why}" for name, why in refused)
     said += (*text.splitlines(), f"Twin: {target}", f"next: brushloop sim --brush {quote(str(target))}")
     return Written(target, said)
 
@@ -169,26 +169,18 @@ def _end_with_parent() -> None:
     threading.Thread(target=watch, name="parent", daemon=True).start()
 
 
-def fit_twin(
-    strokes: Sequence[Pressed],
-    grid: Grid,
-    radius_mm: float,
-    length_mm: float,
-    pool: Executor,
-    progress: Progress = unseen,
-    store: Store | None = None,
-) -> Twin:
-    """Fit the twin of a brush of this size to its presses. Passes of the search that the store holds are not repeated.
+def fit_twin(presses: Presses, pool: Executor, progress: Progress = unseen, store: Store | None = None) -> Twin:
+    """Fit the twin of a brush to its presses. Passes of the search that the store holds are not repeated.
 
     Raises ValueError for a press that is deeper than a brush of this size allows.
     """
-    cells = by_cell(strokes)
-    means = np.asarray([np.mean([press.ink for press in group], axis=0) for group in cells.values()], np.float32)
-    target = Target(BrushSpec(radius_mm=radius_mm, length_mm=length_mm, seed=0), tuple(cells), grid, means)
+    grid, groups = presses.grid, {cell: presses.ink[numbers] for cell, numbers in presses.cells.items()}
+    means = np.asarray([ink.mean(axis=0) for ink in groups.values()], np.float32)
+    size = BrushSpec(radius_mm=presses.radius_mm, length_mm=presses.length_mm, seed=0)
+    target = Target(size, tuple(groups), grid, means)
     parts = parts_of(target.cells)
     searches = _Searches(pool, store, progress, (1 + len(parts)) * (2 + len(COARSE_MM) + 1))
     solution = searches.coarse(target)
-    groups = {cell: np.array([press.ink for press in group]) for cell, group in cells.items()}
     repeats = {cell: ink for cell, ink in groups.items() if len(ink) >= FEWEST_REPEATS}
     spread: Spread | None = None
     if repeats:
@@ -202,10 +194,10 @@ def fit_twin(
         spread = fit_spread(spec, place_at(solution.point), repeats, grid, pool, spread.point)
     predicted, points = list[Predicted](), list[Vector]()
     for part in parts:
-        others = target.only([k for k in range(len(cells)) if k not in part])
+        others = target.only([k for k in range(len(groups)) if k not in part])
         without = searches.fine(others, searches.coarse(others))
         points.append(without.point)
-        predicted += _predicted(cells, [target.cells[k] for k in part], without, target)
+        predicted += _predicted(presses, [target.cells[k] for k in part], without, target)
     errors = WIDER * np.sqrt(variance + of_parts(points))
     estimates = [Estimate.of(*one) for one in zip(SHAPE, solution.point, errors, strict=False)]
     if spread is not None:
@@ -248,18 +240,16 @@ class _Searches:
         return result
 
 
-def _predicted(
-    cells: dict[Cell, list[Pressed]], held: list[Cell], there: Solution, target: Target
-) -> Iterator[Predicted]:
+def _predicted(presses: Presses, held: list[Cell], there: Solution, target: Target) -> Iterator[Predicted]:
     """Yield the cells `held` as predicted by the twin solution without them, and by a Bezier refitted to the others."""
     drawn = draw(target.brush(there), place_at(there.point), held, target.grid, VOTES, FIRST_SEED).mean(axis=1)
-    others = [press for cell, group in cells.items() if cell not in held for press in group]
-    bezier = refit_bezier(others, target.grid)
+    cells = presses.cells
+    bezier = refit_bezier(presses.pick([k for cell, numbers in cells.items() if cell not in held for k in numbers]))
     for cell, image in zip(held, drawn, strict=True):
-        images: dict[str, Images] = {TWIN: image}
+        images: dict[str, NDArray[np.floating]] = {TWIN: image}
         if bezier is not None:
             images[BEZIER] = image_of(bezier(*cell), target.grid)
-        yield cells[cell], images
+        yield presses.ink[cells[cell]], images
 
 
 def parts_of(cells: Sequence[Cell]) -> list[list[int]]:

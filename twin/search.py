@@ -22,8 +22,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.fit.captures import Grid
 from brushloop.drivers.sim.brush.spec import BrushSpec
+from brushloop.model.presses import Grid
 from brushloop.model.similarity import csim
 from brushloop.twin.brush import (
     HERE,

@@ -31,7 +31,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.fit.captures import SPREAD_MM, Cell, Grid, Pressed, by_cell, near_ink
 from brushloop.model.damped import Damping, Equations, descend
 from brushloop.model.fitted import (
     MODES,
@@ -45,9 +44,12 @@ from brushloop.model.fitted import (
     modes,
     published,
 )
+from brushloop.model.presses import Cell, Grid, Presses
 
 Floats = NDArray[np.float64]
 
+SPREAD_MM = 0.15
+"""Variation of an edge from press to press (scale of a logistic)."""
 FILE = Path(__file__).with_name("prior.json")
 SHRINKAGE = 0.3
 FLOOR = 0.15
@@ -137,32 +139,25 @@ def of_brushes(known: Sequence[KnownBrush]) -> Prior:
 
 
 def fit_presses(
-    strokes: Sequence[Pressed],
-    grid: Grid,
-    radius_mm: float,
-    length_mm: float,
-    *,
-    residual: bool = True,
-    prior: Prior | None = None,
-    start: Floats | None = None,
+    presses: Presses, *, residual: bool = True, prior: Prior | None = None, start: Floats | None = None
 ) -> FittedPress:
     """Fit the parameters, then the residual that they cannot express. By default the prior is `learned`.
 
     The cost has several minima. Of two descents, one from the prior and one that fits size and place of the marks
-    first, the lower one counts; with `start` (17,), the parameters of a fit to nearly the same strokes, one descent
-    from there. Parameters that the strokes do not determine have the values that the prior expects. Raises ValueError
-    without a stroke.
+    first, the lower one counts; with `start` (17,), the parameters of a fit to nearly the same presses, one descent
+    from there. Parameters that the presses do not determine have the values that the prior expects. Raises ValueError
+    without a press.
     """
-    if not strokes:
-        raise ValueError("a fit needs at least one stroke")
-    strokes, grid = near_ink(strokes, grid)
+    if not len(presses):
+        raise ValueError("a fit needs at least one press")
+    presses = presses.near_ink()
     prior = learned() if prior is None else prior
-    expected = FittedPress(radius_mm, length_mm, prior.values if start is None else start)
+    expected = FittedPress(presses.radius_mm, presses.length_mm, prior.values if start is None else start)
     starts = [expected]
     if start is None:
-        starts.append(_minimise(expected, SCALE, strokes, grid, prior)[0])
-    press, _ = min((_minimise(begin, ALL, strokes, grid, prior) for begin in starts), key=itemgetter(1))
-    return fit_residual(press, strokes, grid) if residual else press
+        starts.append(_minimise(expected, SCALE, presses, prior)[0])
+    press, _ = min((_minimise(begin, ALL, presses, prior) for begin in starts), key=itemgetter(1))
+    return fit_residual(press, presses) if residual else press
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,12 +200,10 @@ def draw(press: FittedPress, cells: Floats, grid: Grid, free: Sequence[int] = AL
     return [Drawn.of(*of_cell, grid.y_mm) for of_cell in zip(width, by_parameter, strict=True)]
 
 
-def _minimise(
-    press: FittedPress, free: Sequence[int], strokes: Sequence[Pressed], grid: Grid, prior: Prior
-) -> tuple[FittedPress, float]:
+def _minimise(press: FittedPress, free: Sequence[int], presses: Presses, prior: Prior) -> tuple[FittedPress, float]:
     """Levenberg-Marquardt from `press`, and the cost where it ends; a parameter one standard deviation off the prior
     costs as much as a pixel of wrong ink."""
-    inks = {cell: np.array([s.ink for s in group], np.float64) for cell, group in by_cell(strokes).items()}
+    inks = {cell: presses.ink[numbers] for cell, numbers in presses.cells.items()}
     at = list(free)
     low, high = (np.array([getattr(PARAMETERS[k], end) for k in at]) for end in ("low", "high"))
 
@@ -221,7 +214,7 @@ def _minimise(
 
     def equations(vector: Floats) -> Equations:
         trial = at_values(vector)
-        square, gradient, cost = _normal(trial, at, inks, grid)
+        square, gradient, cost = _normal(trial, at, inks, presses.grid)
         pull = prior.precision @ prior.off(trial.values)
         cost += 0.5 * float(prior.off(trial.values) @ pull)
         square += prior.precision[np.ix_(at, at)]
@@ -236,7 +229,7 @@ def _minimise(
         """Within the bounds; None if a press would not reach the paper."""
         clipped = np.clip(vector, low, high)
         h0_mm = at_values(clipped).values[NAMES.index("h0_mm")]
-        return None if any(s.depth_mm + h0_mm <= 0.1 for s in strokes) else clipped
+        return None if presses.commands[:, 0].min() + h0_mm <= 0.1 else clipped
 
     lowest = descend(
         equations,
@@ -275,10 +268,10 @@ def _normal(
     return squares[np.ix_(kept, kept)], gradient[kept], cost
 
 
-def fit_residual(press: FittedPress, strokes: Sequence[Pressed], grid: Grid) -> FittedPress:
+def fit_residual(press: FittedPress, presses: Presses) -> FittedPress:
     """The brush with the residuals of its ends and edges; `press` has none."""
-    depths, tilts = np.array([s.depth_mm for s in strokes]), np.array([s.tilt_deg for s in strokes])
-    inks, terms = np.array([s.ink for s in strokes], np.float64), command_terms(depths, tilts)
+    (depths, tilts), inks, grid = presses.commands.T, presses.ink, presses.grid
+    terms = command_terms(depths, tilts)
     ends = _ends(press, depths, tilts, inks, grid)
     sides = _sines(press, press.sizes(depths, tilts, ends), inks, grid)
     falling = 1.0 / np.arange(1, MODES + 1)

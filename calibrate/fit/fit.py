@@ -1,10 +1,13 @@
 """`brushloop fit SESSION` for presses: the fitted brush, its immutable file, its tables, and its page.
 
-The page shows the fitted outline over the ink of each cell, the sizes of the marks, and the held-out scores.
+The page shows the fitted outline over the ink of each cell, the sizes of the marks, and the held-out scores. The
+intervals of the sizes are those of the jackknife: each cell is left out in turn, so they hold the differences between
+presses and how far the brush is from a plane.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -19,23 +22,10 @@ from brushloop.calibrate.commands import FitRequest
 from brushloop.calibrate.compare import MM_PER_PX, brush_of
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written
-from brushloop.calibrate.fit.captures import (
-    FEWEST_CELLS,
-    SPREAD_MM,
-    Captures,
-    Cell,
-    Floats,
-    Grid,
-    Pressed,
-    Size,
-    by_cell,
-    measure,
-    middle,
-    read_presses,
-    sizes_of,
-)
+from brushloop.calibrate.fit.descent import SPREAD_MM, Floats
 from brushloop.calibrate.fit.descent import fit_presses as fit_parameters
-from brushloop.calibrate.fit.heldout import FITTED, UNCALIBRATED, HeldOut, leave_cell_out
+from brushloop.calibrate.fit.heldout import FITTED, HeldOut, leave_cell_out
+from brushloop.calibrate.presses import Refused, read_for_fit
 from brushloop.calibrate.report import (
     COLOURS,
     Axis,
@@ -52,10 +42,12 @@ from brushloop.calibrate.report import (
     source_point,
     write_page,
 )
-from brushloop.calibrate.stats import CEILING, NEAR_POINTS, is_near
+from brushloop.calibrate.session import OpenSession
+from brushloop.calibrate.stats import NEAR_POINTS, is_near, student_95
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.fitted import MODES, NAMES, TERMS, FittedPress, fitted_model
 from brushloop.model.outline import Outline
+from brushloop.model.presses import SIZES, Cell, Presses, measure, plane_at
 from brushloop.model.similarity import csim
 from brushloop.model.strokes import StrokeModel, stroke_model
 from brushloop.sessions.recording import Recording
@@ -64,6 +56,7 @@ from brushloop.sessions.terminal import Progress, unseen
 
 FOLDER = "brushfit"
 """Folder of a session that holds its fits."""
+FEWEST_CELLS = 5
 MARGIN_MM = 1.5
 SMOOTH_POINTS = 24
 
@@ -110,10 +103,68 @@ class BrushFit(SessionFit):
 
 
 @dataclass(frozen=True, slots=True)
-class FitResult:
-    """The fitted brush that a session uses from now on, and what its captures say about it."""
+class Estimate:
+    """A number with its 95 % interval."""
 
-    captures: Captures
+    value: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, value: float, variance: float, factor: float) -> Estimate:
+        """The interval of `factor` standard errors on either side."""
+        off = factor * math.sqrt(variance)
+        return cls(value, value - off, value + off)
+
+    def __str__(self) -> str:
+        return f"{self.value:.2f} ({self.low:.2f} to {self.high:.2f})"
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """One size of the marks in the middle of the session's depths and tilts."""
+
+    name: str
+    here: Estimate
+    """mm"""
+    by_depth: Estimate
+    """mm per mm of depth"""
+    by_tilt: Estimate
+    """mm per degree of tilt"""
+
+
+def sizes_of(presses: Presses) -> list[Size]:
+    """Every size; empty where the cells are too few for an interval, or do not span depth and tilt without one."""
+    inked = presses.pick(np.flatnonzero((presses.ink > 0.5).any(axis=(1, 2))).tolist())
+    cells = list(inked.cells.values())
+    if len(cells) < FEWEST_CELLS:
+        return []
+    measured = np.array([measure(ink, inked.grid) for ink in inked.ink])
+
+    def plane(rows: Sequence[int]) -> Floats:
+        return plane_at(inked.commands[rows], measured[rows], inked.middle)
+
+    every = range(len(inked))
+    try:
+        whole, without = plane(every), np.array([plane([k for k in every if k not in cell]) for cell in cells])
+    except ValueError:
+        return []
+    variance = (1.0 - 1.0 / len(cells)) * ((without - whole) ** 2).sum(axis=0)
+    factor = student_95(len(cells) - 1)
+    return [
+        Size(name, *(Estimate.of(float(v), float(s), factor) for v, s in zip(values, squares, strict=True)))
+        for name, values, squares in zip(SIZES, whole.T, variance.T, strict=True)
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class FitResult:
+    """The fitted brush that a session uses from now on, and what its presses say about it."""
+
+    session: OpenSession
+    presses: Presses
+    refused: list[Refused]
+    """Presses that cannot be used or are cut by the edge of their photograph."""
     fit: BrushFit
     """The contents of the file."""
     sizes: list[Size]
@@ -121,20 +172,24 @@ class FitResult:
     held_out: list[HeldOut]
     """Empty with one cell only."""
     path: Path
-    page: Path
+
+    @property
+    def page(self) -> Path:
+        """The page beside the file."""
+        return self.path.with_suffix(".html")
 
     def lines(self) -> Iterator[object]:
         """What the command prints: lines and tables."""
         from rich.table import Table
 
-        header, strokes = self.captures.session.header, self.captures.strokes
+        header = self.session.header
         label = source_label(header.source, [header.brush])
-        yield f"{source_note(header.source, header.brush)}; {len(strokes)} presses fitted"
-        for name, why in self.captures.refused:
+        yield f"{source_note(header.source, header.brush)}; {len(self.presses)} presses fitted"
+        for name, why in self.refused:
             yield f"left out: {name}: {why}"
         if self.sizes:
             title = f"sizes of the marks with 95 % intervals ({label})"
-            at = "at {:g} mm, {:g}°".format(*middle(strokes))
+            at = "at {:g} mm, {:g}°".format(*self.presses.middle)
             sizes = Table("size, mm", at, "per mm of depth", "per degree of tilt", title=title)
             for size in self.sizes:
                 sizes.add_row(size.name, str(size.here), str(size.by_depth), str(size.by_tilt))
@@ -174,69 +229,64 @@ def fit_presses(request: FitRequest, progress: Progress = unseen) -> FitResult:
     """
     if request.prior is not None:
         raise CalibrationError("--prior", "adapts a fit of drags, and this session holds presses")
-    captures = read_presses(request.session, progress)
-    session, grid, strokes = captures.session, captures.grid, captures.strokes
-    press = fit_parameters(strokes, grid, captures.radius_mm, captures.length_mm)
-    held_out = leave_cell_out(strokes, grid, press, progress=progress, store=session.store)
+    session, presses, refused = read_for_fit(request.session, progress)
+    press = fit_parameters(presses)
+    held_out = leave_cell_out(presses, press, progress=progress, store=session.store)
     fit = BrushFit(
         session_id=session.header.session_id,
         source=session.header.source,
         recording_sha256=session.sha256,
         calibration=session.calibration_digest,
         software=made_by(),
-        radius_mm=captures.radius_mm,
-        length_mm=captures.length_mm,
-        strokes=len(strokes),
-        cells=tuple(by_cell(strokes)),
+        radius_mm=presses.radius_mm,
+        length_mm=presses.length_mm,
+        strokes=len(presses),
+        cells=tuple(presses.cells),
         mm_per_px=MM_PER_PX,
         parameters=dict(zip(NAMES, press.values.tolist(), strict=True)),
         edges_mm=press.edges.tolist(),
         ends_mm=press.ends.tolist(),
         csim_percent={row.model: row.csim for row in held_out},
     )
-    sizes, path = sizes_of(strokes, grid), put_to_use(fit, session.recording.path.parent, FOLDER)
-    page = _write_page(captures, press, sizes, held_out, path)
-    return FitResult(captures, fit, sizes, held_out, path, page)
+    path = put_to_use(fit, session.recording.path.parent, FOLDER)
+    result = FitResult(session, presses, refused, fit, sizes_of(presses), held_out, path)
+    _write_page(result, press)
+    return result
 
 
-def _write_page(
-    captures: Captures, press: FittedPress, sizes: Sequence[Size], held_out: Sequence[HeldOut], path: Path
-) -> Path:
-    """Write the page of the fit at `path` beside it; returns the page's path. Raises OSError."""
-    session = captures.session
-    header = session.header
-    cells = by_cell(captures.strokes)
-    published = FittedPress(captures.radius_mm, captures.length_mm)
-    return write_page(
-        path.with_suffix(".html"),
+def _write_page(result: FitResult, press: FittedPress) -> None:
+    """Write the page of the fit. Raises OSError."""
+    session, presses = result.session, result.presses
+    header, published = session.header, FittedPress(presses.radius_mm, presses.length_mm)
+    write_page(
+        result.page,
         "fit.html.j2",
         **about(header),
         session=header.session_id,
-        window=_window(captures, (press, published)),
-        cells=[_cell(cell, strokes, press, published, captures.grid) for cell, strokes in cells.items()],
-        verdict=list(_verdict(captures, held_out)),
-        trust=[source_point(header.source), *_trust(captures, held_out)],
-        chart=_chart(captures, press),
-        measured=sizes,
-        middle="{:g} mm, {:g}°".format(*middle(captures.strokes)),
-        held_out=held_out,
-        refused=captures.refused,
+        window=_window(presses, (press, published)),
+        cells=[_cell(presses, cell, numbers, press, published) for cell, numbers in presses.cells.items()],
+        verdict=list(_verdict(result)),
+        trust=[source_point(header.source), *_trust(result)],
+        chart=_chart(presses, press, header),
+        measured=result.sizes,
+        middle="{:g} mm, {:g}°".format(*presses.middle),
+        held_out=result.held_out,
+        refused=result.refused,
         facts=[
             *recording_facts(header, session.recording.path.name, session.sha256, session.calibration),
-            ("images", f"{captures.grid.px_mm:g} mm per pixel"),
+            ("images", f"{presses.grid.px_mm:g} mm per pixel"),
             ("fitted with", made_by()),
-            ("artefact", path.name),
+            ("artefact", result.path.name),
         ],
     )
 
 
-def _window(captures: Captures, presses: tuple[FittedPress, ...]) -> tuple[float, float, float, float]:
+def _window(presses: Presses, brushes: tuple[FittedPress, ...]) -> tuple[float, float, float, float]:
     """The (left, top, width, height) in mm, y downward, that holds all ink and every outline."""
-    grid = captures.grid
-    inked = np.any([stroke.ink > 0.5 for stroke in captures.strokes], axis=0)
+    grid, inked = presses.grid, (presses.ink > 0.5).any(axis=0)
     x, y = grid.x_mm[inked.any(axis=0)], -grid.y_mm[inked.any(axis=1)]
     low, high = np.array([x[0], y[0]]), np.array([x[-1], y[-1]])
-    for loop in (_outline(press, cell) for press in presses for cell in by_cell(captures.strokes)):
+    for loop in (_outline(brush, cell) for brush in brushes for cell in presses.cells):
         if loop is not None:
             points = loop.points.reshape(-1, 2) * np.array([1.0, -1.0])
             low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
@@ -244,33 +294,28 @@ def _window(captures: Captures, presses: tuple[FittedPress, ...]) -> tuple[float
     return round(left, 3), round(top, 3), round(width, 3), round(height, 3)
 
 
-def _cell(cell: Cell, strokes: list[Pressed], press: FittedPress, published: FittedPress, grid: Grid) -> dict[str, Any]:
+def _cell(
+    presses: Presses, cell: Cell, numbers: list[int], press: FittedPress, published: FittedPress
+) -> dict[str, Any]:
     """One picture: the mean ink of the cell's presses, and both outlines as SVG paths in mm."""
-    mean = np.mean([stroke.ink for stroke in strokes], axis=0).astype(np.float32)
+    grid, ink = presses.grid, presses.ink[numbers]
     left, top = float(grid.x_mm[0]) - 0.5 * grid.px_mm, -float(grid.y_mm[0]) - 0.5 * grid.px_mm
     across, down = len(grid.x_mm) * grid.px_mm, len(grid.y_mm) * grid.px_mm
+    alike: list[float] = []
+    with contextlib.suppress(DomainError):  # so light that the brush leaves no mark
+        drawn = np.asarray(press.chance(*cell, grid.x_mm, grid.y_mm, SPREAD_MM) > 0.5, np.float32)
+        if drawn.any():
+            alike = [csim(drawn, seen) for seen in np.asarray(ink > 0.5, np.float32) if seen.any()]
     return {
         "depth_mm": f"{cell[0]:g}",
         "tilt_deg": f"{cell[1]:g}",
-        "presses": len(strokes),
-        "ink": ink_uri(mean),
+        "presses": len(numbers),
+        "ink": ink_uri(ink.mean(axis=0).astype(np.float32)),
         "place": (round(left, 3), round(top, 3), round(across, 3), round(down, 3)),
         "fitted": _path(press, cell),
         "published": _path(published, cell),
-        "csim": _csim(press, cell, strokes, grid),
+        "csim": f"{100.0 * np.mean(alike):.1f}" if alike else "",
     }
-
-
-def _csim(press: FittedPress, cell: Cell, strokes: list[Pressed], grid: Grid) -> str:
-    """Average CSIM of the fit and the presses that it was fitted to, percent; empty where it draws no mark."""
-    try:
-        drawn = np.asarray(press.chance(*cell, grid.x_mm, grid.y_mm, SPREAD_MM) > 0.5, np.float32)
-    except DomainError:
-        return ""
-    if not drawn.any():
-        return ""
-    seen = [np.asarray(stroke.ink > 0.5, np.float32) for stroke in strokes]
-    return f"{100.0 * np.mean([csim(drawn, image) for image in seen if image.any()]):.1f}"
 
 
 def _outline(press: FittedPress, cell: Cell) -> Outline | None:
@@ -291,70 +336,49 @@ def _path(press: FittedPress, cell: Cell) -> str:
     return f"M{x:g} {y:g}{curves}Z"
 
 
-def _chart(captures: Captures, press: FittedPress) -> str:
+def _chart(presses: Presses, press: FittedPress, header: Header) -> str:
     """Length and width against depth: the ink of each press as a point, the fit as a line for each tilt."""
-    strokes, grid = captures.strokes, captures.grid
-    depths = sorted({stroke.depth_mm for stroke in strokes})
-    tilts = sorted({stroke.tilt_deg for stroke in strokes})
-    shown = tilts if len(tilts) <= len(COLOURS) else [tilts[0], tilts[len(tilts) // 2], tilts[-1]]
-    seen = {tilt: np.array([_measured(s, grid) for s in strokes if s.tilt_deg == tilt]) for tilt in shown}
-    smooth = np.linspace(depths[0], depths[-1], SMOOTH_POINTS).tolist()
-    drawn = {tilt: np.array([_fitted(press, depth, tilt, grid.x_mm) for depth in smooth]) for tilt in shown}
+    depths, tilts = presses.commands.T
+    every = np.unique(tilts).tolist()
+    shown = every if len(every) <= len(COLOURS) else [every[0], every[len(every) // 2], every[-1]]
+    smooth = np.linspace(depths.min(), depths.max(), SMOOTH_POINTS).tolist()
+    sizes = np.array([measure(ink, presses.grid) for ink in presses.ink])
+    drawn = {tilt: np.array([_fitted(press, depth, tilt, presses.grid.x_mm) for depth in smooth]) for tilt in shown}
     panels: list[Panel] = []
-    for column, what in ((1, "length"), (2, "width")):
+    for column, (what, seen) in enumerate((("length", sizes[:, 0] + sizes[:, 1]), ("width", sizes[:, 2]))):
         marks: list[Marks] = []
         for tilt, colour in zip(shown, COLOURS, strict=False):
-            points, line = seen[tilt], drawn[tilt]
-            marks.append(Marks(points[:, 0], points[:, column], colour, f"α {tilt:g}°", dot_px=6.0))
-            marks.append(Marks(line[:, 0], line[:, column], colour, line_px=1.5))
+            marks.append(Marks(depths[tilts == tilt], seen[tilts == tilt], colour, f"α {tilt:g}°", dot_px=6.0))
+            marks.append(Marks(smooth, drawn[tilt][:, column], colour, line_px=1.5))
         panels.append(Panel(what, Axis("commanded depth H, mm"), Axis(f"{what} of the mark, mm"), marks))
-    header = captures.session.header
     return chart_uri(panels, (960, 320), source_label(header.source, [header.brush]))
 
 
-def _measured(stroke: Pressed, grid: Grid) -> tuple[float, float, float]:
-    """Depth of a press, length and width of its ink, mm."""
-    toward_tip, toward_heel, width = measure(stroke, grid).tolist()
-    return stroke.depth_mm, toward_tip + toward_heel, width
-
-
-def _fitted(press: FittedPress, depth_mm: float, tilt_deg: float, x_mm: Floats) -> tuple[float, float, float]:
-    """Depth of a press, length and width of the mark that is predicted, mm; NaN where there is none."""
+def _fitted(press: FittedPress, depth_mm: float, tilt_deg: float, x_mm: Floats) -> tuple[float, float]:
+    """Length and width of the mark that is predicted, mm; NaN where there is none."""
     try:
         sizes = press.sizes(depth_mm, tilt_deg)
         width = np.maximum(press.edges_at(depth_mm, tilt_deg, x_mm), 0.0).sum(axis=0).max()
     except DomainError:
-        return depth_mm, math.nan, math.nan
-    return depth_mm, float(sizes.tip + sizes.heel), float(width)
+        return math.nan, math.nan
+    return float(sizes.tip + sizes.heel), float(width)
 
 
-def _verdict(captures: Captures, held_out: Sequence[HeldOut]) -> Iterator[str]:
-    brush = captures.session.header.brush or "a brush without a name"
-    presses, cells = len(captures.strokes), len(by_cell(captures.strokes))
+def _verdict(result: FitResult) -> Iterator[str]:
+    brush = result.session.header.brush or "a brush without a name"
+    presses, cells = len(result.presses), len(result.presses.cells)
     yield f"The stroke model was fitted to {presses} presses at {cells} combinations of H and α: {brush}."
-    scores = {row.model: row.csim for row in held_out}
-    if FITTED not in scores:
-        yield "Only one combination was pressed, so how well it predicts others is not known."
-        return
-    ceiling = f"; a perfect model would reach {scores[CEILING]:.1f} %" if CEILING in scores else ""
-    yield (
-        f"On combinations that were left out of the fit it predicts the ink with a CSIM of {scores[FITTED]:.1f} %, "
-        f"the model as published with {scores[UNCALIBRATED]:.1f} %{ceiling}."
-    )
+    if result.held_out:
+        scores = ", ".join(f"{row.model} {row.csim:.1f} %" for row in result.held_out)
+        yield f"On combinations that were left out of the fit, the CSIM is: {scores}."
 
 
-def _trust(captures: Captures, held_out: Sequence[HeldOut]) -> Iterator[Point]:
-    below = {row.model: row.below for row in held_out}
-    if not below:
-        yield Point(False, "One combination of H and α does not show how the mark changes with depth or tilt.")
-    elif (off := below.get(FITTED)) is not None:
+def _trust(result: FitResult) -> Iterator[Point]:
+    off = next((row.below for row in result.held_out if row.model == FITTED), None)
+    if off is None:
+        yield Point(None, "No combination was pressed twice, so the repeatability of the brush is not known here.")
+    else:
         span = "" if off.avg_interval is None else " (95 % {:.1f} to {:.1f})".format(*off.avg_interval)
         words = f"Held out, the fit is {off.avg:.1f} points of CSIM{span} below the ceiling"
         yield Point(is_near(off.avg, off.avg_interval), f"{words}; {NEAR_POINTS:g} or less is near.")
-    else:
-        yield Point(None, "No combination was pressed twice, so the repeatability of the brush is not known here.")
-    if captures.refused:
-        yield Point(False, f"{len(captures.refused)} presses could not be used; each is named below.")
-    else:
-        yield Point(True, "Every press was used.")
     yield Point(None, "The pictures above show presses that were fitted; judge the fit by the held-out scores.")

@@ -3,39 +3,28 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.compare import Alignment, similarity
-from brushloop.calibrate.fit.captures import Cell, Floats, Grid, Pressed, by_cell
-from brushloop.calibrate.fit.descent import Prior, fit_presses
+from brushloop.calibrate.fit.descent import Floats, Prior, fit_presses
 from brushloop.calibrate.stats import CEILING, Summary, ceiling_values, pair_means, summarise
 from brushloop.calibrate.work import Arrays, Scheduler, Store, key_of, threads
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.fitted import FittedPress
-from brushloop.model.outline import Outline, as_batch
-from brushloop.model.strokes import fit_plane
-from brushloop.model.strokes.peers import bezier
-from brushloop.sessions.records import Condition
+from brushloop.model.presses import Cell, Draw, Presses, image_of, refit_bezier
 from brushloop.sessions.terminal import Progress, counted, unseen
 
-BEZIER_SIZES = ("left_mm", "right_mm", "belly_mm", "shoulder")
 FITTED, BEZIER, UNCALIBRATED = "fitted", "refitted Bezier", "uncalibrated"
 Images = NDArray[np.floating]
-Draw = Callable[[float, float], Outline]
-"""The mark of a press by depth and tilt, x from the point of touch."""
 MAX_FOLDS = 15
 """Most folds: the paper's grid leaves out one cell at a time, a larger grid several."""
 PER_CELL = 3
 """Presses of each other cell that a fit uses; more did not change it."""
 MAX_STROKES = 60
-FINE = 16
-T = TypeVar("T")
-C = TypeVar("C", Cell, Condition)
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,18 +39,18 @@ class HeldOut:
     """Points of CSIM below the ceiling; None for the ceiling itself, and where no cell was pressed twice."""
 
 
-Predicted = tuple[Sequence[Pressed], Mapping[str, Images]]
-"""The presses of one cell, and what each model predicts there without them."""
+Predicted = tuple[Floats, Mapping[str, Images]]
+"""The ink of the presses of one cell, (n, rows, columns), and what each model predicts there without them."""
 
 
-def leave_out(cells: Mapping[C, Sequence[T]], most: int = MAX_FOLDS) -> list[tuple[list[C], list[T]]]:
+def leave_out(cells: Mapping[Cell, Sequence[int]]) -> list[tuple[list[Cell], list[int]]]:
     """Cells that are left out together, and the presses of all others that a fit uses; none if no press is left."""
     ordered = sorted(cells)
-    folds = [ordered[k::most] for k in range(min(len(ordered), most))]
+    folds = [ordered[k::MAX_FOLDS] for k in range(min(len(ordered), MAX_FOLDS))]
     return [(fold, others) for fold in folds if (others := _without(cells, fold))]
 
 
-def _without(cells: Mapping[C, Sequence[T]], fold: Sequence[C]) -> list[T]:
+def _without(cells: Mapping[Cell, Sequence[int]], fold: Sequence[Cell]) -> list[int]:
     others = [press for cell, group in cells.items() if cell not in fold for press in group[:PER_CELL]]
     return others[:: max(1, -(-len(others) // MAX_STROKES))]
 
@@ -70,10 +59,7 @@ def _without(cells: Mapping[C, Sequence[T]], fold: Sequence[C]) -> list[T]:
 class Refit:
     """A fit of the brush to some presses of a session."""
 
-    strokes: Sequence[Pressed]
-    grid: Grid
-    radius_mm: float
-    length_mm: float
+    presses: Presses
     prior: Prior | None = None
     start: Floats | None = None
     """Parameters (17,) of the fit to all presses, where the descent begins; None searches from the prior."""
@@ -82,14 +68,14 @@ class Refit:
     def key(self) -> str:
         """Key in the store of finished work."""
         prior = () if self.prior is None else (self.prior.mean, self.prior.precision)
-        presses = (part for stroke in self.strokes for part in (stroke.depth_mm, stroke.tilt_deg, stroke.ink))
-        grid = self.grid.x_mm, self.grid.y_mm
-        return key_of("refit", self.radius_mm, self.length_mm, *grid, *prior, self.start, *presses)
+        of, grid = self.presses, self.presses.grid
+        numbers = of.radius_mm, of.length_mm, grid.x_mm, grid.y_mm, of.commands, of.ink
+        return key_of("refit", *numbers, *prior, self.start)
 
 
 def refit(job: Refit) -> Arrays:
     """The numbers of the fitted brush."""
-    press = fit_presses(job.strokes, job.grid, job.radius_mm, job.length_mm, prior=job.prior, start=job.start)
+    press = fit_presses(job.presses, prior=job.prior, start=job.start)
     return {"values": press.values, "edges": press.edges, "ends": press.ends}
 
 
@@ -100,12 +86,12 @@ def refits(
     keys = [job.key for job in jobs]
     unique = dict(zip(keys, jobs, strict=True))
     results = dict(counted(scheduler.finished(refit, unique.items(), store), what, len(unique), progress))
-    return [FittedPress(job.radius_mm, job.length_mm, **results[key]) for key, job in zip(keys, jobs, strict=True)]
+    brushes = ((job.presses.radius_mm, job.presses.length_mm) for job in jobs)
+    return [FittedPress(*brush, **results[key]) for key, brush in zip(keys, brushes, strict=True)]
 
 
 def leave_cell_out(
-    strokes: Sequence[Pressed],
-    grid: Grid,
+    presses: Presses,
     press: FittedPress,
     prior: Prior | None = None,
     progress: Progress = unseen,
@@ -117,32 +103,31 @@ def leave_cell_out(
     Models without enough data are left out: the ceiling needs two strokes of a cell, a regressed Bezier two depths and
     two tilts among the others.
     """
-    cells = by_cell(strokes)
-    brush = press.radius_mm, press.length_mm
-    published = FittedPress(*brush)
-    left_out = leave_out(cells)
-    jobs = [Refit(others, grid, *brush, prior, press.values) for _, others in left_out]
+    cells = presses.cells
+    published = FittedPress(presses.radius_mm, presses.length_mm)
+    left_out = [(fold, presses.pick(others)) for fold, others in leave_out(cells)]
+    jobs = [Refit(others, prior, press.values) for _, others in left_out]
     with threads(1) as scheduler:  # a fit holds Python's lock nearly all the time: two at once take half as long again
-        presses = refits(jobs, store, scheduler, "cells left out in turn", progress)
+        brushes = refits(jobs, store, scheduler, "cells left out in turn", progress)
     predicted: list[Predicted] = []
-    for (fold, others), refitted in zip(left_out, presses, strict=True):
+    for (fold, others), refitted in zip(left_out, brushes, strict=True):
         outlines: dict[str, Draw] = {FITTED: refitted.outline, UNCALIBRATED: published.outline}
-        if (of_others := refit_bezier(others, grid)) is not None:
+        if (of_others := refit_bezier(others)) is not None:
             outlines[BEZIER] = of_others
         for cell in fold:
             images: dict[str, Images] = {}
             for name, outline in outlines.items():
                 with contextlib.suppress(DomainError):  # so light that the brush leaves no mark
-                    images[name] = image_of(outline(*cell), grid)
-            predicted.append((cells[cell], images))
+                    images[name] = image_of(outline(*cell), presses.grid)
+            predicted.append((presses.ink[cells[cell]], images))
     return held_out_scores(predicted, (FITTED, BEZIER, UNCALIBRATED))
 
 
 def held_out_scores(predicted: Sequence[Predicted], models: Sequence[str]) -> list[HeldOut]:
     """The ceiling, then these models in this order; one without a score is left out."""
     values: dict[str, list[Floats]] = {name: [] for name in (CEILING, *models)}
-    for presses, images in predicted:
-        inks = np.array([_binary(press.ink) for press in presses])
+    for ink, images in predicted:
+        inks = _binary(ink)
 
         def score(k: int, others: list[int], inks: Floats = inks) -> Floats:
             return similarity(inks[k], inks[others], Alignment.MM)
@@ -153,7 +138,7 @@ def held_out_scores(predicted: Sequence[Predicted], models: Sequence[str]) -> li
             values[name].append(similarity(drawn, inks, Alignment.MM))
     if not predicted:
         return []
-    cells = np.repeat(np.arange(len(predicted)), [len(presses) for presses, _ in predicted])
+    cells = np.repeat(np.arange(len(predicted)), [len(ink) for ink, _ in predicted])
     percent = {name: 100.0 * np.concatenate(scores) for name, scores in values.items()}
     ceiling = np.stack([ceiling_values(pairs, cells) for pairs in percent[CEILING].T], axis=1)
     rows: list[HeldOut] = []
@@ -164,53 +149,6 @@ def held_out_scores(predicted: Sequence[Predicted], models: Sequence[str]) -> li
             csim, ssim = scores[known].mean(axis=0).tolist()
             rows.append(HeldOut(name, csim, ssim, int(known.sum()), below))
     return rows
-
-
-def image_of(mark: Outline, grid: Grid) -> Images:
-    """Coverage (len(y_mm), len(x_mm)) of a mark with one upper and one lower edge, sampled at `FINE` places a column.
-
-    The compiled raster would be exact, but takes longer to load than all marks of a fit take to draw.
-    """
-    points = mark.polyline()[0]
-    points = np.roll(points, -int(points[:, 0].argmin()), axis=0)  # from the tip along the lower edge, and back
-    heel = int(points[:, 0].argmax())
-    x_mm = (grid.x_mm[:, None] + grid.px_mm * ((np.arange(FINE) + 0.5) / FINE - 0.5)).ravel()
-    lower, upper = points[: heel + 1], np.concatenate([points[heel:], points[:1]])[::-1]
-    below, above = (np.interp(x_mm, edge[:, 0], edge[:, 1], left=0.0, right=0.0) for edge in (lower, upper))
-    bottom_mm = grid.y_mm[:, None] - 0.5 * grid.px_mm
-    inside = np.clip(above - bottom_mm, 0.0, grid.px_mm) - np.clip(below - bottom_mm, 0.0, grid.px_mm)
-    return inside.reshape(len(grid.y_mm), -1, FINE).mean(axis=2) / grid.px_mm
-
-
-def refit_bezier(strokes: Sequence[Pressed], grid: Grid) -> Draw | None:
-    """The paper's Bezier baseline: ends, belly and shoulder of the strokes as planes in (H, H alpha).
-
-    None where a stroke holds no ink, or the cells are too few for a plane.
-    """
-    rows: list[tuple[float, float, float, float]] = []
-    for stroke in strokes:
-        ink = stroke.ink > 0.5
-        columns = np.flatnonzero(ink.any(axis=0))
-        if not len(columns):
-            return None
-        left = float(grid.x_mm[columns[0]]) - 0.5 * grid.px_mm
-        right = float(grid.x_mm[columns[-1]]) + 0.5 * grid.px_mm
-        width = float(stroke.ink.sum(axis=0).max()) * grid.px_mm
-        # The enclosed area is belly length (4 - s) / 5, as in `model.strokes.peers.bezier_sizes`.
-        area = float(stroke.ink.sum()) * grid.px_mm**2
-        rows.append((left, right, width, float(np.clip(4.0 - 5.0 * area / (width * (right - left)), 0.0, 1.0))))
-    height, tilt = [s.depth_mm for s in strokes], [s.tilt_deg for s in strokes]
-    try:
-        plane = fit_plane(height, tilt, dict(zip(BEZIER_SIZES, np.array(rows).T, strict=True)))
-    except ValueError:
-        return None
-
-    def outline(depth_mm: float, tilt_deg: float) -> Outline:
-        left, right, belly, shoulder = plane.at(depth_mm, tilt_deg).values()
-        right, belly, shoulder = max(right, left + 0.2), max(belly, 0.1), min(max(shoulder, 0.0), 1.0)
-        return bezier(*as_batch(-left, right, belly, shoulder))
-
-    return outline
 
 
 def _binary(image: Images) -> Floats:

@@ -13,13 +13,13 @@ from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.compare import Pixels, brush_of, images_of
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.fit import BrushFit
-from brushloop.calibrate.fit.heldout import Draw
 from brushloop.calibrate.session import OpenSession
 from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.work import Store, key_of
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.fitted import NAME as FITTED
 from brushloop.model.outline import Outline
+from brushloop.model.presses import Cell, Draw
 from brushloop.sessions.disk import file_sha256
 from brushloop.sessions.records import Condition
 
@@ -168,11 +168,11 @@ def known_models(session: FittedSession, generators: Sequence[Path], *, ablation
     return in_order(models)
 
 
-def held_out(info: ModelInfo, outlines: Mapping[Condition, Draw | None]) -> Model:
+def held_out(info: ModelInfo, outlines: Mapping[Cell, Draw | None]) -> Model:
     """A model that was fitted without the cell that it predicts; None where the other cells are too few."""
 
     def mark(at: Condition) -> Mark:
-        outline = outlines.get(at)
+        outline = outlines.get((at.depth_mm, at.tilt_deg))
         if outline is None:
             raise DomainError("depth_mm", at.depth_mm, "other cells", "the other cells do not determine this press")
         return outline(at.depth_mm, at.tilt_deg), 0.0

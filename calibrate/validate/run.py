@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -19,14 +19,12 @@ from brushloop.calibrate.compare import (
     Alignment,
     Pixels,
     Tone,
-    brush_of,
     images_of,
     similarity,
 )
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.fit.captures import Pressed, field_grid, pressed
-from brushloop.calibrate.fit.heldout import MAX_FOLDS, Draw, Refit, leave_out, refit_bezier, refits
-from brushloop.calibrate.presses import Press, read_presses, too_thin, uncommanded
+from brushloop.calibrate.fit.heldout import Refit, leave_out, refits
+from brushloop.calibrate.presses import Press, for_fit, read_presses, too_thin, uncommanded
 from brushloop.calibrate.scores import Scores, similarities
 from brushloop.calibrate.stats import others_of
 from brushloop.calibrate.validate.models import (
@@ -43,6 +41,7 @@ from brushloop.calibrate.validate.models import (
     predicted,
 )
 from brushloop.calibrate.work import Arrays, Scheduler, key_of
+from brushloop.model.presses import Draw, refit_bezier
 from brushloop.sessions.records import Condition
 from brushloop.sessions.terminal import Progress, counted, unseen
 
@@ -145,40 +144,22 @@ def _held_out(
 ) -> Iterator[Model]:
     """Yield the models fitted to the session without the cells that they predict."""
     wanted = request.models or (FITTED_HELD_OUT, BEZIER_REFITTED)
-    if request.held_out and (FITTED_HELD_OUT in wanted or BEZIER_REFITTED in wanted):
-        left_out = _left_out(presses, MAX_FOLDS)
-        fits = _refitted(session, left_out, scheduler, progress)
-        if fits:
-            yield held_out(BRUSH_LEFT_OUT, fits)
-        if left_out:
-            beziers = {cell: refit_bezier(others, field_grid()) for fold, others in left_out for cell in fold}
-            yield held_out(BEZIER_LEFT_OUT, beziers)
-
-
-LeftOut = list[tuple[list[Condition], list[Pressed]]]
-"""Cells that are left out together, and the presses of all others that a fit uses."""
-
-
-def _left_out(presses: Sequence[Press], most: int) -> LeftOut:
-    """At most so many groups of cells, with the uncut presses of the others; none for a single cell."""
-    cells: dict[Condition, list[Pressed]] = {at: [] for at in sorted({press.condition for press in presses})}
-    for press in presses:
-        if not press.cut:
-            cells[press.condition].append(pressed(press))
-    return leave_out(cells, most)
-
-
-def _refitted(
-    session: FittedSession, left_out: LeftOut, scheduler: Scheduler, progress: Progress
-) -> dict[Condition, Draw]:
-    """The marks of the brush fitted without each cell; empty for a session that was not fitted."""
-    if session.fit is None:
-        return {}
-    start, grid = session.fit.press(), field_grid()
-    jobs = [Refit(others, grid, start.radius_mm, start.length_mm, start=start.values) for _, others in left_out]
-    what = f"{session.header.session_id}: cells left out in turn"
-    fits = refits(jobs, session.store, scheduler, what, progress)
-    return {cell: fit.outline for (fold, _), fit in zip(left_out, fits, strict=True) for cell in fold}
+    if not request.held_out or not {FITTED_HELD_OUT, BEZIER_REFITTED} & {*wanted}:
+        return
+    whole = for_fit([press for press in presses if not press.cut], session.header)
+    cells = {(press.condition.depth_mm, press.condition.tilt_deg): list[int]() for press in presses} | whole.cells
+    left_out = [(fold, whole.pick(others)) for fold, others in leave_out(cells)]
+    if not left_out:
+        return
+    if session.fit is not None:
+        start = session.fit.press()
+        size = {"radius_mm": start.radius_mm, "length_mm": start.length_mm}
+        jobs = [Refit(replace(others, **size), start=start.values) for _, others in left_out]
+        what = f"{session.header.session_id}: cells left out in turn"
+        fits = refits(jobs, session.store, scheduler, what, progress)
+        brushes = {cell: fit.outline for (fold, _), fit in zip(left_out, fits, strict=True) for cell in fold}
+        yield held_out(BRUSH_LEFT_OUT, brushes)
+    yield held_out(BEZIER_LEFT_OUT, {cell: refit_bezier(others) for fold, others in left_out for cell in fold})
 
 
 ScoreJob = tuple[Pixels, tuple[Sequence[Pixels], ...]]
@@ -225,14 +206,12 @@ def _score(
 
 def _similarity_by_strokes(session: FittedSession, number: int, scores: Scores, scheduler: Scheduler) -> Iterator[Step]:
     """Yield scores of fits from few presses on others of the session; none for a session with too few presses."""
-    name, brush, grid = session.header.session_id, brush_of(session.header), field_grid()
-    trials = list(_trials(name, number, scores))
-    fitted = [[pressed(press) for press in few] for few, _ in trials]
-    jobs = [Refit(few, grid, float(brush.radius_mm), float(brush.length_mm)) for few in fitted]
-    fits = refits(jobs, session.store, scheduler, "fits from few strokes")
+    name = session.header.session_id
+    trials = [(for_fit(few, session.header), others) for few, others in _trials(name, number, scores)]
+    fits = refits([Refit(few) for few, _ in trials], session.store, scheduler, "fits from few strokes")
     values: dict[tuple[int, str], list[NDArray[np.float64]]] = {}
-    for (_, others), few, fit in zip(trials, fitted, fits, strict=True):
-        for label, model in (("CCD-BSM", fit.outline), ("Bézier", refit_bezier(few, grid))):
+    for (few, others), fit in zip(trials, fits, strict=True):
+        for label, model in (("CCD-BSM", fit.outline), ("Bézier", refit_bezier(few))):
             if model is not None:
                 values.setdefault((len(few), label), []).extend(_on_others(model, others))
     for (count, label), of_model in sorted(values.items()):

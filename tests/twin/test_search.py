@@ -13,10 +13,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brushloop.calibrate.fit.captures import Grid, Pressed, field_grid
+from brushloop.calibrate.compare import field_grid
 from brushloop.collect.rig.config import QualityConfig
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 from brushloop.drivers.sim.brush.spec import ALLOWED, PAPER, load_brush
+from brushloop.model.presses import Grid, Presses
 from brushloop.twin.brush import HERE, SHAPE, SPREAD, Constant, draw, with_values
 from brushloop.twin.run import LEAST_MISPLACED_MM, Estimate, fit_twin, sound_head
 from brushloop.twin.search import (
@@ -150,6 +151,7 @@ def test_the_shape_is_found_with_hairs_that_stray_as_those_of_the_captures(monke
     cell = (3.0, 0.0)
     brush = replace(BrushSpec(), strand_mm=0.5)
     captured = draw(brush, HERE, [cell], GRID, repeats=4)[0]
-    twin = fit_twin([Pressed(*cell, ink) for ink in captured], GRID, brush.radius_mm, brush.length_mm, Serial())
+    presses = Presses(brush.radius_mm, brush.length_mm, GRID, np.array([cell] * 4), captured)
+    twin = fit_twin(presses, Serial())
     assert strays == [(1.0, BrushSpec().strand_mm), (0.5, pytest.approx(twin.spec.strand_mm, rel=0.2))]
     assert twin.spec.strand_mm > BrushSpec().strand_mm

@@ -3,11 +3,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brushloop.calibrate.fit.captures import FEWEST_CELLS, Grid, Pressed, sizes_of
 from brushloop.calibrate.fit.descent import KnownBrush, about, draw, fit_presses, learned, of_brushes, regress, spreads
+from brushloop.calibrate.fit.fit import FEWEST_CELLS, sizes_of
 from brushloop.calibrate.fit.heldout import FITTED, leave_cell_out
 from brushloop.calibrate.stats import CEILING
 from brushloop.model.fitted import NAMES, PARAMETERS, TERMS, FittedPress, command_terms, published
+from brushloop.model.presses import Grid, Presses
 
 PX_MM = 0.4
 GRID = Grid((np.arange(100) + 0.5) * PX_MM - 31.0, 8.0 - (np.arange(40) + 0.5) * PX_MM)
@@ -22,22 +23,18 @@ def a_brush(**changed: float) -> FittedPress:
     return FittedPress(6.0, 48.0, values)
 
 
-def presses(brush: FittedPress, cells: list[tuple[float, float]], noise: float = 0.0, seed: int = 0) -> list[Pressed]:
+def presses(brush: FittedPress, cells: list[tuple[float, float]], noise: float = 0.0, seed: int = 0) -> Presses:
     rng = np.random.default_rng(seed)
-    out = []
-    for height, tilt in cells:
+    ink = []
+    for cell in cells:
         y = GRID.y_mm + noise * rng.normal()
-        out.append(Pressed(height, tilt, brush.chance(height, tilt, GRID.x_mm + noise * rng.normal(), y, 0.15)))
-    return out
-
-
-def value(press: FittedPress, name: str) -> float:
-    return float(press.values[NAMES.index(name)])
+        ink.append(brush.chance(*cell, GRID.x_mm + noise * rng.normal(), y, 0.15))
+    return Presses(6.0, 48.0, GRID, np.array(cells).reshape(-1, 2), np.array(ink))
 
 
 def test_a_brush_of_the_family_is_found_again() -> None:
     truth = a_brush(h0_mm=1.0, width_power=1.2)
-    fit = fit_presses(presses(truth, CELLS), GRID, 6.0, 48.0, residual=False)
+    fit = fit_presses(presses(truth, CELLS), residual=False)
     for height, tilt in [(13.0, 5.0), (17.0, 10.0)]:
         seen, wanted = (np.maximum(b.edges_at(height, tilt, GRID.x_mm)[0], 0.0) for b in (fit, truth))
         assert seen.max() == pytest.approx(wanted.max(), rel=0.03)
@@ -52,7 +49,7 @@ def test_a_brush_far_from_all_known_ones_does_not_end_the_fit_far_from_its_marks
     far = spreads() * np.linalg.cholesky(np.linalg.inv(known.precision)) @ rng.normal(size=len(NAMES))
     low, high = (np.array([getattr(spec, end) for spec in PARAMETERS]) for end in ("low", "high"))
     truth = FittedPress(6.0, 48.0, np.clip(known.values + 1.5 * far, low, high))
-    fit = fit_presses(presses(truth, cells[:-1], noise=0.2, seed=seed), GRID, 6.0, 48.0, residual=False)
+    fit = fit_presses(presses(truth, cells[:-1], noise=0.2, seed=seed), residual=False)
     seen, wanted = (np.maximum(b.edges_at(*cells[-1], GRID.x_mm)[0], 0.0) for b in (fit, truth))
     assert np.abs(seen - wanted).mean() < 0.2
 
@@ -60,18 +57,18 @@ def test_a_brush_far_from_all_known_ones_does_not_end_the_fit_far_from_its_marks
 def test_sizes_of_marks_are_those_of_the_brush_with_intervals_that_narrow() -> None:
     truth = a_brush()
     at = truth.sizes(15.5, 5.0)
-    few = sizes_of(presses(truth, CELLS, noise=0.2), GRID)
+    few = sizes_of(presses(truth, CELLS, noise=0.2))
     assert [size.name for size in few] == ["reach toward the tip", "reach toward the heel", "width"]
     assert few[2].here.low < 2.0 * (at.half + 0.4) < few[2].here.high
     assert few[2].by_depth.low > 0.0, "it opens as it is pressed deeper"
     every = [(height, tilt) for height in (11.0, 13.0, 15.0, 17.0, 20.0) for tilt in (0.0, 5.0, 10.0)]
-    many = sizes_of(presses(truth, every, noise=0.2), GRID)
+    many = sizes_of(presses(truth, every, noise=0.2))
     assert many[2].here.high - many[2].here.low < 0.7 * (few[2].here.high - few[2].here.low)
 
 
 def test_too_few_cells_give_no_interval() -> None:
-    assert sizes_of(presses(a_brush(), CELLS[: FEWEST_CELLS - 1] * 3), GRID) == []
-    assert sizes_of(presses(a_brush(), [(h, 0.0) for h in range(11, 18)]), GRID) == [], "one tilt shows no slope"
+    assert sizes_of(presses(a_brush(), CELLS[: FEWEST_CELLS - 1] * 3)) == []
+    assert sizes_of(presses(a_brush(), [(h, 0.0) for h in range(11, 18)])) == [], "one tilt shows no slope"
 
 
 def test_products_of_the_jacobian_are_those_of_the_whole_image() -> None:
@@ -93,13 +90,13 @@ def test_products_of_the_jacobian_are_those_of_the_whole_image() -> None:
 def test_edges_that_the_profile_does_not_have_are_found() -> None:
     truth = replace(a_brush(), edges=np.zeros_like(a_brush().edges))
     truth.edges[0, 1, 0] = 0.5
-    fit = fit_presses(presses(truth, CELLS), GRID, 6.0, 48.0)
+    fit = fit_presses(presses(truth, CELLS))
     assert fit.edges[0, 1, 0] - fit.edges[1, 1, 0] == pytest.approx(0.5, abs=0.15)
 
 
 def test_held_out_cells_are_scored_beside_the_ceiling() -> None:
     strokes = presses(a_brush(), CELLS * 3, noise=0.05)
-    rows = {row.model: row for row in leave_cell_out(strokes, GRID, fit_presses(strokes, GRID, 6.0, 48.0))}
+    rows = {row.model: row for row in leave_cell_out(strokes, fit_presses(strokes))}
     assert rows[FITTED].n == rows[CEILING].n == 15
     assert rows["uncalibrated"].csim + 5.0 < rows[FITTED].csim <= 100.0
     below = rows[FITTED].below
@@ -114,12 +111,12 @@ def test_held_out_cells_are_scored_beside_the_ceiling() -> None:
 def test_two_presses_of_a_cell_are_enough_for_the_ceiling_and_one_is_not() -> None:
     for repeats, known in ((2, True), (1, False)):
         strokes = presses(a_brush(), CELLS[:3] * repeats, noise=0.05)
-        rows = {row.model: row for row in leave_cell_out(strokes, GRID, fit_presses(strokes, GRID, 6.0, 48.0))}
+        rows = {row.model: row for row in leave_cell_out(strokes, fit_presses(strokes))}
         assert (CEILING in rows) is known
         assert (rows[FITTED].below is not None) is known
-    assert leave_cell_out(presses(a_brush(), CELLS[:1] * 2), GRID, a_brush()) == []
-    with pytest.raises(ValueError, match="at least one stroke"):
-        fit_presses([], GRID, 6.0, 48.0)
+    assert leave_cell_out(presses(a_brush(), CELLS[:1] * 2), a_brush()) == []
+    with pytest.raises(ValueError, match="at least one press"):
+        fit_presses(presses(a_brush(), []))
 
 
 def test_the_prior_lies_among_the_known_brushes_and_admits_others() -> None:
