@@ -269,5 +269,3 @@ TABLE_3: dict[str, Printed] = {
 }
 """The character zi. The paper does not say what each row was compared with, nor whether it wrote 字 or 子, nor its
 polarity: the pairing of its rows with ours is our interpretation."""
-ORDER = ("ccd-bsmg", "ccd-bsm", "bezier", "ellipse", "line", "circle")
-"""Models by average CSIM and SSIM, best first, as the paper states it."""

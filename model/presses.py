@@ -103,7 +103,7 @@ def plane_at(commands: Floats, measured: Floats, at: Cell) -> Floats:
 
     `measured` (n, 3) are the `SIZES` at the commands (n, 2). Raises ValueError if these do not span depth and tilt.
     """
-    plane = fit_plane(*commands.T, dict(zip(SIZES, measured.T, strict=True)))
+    plane = fit_plane(commands[:, 0], commands[:, 1], dict(zip(SIZES, measured.T, strict=True)))
     depth, tilt = at
     rows = [list(plane.at(*command).values()) for command in ((depth, tilt), (depth + 1.0, tilt), (depth, tilt + 1.0))]
     return np.array([rows[0], np.subtract(rows[1], rows[0]), np.subtract(rows[2], rows[0])])
@@ -125,9 +125,10 @@ def refit_bezier(presses: Presses) -> Draw | None:
         # The enclosed area is belly length (4 - s) / 5, as in `model.strokes.peers.bezier_sizes`.
         area = float(ink.sum()) * grid.px_mm**2
         rows.append((left, right, width, float(np.clip(4.0 - 5.0 * area / (width * (right - left)), 0.0, 1.0))))
-    sizes = dict(zip(("left_mm", "right_mm", "belly_mm", "shoulder"), np.array(rows).T, strict=True))
+    names = "left_mm", "right_mm", "belly_mm", "shoulder"
     try:
-        plane = fit_plane(*presses.commands.T, sizes)
+        depths_mm, tilts_deg = presses.commands[:, 0], presses.commands[:, 1]
+        plane = fit_plane(depths_mm, tilts_deg, dict(zip(names, np.array(rows).T, strict=True)))
     except ValueError:
         return None
 

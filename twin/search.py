@@ -233,7 +233,7 @@ class Spread:
 def fit_spread(
     spec: BrushSpec,
     place: Place,
-    repeats: Mapping[Cell, Images],
+    repeats: Mapping[Cell, NDArray[np.floating]],
     grid: Grid,
     workers: Executor,
     start: Sequence[float] = SPREAD_START,
@@ -271,7 +271,7 @@ def _drawn(spec: BrushSpec, place: Place, cells: Sequence[Cell], grid: Grid, poi
     return list(draw(with_values(spec, SPREAD, point), place, cells, grid, REPEATS, FIRST_SEED))
 
 
-def statistics(ink: Sequence[Images], grid: Grid) -> Vector:
+def statistics(ink: Sequence[NDArray[np.floating]], grid: Grid) -> Vector:
     """Logarithms of deviations between repeats and of 1 - CSIM of two of them.
 
     The deviations are those of log area, and in mm of the tip's x and of the y of the tip and of the heel.
@@ -283,14 +283,14 @@ def statistics(ink: Sequence[Images], grid: Grid) -> Vector:
     return np.log(np.append(deviations, 1.0 - agreement(ink) / 100.0) + 1e-6)
 
 
-def agreement(ink: Sequence[Images]) -> float:
+def agreement(ink: Sequence[NDArray[np.floating]]) -> float:
     """Mean CSIM in percent of two repeats of a cell, as binary images."""
     binary = [(cell > 0.5).astype(np.float32) for cell in ink]
     pairs = [csim(a, b) for cell in binary for a, b in combinations(cell, 2)]
     return 100.0 * float(np.mean(pairs))
 
 
-def _measure(image: Images, grid: Grid) -> tuple[float, float, float, float]:
+def _measure(image: NDArray[np.floating], grid: Grid) -> tuple[float, float, float, float]:
     ink = image > 0.5
     columns = np.flatnonzero(ink.any(axis=0))
     if not columns.size:

@@ -283,7 +283,7 @@ def _write_page(result: FitResult, press: FittedPress) -> None:
 
 def _window(presses: Presses, brushes: tuple[FittedPress, ...]) -> tuple[float, float, float, float]:
     """The (left, top, width, height) in mm, y downward, that holds all ink and every outline."""
-    grid, inked = presses.grid, (presses.ink > 0.5).any(axis=0)
+    grid, inked = presses.grid, np.any(presses.ink > 0.5, axis=0)
     x, y = grid.x_mm[inked.any(axis=0)], -grid.y_mm[inked.any(axis=1)]
     low, high = np.array([x[0], y[0]]), np.array([x[-1], y[-1]])
     for loop in (_outline(brush, cell) for brush in brushes for cell in presses.cells):
@@ -338,10 +338,10 @@ def _path(press: FittedPress, cell: Cell) -> str:
 
 def _chart(presses: Presses, press: FittedPress, header: Header) -> str:
     """Length and width against depth: the ink of each press as a point, the fit as a line for each tilt."""
-    depths, tilts = presses.commands.T
+    depths, tilts = presses.commands[:, 0], presses.commands[:, 1]
     every = np.unique(tilts).tolist()
     shown = every if len(every) <= len(COLOURS) else [every[0], every[len(every) // 2], every[-1]]
-    smooth = np.linspace(depths.min(), depths.max(), SMOOTH_POINTS).tolist()
+    smooth = np.linspace(float(depths.min()), float(depths.max()), SMOOTH_POINTS).tolist()
     sizes = np.array([measure(ink, presses.grid) for ink in presses.ink])
     drawn = {tilt: np.array([_fitted(press, depth, tilt, presses.grid.x_mm) for depth in smooth]) for tilt in shown}
     panels: list[Panel] = []

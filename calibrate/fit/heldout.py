@@ -45,8 +45,8 @@ Predicted = tuple[Floats, Mapping[str, Images]]
 
 def leave_out(cells: Mapping[Cell, Sequence[int]]) -> list[tuple[list[Cell], list[int]]]:
     """Cells that are left out together, and the presses of all others that a fit uses; none if no press is left."""
-    ordered = sorted(cells)
-    folds = [ordered[k::MAX_FOLDS] for k in range(min(len(ordered), MAX_FOLDS))]
+    cells = dict(sorted(cells.items()))
+    folds = [list(cells)[k::MAX_FOLDS] for k in range(min(len(cells), MAX_FOLDS))]
     return [(fold, others) for fold in folds if (others := _without(cells, fold))]
 
 

@@ -23,11 +23,9 @@ from brushloop.calibrate.remote import URL, local_path
 from brushloop.calibrate.report import framed, png_uri, write_files
 from brushloop.calibrate.scores import scores_csv, write_parquet
 from brushloop.calibrate.session import open_session as open_recording
-from brushloop.calibrate.validate.figures import Curve, read_curve
 from brushloop.calibrate.validate.findings import terminal_lines
-from brushloop.calibrate.validate.models import FittedSession
-from brushloop.calibrate.validate.page import page_of, pages_beside
-from brushloop.calibrate.validate.run import Outcome, Refused, validate_presses
+from brushloop.calibrate.validate.page import Curve, page_of, pages_beside, read_curve
+from brushloop.calibrate.validate.run import FittedSession, Outcome, Refused, validate_presses
 from brushloop.calibrate.validate.tables import Report, check_gates, parse_gate, report_of, summary_csv
 from brushloop.calibrate.work import cluster, threads
 from brushloop.calibrate.writing.compare import FILE as WRITTEN_FILE
@@ -130,13 +128,15 @@ def open_session(place: str, fit: Path | None = None) -> FittedSession:
     session = open_recording(local_path(place))
     path = session.recording.path
     closed = replay(path.parent / JOURNAL_NAME).closed if (path.parent / JOURNAL_NAME).is_file() else None
-    if closed is not None and closed.sha256 != session.sha256:
+    sha256 = session.sha256
+    if closed is not None and closed.sha256 != sha256:
         raise SessionDamaged(path, "is not the file that the session was closed with: its SHA-256 differs")
     if len({stroke.kind for stroke in session.strokes}) > 1:
         raise CalibrationError(str(path), "mixes presses and drags; validate them as two sessions")
     # A fit of drags is read with the strokes that it predicts.
     used = None if session.strokes[0].kind == "drag" else fit or current(path.parent, FITS)
-    return FittedSession.of(session, None if used is None else load_artefact(used, BrushFit))
+    brush = None if used is None else load_artefact(used, BrushFit)
+    return FittedSession(session.recording, sha256, session.strokes, session.calibration, session.store, brush)
 
 
 def one_source(sessions: Sequence[FittedSession]) -> Source:
@@ -156,27 +156,27 @@ def find_beside(sessions: Sequence[FittedSession]) -> Beside:
     file.
     """
     beside, source = Beside(), sessions[0].header.source
-    brushes = {session.header.brush for session in sessions}
+    brushes, originals = {session.header.brush for session in sessions}, {session.sha256 for session in sessions}
     homes = list(dict.fromkeys(session.recording.path.resolve().parent for session in sessions))
-    originals = {session.sha256 for session in sessions}
-    for folder in (home / LOOP for home in homes):
-        if (folder / LOOP_FILE).is_file():
-            loop = read_loop(folder)
-            why = "" if loop.original_sha256 in originals else f"it is of another recording of {loop.original}"
-            why = why or (f"it is of {loop.source}, not {source}" if loop.source != source else "")
-            if why:
-                beside.notes.append(f"{folder / LOOP_FILE} is left out: {why}; `{loop.MADE_BY}` compares again")
-            else:
+
+    def belongs(path: Path, record: LoopRecord | WrittenRecord, foreign: str) -> bool:
+        if record.source != source:
+            foreign = f"it is of {record.source}, not {source}"
+        if foreign:
+            beside.notes.append(f"{path} is left out: {foreign}; `{record.MADE_BY}` compares again")
+        return not foreign
+
+    for path in (home / LOOP / LOOP_FILE for home in homes):
+        if path.is_file():
+            loop = read_loop(path.parent)
+            foreign = "" if loop.original_sha256 in originals else f"it is of another recording of {loop.original}"
+            if belongs(path, loop, foreign):
                 beside.loops.append(loop)
-    places = dict.fromkeys(place / WRITTEN for home in homes for place in (home, home.parent.parent))
-    for folder in places:
+    for folder in dict.fromkeys(place / WRITTEN for home in homes for place in (home, home.parent.parent)):
         if (folder / WRITTEN_FILE).is_file():
             record = read_written(folder)
-            why = f"it is of {record.source}, not {source}" if record.source != source else ""
-            why = why or (f"it was written with another brush, {record.brush}" if {record.brush} != brushes else "")
-            if why:
-                beside.notes.append(f"{folder / WRITTEN_FILE} is left out: {why}")
-            else:
+            foreign = "" if {record.brush} == brushes else f"it was written with another brush, {record.brush}"
+            if belongs(folder / WRITTEN_FILE, record, foreign):
                 beside.written.append(record)
                 beside.figures_13.append((record.session, figure_13(folder / PICTURE, record)))
     return beside

@@ -10,11 +10,11 @@ from collections.abc import Iterator, Sequence
 
 from rich.table import Table
 
-from brushloop.calibrate.compare import ORDER, Key
+from brushloop.calibrate.compare import Key
 from brushloop.calibrate.report import Point, brush_and_size, source_note, source_point
 from brushloop.calibrate.scores import Stat
 from brushloop.calibrate.stats import CEILING, NEAR_POINTS, Interval, Summary, is_near
-from brushloop.calibrate.validate.models import BEZIER_REFITTED, FITTED_HELD_OUT, HELD_OUT, PRESSES
+from brushloop.calibrate.validate.run import BEZIER_REFITTED, FITTED_HELD_OUT, HELD_OUT, PRESSES
 from brushloop.calibrate.validate.tables import (
     NORMAL,
     STRICT,
@@ -28,9 +28,6 @@ from brushloop.calibrate.validate.tables import (
 )
 from brushloop.calibrate.writing.compare import Table3Row
 
-CLOSE = 0.5
-"""Points below which two models count as equal."""
-FEW_REPEATS = 3
 WIDE_SCALE = 0.005
 """Relative width of pix2len's interval above which it matters: half a percent of every length."""
 MUCH_REFUSED = 0.05
@@ -92,26 +89,6 @@ def verdict(report: Report) -> Iterator[str]:
         yield f"The marks are {length:.2f} times as long and {width:.2f} times as wide as CCD-BSM predicts."
 
 
-def order(report: Report) -> str:
-    """Whether the models rank in the paper's order, size-normalised and binary."""
-    csim = {name: summary.avg for name in ORDER if (summary := _csim(report, name, NORMAL)) is not None}
-    if len(csim) < 3:
-        return ""
-    wanted, ours = list(csim), sorted(csim, key=lambda name: -csim[name])
-    label = {name: _label(report, name) for name in csim}
-    words = " > ".join(f"{label[name]} {csim[name]:.1f}" for name in ours)
-    close = [f"{label[a]} and {label[b]}" for a, b in itertools.pairwise(ours) if csim[a] - csim[b] < CLOSE]
-    near = f" Too close to separate: {'; '.join(close)}." if close else ""
-    if ours == wanted:
-        return f"By average CSIM in the size-normalised alignment the models have the paper's order: {words}.{near}"
-    swapped = [f"{label[b]} before {label[a]}" for a, b in itertools.combinations(wanted, 2) if csim[b] > csim[a]]
-    return (
-        f"By average CSIM in the size-normalised alignment: {words}. The paper's order differs: here "
-        f"{', '.join(swapped)}. Uncalibrated models have the proportions of the paper's brush. If those of this brush "
-        "differ, a model can win by its size alone, and the order says little about the models." + near
-    )
-
-
 def trust(report: Report) -> Iterator[Point]:
     """Points to check before trusting the numbers."""
     yield source_point(report.source)
@@ -162,23 +139,17 @@ def _session(session: Session) -> Iterator[Point]:
 
 
 def _models(report: Report) -> Iterator[Point]:
-    """How well the ceiling is known, and where the calibrated model stands."""
-    repeats = [stat.csim.n for stat in report.stats if stat.cell is not None and stat.model == CEILING]
+    """Whether there is a ceiling, and where the calibrated model stands."""
     if _csim(report, CEILING) is None:
         words = "No cell was pressed twice: the repeatability of the brush is unknown, and there is no ceiling."
         yield Point(False, words)
-    elif min(repeats, default=FEW_REPEATS) < FEW_REPEATS:
-        words = f"Some cells were pressed only {min(repeats)} times, so the ceiling is rough."
-        yield Point(None, f"{words} The paper presses ten times.")
-    held, bezier = (_csim(report, name) for name in (FITTED_HELD_OUT, BEZIER_REFITTED))
+    held = _csim(report, FITTED_HELD_OUT)
     if held is not None and held.below_ceiling is not None:
         near = is_near(held.below_ceiling, held.below_interval)
         words = f"The calibrated model is {_points(held)} below the ceiling; the goal is {NEAR_POINTS:g}"
         yield Point(near, f"{words} (CSIM, mm, binary).")
     elif held is None and not report.source.imported:
         yield Point(None, "No model was calibrated to this brush: run “brushloop fit”, then validate again.")
-    if held is not None and bezier is not None and held.avg < bezier.avg:
-        yield Point(False, "The refitted Bézier predicts unseen cells better than the calibrated CCD-BSM.")
 
 
 def _csim(report: Report, model: str, key: Key = STRICT) -> Summary | None:

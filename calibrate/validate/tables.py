@@ -37,7 +37,7 @@ from brushloop.calibrate.report import Sealed, load_sealed, source_label
 from brushloop.calibrate.scores import MEASURES, Cell, Scores, Stat, find_stat, statistics
 from brushloop.calibrate.session import Calibration
 from brushloop.calibrate.stats import CEILING, Floats, Summary, ceiling_values
-from brushloop.calibrate.validate.models import (
+from brushloop.calibrate.validate.run import (
     ANOTHER,
     FITTED,
     FITTED_HELD_OUT,
@@ -45,8 +45,10 @@ from brushloop.calibrate.validate.models import (
     LAMBDAS,
     FittedSession,
     ModelInfo,
+    Outcome,
+    Refused,
+    Step,
 )
-from brushloop.calibrate.validate.run import Outcome, Refused, Step
 from brushloop.calibrate.writing.compare import ANOTHER as ANOTHER_WRITING
 from brushloop.calibrate.writing.compare import PAPER_ROWS, PLANNED, REFERENCE, SIMULATED, Table3Row, WrittenRecord
 from brushloop.model.ccdbsm import DomainError

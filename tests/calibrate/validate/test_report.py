@@ -21,12 +21,12 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.fit import fit_presses
 from brushloop.calibrate.fit.heldout import BEZIER, FITTED
 from brushloop.calibrate.stats import CEILING
-from brushloop.calibrate.validate import models
+from brushloop.calibrate.validate import run as validation
 from brushloop.calibrate.validate.command import validate
 from brushloop.calibrate.validate.diff import compare
 from brushloop.calibrate.validate.findings import trust
-from brushloop.calibrate.validate.models import BEZIER_REFITTED, FITTED_HELD_OUT
 from brushloop.calibrate.validate.page import provenance
+from brushloop.calibrate.validate.run import BEZIER_REFITTED, FITTED_HELD_OUT
 from brushloop.calibrate.validate.tables import Collected, GateMissed, Report, check_gates, collected_in, load_report
 from brushloop.sessions.events import CaptureResult, Condition, DipResult, Remark, ZeroTouchResult
 from brushloop.sessions.events import Press as Pressed
@@ -274,7 +274,7 @@ def test_a_report_does_not_differ_from_itself(before: Path) -> None:
 def test_another_version_of_a_model_is_compared_stroke_by_stroke(
     session: Path, before: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(models, "_pressed", lambda model, at: (model.profile(at.depth_mm, at.tilt_deg), -9.0))
+    monkeypatch.setattr(validation, "_pressed", lambda model, at: (model.profile(at.depth_mm, at.tilt_deg), -9.0))
     run(session, "--out", tmp_path, *TWO)
     changes = {change.series: change for change in compare(DiffRequest(before, tmp_path)).changes}
     # Every mark is drawn 9 mm too far to the left, in each of the five cells.
