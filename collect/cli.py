@@ -29,10 +29,24 @@ rig_app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+PICTURES = (".png", ".svg", ".pdf", ".jpg")
+"""Endings of a picture's file, which determine its format."""
 RigFile = Annotated[Path, typer.Argument(help="The rig: addresses, frames, limits.")]
 StepArm = Annotated[
     bool, typer.Option("--arm", help="Let the arm move where a step needs it; a key confirms each time.")
 ]
+
+
+def _check_output(option: str, path: Path, *endings: str) -> None:
+    """Raise `ConfigError` if no such file can be written to this path; before anything is computed or asked."""
+    from brushloop.collect.errors import ConfigError
+
+    if path.suffix.lower() not in endings:
+        raise ConfigError(option, "", f"{path} must end in {' or '.join(endings)}")
+    if not path.parent.is_dir():
+        raise ConfigError(option, "", f"{path}: there is no folder {path.parent}")
+    if path.is_dir():
+        raise ConfigError(option, "", f"{path} is a folder")
 
 
 @app.command("strokes")
@@ -46,10 +60,6 @@ def collect(
         typer.Option(min=1, help="Confirm that sheet N of the session is in. Repeating it is safe."),
     ] = None,
     arm: Arm = False,
-    dry_run: Annotated[
-        float | None,
-        typer.Option(help="Only move, lifted by this many mm: nothing is pressed, dipped or kept."),
-    ] = None,
     tui: Tui = None,
     set_up: Annotated[
         bool, typer.Option("--set-up", help="On the screen: accept what each set-up step measured, or measure again.")
@@ -73,11 +83,8 @@ def collect(
         on_screen=screen,
         guided=set_up and screen,
         live=LiveView(live_port) if live else None,
-        dry_run_mm=dry_run,
     )
-    if dry_run is not None:
-        start.dry_run(request)
-    elif left_out := start.collect(request).left_out:
+    if left_out := start.collect(request).left_out:
         raise StrokesLeftOut(left_out)
 
 
@@ -93,7 +100,8 @@ def browse() -> None:
         return start.engine_for(opening)
 
     look_for_pixels()
-    run_app(OperatorApp(browser=SessionBrowser(engine_for)))
+    browser = SessionBrowser(engine_for)
+    run_app(OperatorApp(browser.engine, browser=browser))
 
 
 @app.command()
@@ -122,9 +130,7 @@ def plan(
     from brushloop.collect.walk import all_poses, check_protocol
 
     if picture is not None:
-        from brushloop.collect.rig.check import check_picture
-
-        check_picture(picture)
+        _check_output("--picture", picture, *PICTURES)
     rig, wanted = load_rig(config), load_protocol(protocol)
     if arm or not rig.robot.on_this_machine:
         rig = rig.settled(arm)
@@ -152,32 +158,30 @@ def plan(
 
 def doctor(
     config: Rig = RIG_FILE,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object per device.")] = False,
     report: Annotated[
         Path | None, typer.Option(help="Write an archive for a bug report, without secrets: FILE.zip.")
     ] = None,
 ) -> None:
     """Ask every configured device for its identity and its faults. Powers nothing and moves nothing."""
     import asyncio
-    import json
 
+    from brushloop.collect.errors import ConfigError
     from brushloop.collect.rig.config import load_rig
-    from brushloop.collect.rig.doctor import check_report, doctor_table, examine, write_report
+    from brushloop.collect.rig.doctor import doctor_table, examine, write_report
     from brushloop.drivers.host import HostClock
 
     if report is not None:
-        check_report(report)
+        _check_output("--report", report, ".zip")
+        if report.exists():
+            raise ConfigError("--report", "", f"{report} exists and is not overwritten: choose another name")
         if not config.exists() and _first_report(config, report):
             return
     rig = load_rig(config)
     findings = asyncio.run(examine(rig, HostClock()))
-    if as_json:
-        say(*(json.dumps(finding.as_json()) for finding in findings))
-    else:
-        say(doctor_table(findings))
+    say(doctor_table(findings))
     if report is not None:
         asyncio.run(write_report(report, rig, findings))
-        say(f"{report} holds what was asked and answered. Read it before you send it.", err=as_json)
+        say(f"{report} holds what was asked and answered. Read it before you send it.")
     if not all(finding.well for finding in findings):
         raise typer.Exit(4)
 
@@ -245,39 +249,29 @@ def show(
     picture: Annotated[Path | None, typer.Option(help="Draw it from above: .png, .svg, .pdf or .jpg.")] = None,
 ) -> None:
     """Show a rig: its box of limits and every place that the tip goes to. Asks no device."""
-    from brushloop.collect.rig.check import check_picture, draw_rig, rig_table
+    from brushloop.collect.rig.check import draw_rig, rig_table
     from brushloop.collect.rig.config import load_rig
 
     if picture is not None:
-        check_picture(picture)
+        _check_output("--picture", picture, *PICTURES)
     config = load_rig(rig)
-    if picture is not None:
-        draw_rig(config, picture)
     say(rig_table(config))
     if picture is not None:
+        draw_rig(config, picture)
         say(f"The rig is drawn in {picture}")
 
 
 @rig_app.command()
-def check(
-    rig: RigFile = RIG_FILE,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object instead of text.")] = False,
-) -> None:
+def check(rig: RigFile = RIG_FILE) -> None:
     """Report which values of a rig.toml are plausible, contradict each other, or were not measured. Asks no device.
 
     Ends with code 5 if values contradict each other.
     """
-    import json
-    from dataclasses import asdict
-
     from brushloop.collect.commission.notebook import Notebook, gaps
-    from brushloop.collect.rig.check import check_page, check_rig, contradictions
+    from brushloop.collect.rig.check import check_page, check_rig
     from brushloop.collect.rig.config import load_rig
 
     checks = [*check_rig(load_rig(rig)), *gaps(Notebook.load(rig))]
-    if as_json:
-        say(json.dumps({"contradictions": contradictions(checks), "checks": [asdict(check) for check in checks]}))
-    else:
-        say(check_page(checks))
-    if contradictions(checks):
+    say(check_page(checks))
+    if any(check.verdict == "contradicts" for check in checks):
         raise typer.Exit(5)

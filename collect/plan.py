@@ -199,10 +199,7 @@ MOST_SHEETS = 11
 
 
 def draw_plan(config: RigConfig, protocol: ProtocolConfig, plan: Plan, path: Path) -> None:
-    """Write the picture, in the format of the file's ending. `collect.rig.check.check_picture` must have passed.
-
-    Raises OSError if it cannot be written.
-    """
+    """Write the picture, in the format of the file's ending. Raises OSError if it cannot be written."""
     from matplotlib.figure import Figure as Picture
 
     shown = min(plan.sheets, MOST_SHEETS) if plan.placed else 0

@@ -8,23 +8,22 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from rich.table import Table
 from rich.text import Text
 
 from brushloop.calibrate.board.spec import size_mm
-from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import limits_of
 from brushloop.collect.rig.paper import to_base, to_paper
 
 Axes = Any
 """Axes of matplotlib, whose types are incomplete."""
-ENDINGS = (".png", ".svg", ".pdf", ".jpg")
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 """From the palette of Okabe and Ito, which colour-blind people can tell apart; the marks differ in shape too."""
 PAPER = "#fbf7ea"
@@ -36,7 +35,6 @@ MARKS = {
     "touch point": ("x", ORANGE),
 }
 """Marker and colour of each kind of place; the sheet is drawn as an area."""
-MARGIN_MM = 60.0
 Verdict = Literal["plausible", "contradicts", "not measured"]
 COLOURS: dict[Verdict, str] = {"plausible": "green", "contradicts": "red", "not measured": "yellow"}
 TOOL_MM = (40.0, 500.0)
@@ -49,37 +47,26 @@ PARK_CLEAR_MM = 40.0
 """Half the width of a holder and a part of the wrist, which must be out of the picture."""
 
 
-@dataclass(frozen=True, slots=True)
-class Place:
-    """Where the tip of the upright brush goes."""
-
-    name: str
-    at_mm: tuple[float, float, float]
-    """In the base frame; z is the lowest height of the tip there."""
-    top_mm: float
-    """Height in the base frame from which the tip comes down to it."""
-
-
-def places_of(config: RigConfig) -> tuple[Place, ...]:
-    """Every place of `rig.toml`, the corners of the sheet first."""
-    paper, ink, motion = config.paper, config.ink, config.motion
+def places_of(config: RigConfig) -> dict[str, tuple[float, float, float]]:
+    """Where the tip of the upright brush goes, by name: in the base frame, z its lowest height there, in mm."""
+    paper, ink = config.paper, config.ink
     deepest_mm = paper.touch_z_mm - config.brush.max_depth_mm
     width, height = paper.size_mm
-    on_table = [
-        ("sheet lower left", (0.0, 0.0), deepest_mm),
-        ("sheet lower right", (width, 0.0), deepest_mm),
-        ("sheet upper right", (width, height), deepest_mm),
-        ("sheet upper left", (0.0, height), deepest_mm),
-        ("well", ink.well_mm, ink.dip_z_mm),
-    ]
+    on_paper_mm = {
+        "sheet lower left": (0.0, 0.0, deepest_mm),
+        "sheet lower right": (width, 0.0, deepest_mm),
+        "sheet upper right": (width, height, deepest_mm),
+        "sheet upper left": (0.0, height, deepest_mm),
+        "well": (*ink.well_mm, ink.dip_z_mm),
+    }
     if ink.wipe is not None:
-        on_table.append(("wipe, over the rim", ink.wipe.rim_mm, ink.wipe.z_mm))
+        on_paper_mm["wipe, over the rim"] = (*ink.wipe.rim_mm, ink.wipe.z_mm)
     if ink.wash is not None:
-        on_table.append(("wash pot", ink.wash.pot_mm, ink.wash.dip_z_mm))
+        on_paper_mm["wash pot"] = (*ink.wash.pot_mm, ink.wash.dip_z_mm)
     for number, point_mm in enumerate(config.touch.points_mm or [paper.touch_point_mm], 1):
-        on_table.append((f"touch point {number}", point_mm, paper.touch_z_mm))
-    park = Place("park", motion.park_mm, max(motion.park_mm[2], motion.safe_z_mm))
-    return (*(Place(name, (*to_base(paper, *at), z_mm), motion.safe_z_mm) for name, at, z_mm in on_table), park)
+        on_paper_mm[f"touch point {number}"] = (*point_mm, paper.touch_z_mm)
+    in_base_mm = {name: (*to_base(paper, x_mm, y_mm), z_mm) for name, (x_mm, y_mm, z_mm) in on_paper_mm.items()}
+    return in_base_mm | {"park": config.motion.park_mm}
 
 
 def rig_table(config: RigConfig) -> Table:
@@ -88,9 +75,8 @@ def rig_table(config: RigConfig) -> Table:
     table = Table("place", "base x", "y", "z", "paper x", "y", title=f"{config.name}: mm")
     for column in table.columns[1:]:
         column.justify = "right"
-    for place in places_of(config):
-        paper_mm = to_paper(config.paper, *place.at_mm[:2])
-        table.add_row(place.name, *(f"{v:.1f}" for v in (*place.at_mm, *paper_mm)))
+    for name, at_mm in places_of(config).items():
+        table.add_row(name, *(f"{v:.1f}" for v in (*at_mm, *to_paper(config.paper, *at_mm[:2]))))
     for end, *corner in zip(("lowest", "highest"), limits.x_mm, limits.y_mm, limits.z_mm, strict=True):
         table.add_row(f"box, {end}", *(f"{v:.1f}" for v in corner))
     return table
@@ -99,21 +85,8 @@ def rig_table(config: RigConfig) -> Table:
 # The picture from above
 
 
-def check_picture(path: Path) -> None:
-    """Raise `ConfigError` if no picture can be written to this path. Called before anything is computed."""
-    if path.suffix.lower() not in ENDINGS:
-        raise ConfigError("--picture", "", f"{path} must end in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}")
-    if not path.parent.is_dir():
-        raise ConfigError("--picture", "", f"{path}: there is no folder {path.parent}")
-    if path.is_dir():
-        raise ConfigError("--picture", "", f"{path} is a folder")
-
-
 def draw_rig(config: RigConfig, path: Path) -> None:
-    """Write the picture, in the format of the file's ending. `check_picture` must have passed.
-
-    Raises OSError if it cannot be written.
-    """
+    """Write the picture, in the format of the file's ending. Raises OSError if it cannot be written."""
     from matplotlib.figure import Figure as Picture
 
     picture: Any = Picture(figsize=(7.2, 6.4), layout="constrained")
@@ -127,37 +100,32 @@ def draw_rig(config: RigConfig, path: Path) -> None:
 
 def from_above(axes: Axes, config: RigConfig) -> None:
     """Everything that stands on the table, and the box of limits."""
-    from matplotlib.patches import Polygon, Rectangle
+    from matplotlib.patches import Rectangle
 
-    limits, paper, places = limits_of(config), config.paper, places_of(config)
+    limits, paper, board, places = limits_of(config), config.paper, config.board, places_of(config)
     axes.plot(0.0, 0.0, "+", color="black", markersize=14, mew=2.0, label="base of the arm")
     (left, right), (low, high) = limits.x_mm, limits.y_mm
-    box = Rectangle((left, low), right - left, high - low, fill=False, edgecolor=ORANGE, linewidth=1.6)
-    box.set_label("box of limits")
-    axes.add_patch(box)
-    board = _rectangle(config, config.board.origin_mm, size_mm(config.board))
-    axes.add_patch(Polygon(board, fill=False, edgecolor=GREY, linestyle="--", label="board"))
-    sheet = _rectangle(config, (0.0, 0.0), paper.size_mm)
-    axes.add_patch(Polygon(sheet, facecolor=PAPER, edgecolor="black", label="sheet"))
+    box: dict[str, Any] = {"fill": False, "edgecolor": ORANGE, "linewidth": 1.6, "label": "box of limits"}
+    axes.add_patch(Rectangle((left, low), right - left, high - low, **box))
+    dashed: dict[str, Any] = {
+        "fill": False,
+        "edgecolor": GREY,
+        "linestyle": "--",
+        "label": "board",
+        "angle": paper.yaw_deg,
+    }
+    axes.add_patch(Rectangle(to_base(paper, *board.origin_mm), *size_mm(board), **dashed))
+    sheet: dict[str, Any] = {"facecolor": PAPER, "edgecolor": "black", "label": "sheet", "angle": paper.yaw_deg}
+    axes.add_patch(Rectangle(paper.origin_mm, *paper.size_mm, **sheet))
     for name, tip in (("x", (40.0, 0.0)), ("y", (0.0, 40.0))):
         axes.annotate("", to_base(paper, *tip), paper.origin_mm, arrowprops={"arrowstyle": "->", "color": "black"})
         axes.annotate(name, to_base(paper, *(1.25 * v for v in tip)), ha="center", va="center", fontsize=9)
     for kind, (marker, colour) in MARKS.items():
-        at = [place.at_mm[:2] for place in places if place.name.startswith(kind)]
+        at = [at_mm[:2] for name, at_mm in places.items() if name.startswith(kind)]
         if at:
             axes.plot(*zip(*at, strict=True), marker, color=colour, markersize=9, mew=2.0, linestyle="none", label=kind)
-    ends = [(0.0, 0.0), (left, low), (right, high), *board, *(place.at_mm[:2] for place in places)]
-    for limit, along in zip((axes.set_xlim, axes.set_ylim), zip(*ends, strict=True), strict=True):
-        limit(min(along) - MARGIN_MM, max(along) + MARGIN_MM)
+    axes.margins(0.1)
     finish(axes, "from above", ("base x mm", "base y mm"))
-
-
-def _rectangle(
-    config: RigConfig, corner_mm: tuple[float, float], size_mm: Sequence[float]
-) -> list[tuple[float, float]]:
-    """The corners of a rectangle of the paper frame, in the base frame."""
-    (x, y), (width, height) = corner_mm, size_mm
-    return [to_base(config.paper, *at) for at in ((x, y), (x + width, y), (x + width, y + height), (x, y + height))]
 
 
 def finish(axes: Axes, title: str, along: tuple[str, str] = ("x mm", "y mm")) -> None:
@@ -228,20 +196,15 @@ def deepest_press(max_depth_mm: float, length_mm: float) -> Check:
 
 
 def check_rig(config: RigConfig) -> list[Check]:
-    """Every check, in the order in which the first day teaches the values.
+    """Every value that must lie within a range, then what was not measured.
 
     What a protocol needs of the rig (speeds, poses, room on the sheet) is checked with the protocol.
     """
-    return [*_tool(config), *_camera_and_sheet(config), *_places(config), *_force(config)]
+    return [*_tool_and_sheet(config), *_places(config), *_not_measured(config)]
 
 
-def contradictions(checks: list[Check]) -> int:
-    """Number of checks that found a contradiction."""
-    return sum(check.verdict == "contradicts" for check in checks)
-
-
-def _tool(config: RigConfig) -> Iterator[Check]:
-    robot, brush = config.robot, config.brush
+def _tool_and_sheet(config: RigConfig) -> Iterator[Check]:
+    robot, brush, camera, board, force = config.robot, config.brush, config.camera, config.board, config.force
     tool_mm = math.hypot(*robot.tcp_offset_mm)
     yield within("tool length", tool_mm, *TOOL_MM, "mm", _metres(tool_mm) or "brushloop rig teach tip.")
     yield brush_square(robot.tcp_rotation_deg)
@@ -249,11 +212,25 @@ def _tool(config: RigConfig) -> Iterator[Check]:
     yield deepest_press(brush.max_depth_mm, brush.length_mm)
     if robot.payload_kg:
         yield within("payload", robot.payload_kg, 0.05, 5.0, "kg", "Weigh holder, brush and sensor.")
-    else:
-        value = "the pendant's" if robot.payload_kg is None else "0 kg: never set"
-        yield unmeasured("payload", value, "Weigh holder, brush and sensor: robot.payload_kg.")
-    if robot.collision_level is None:
-        yield unmeasured("collision level", "the pendant's", "robot.collision_level fixes it; 9 is the most sensitive.")
+    set_to_px = (camera.locked.width, camera.locked.height)
+    if camera.optics is not None and set_to_px not in ((None, None), camera.optics.size_px):
+        value, allowed = ("{} x {} px".format(*size_px) for size_px in (camera.optics.size_px, set_to_px))
+        yield Check("lens", "contradicts", f"calibrated at {value}", allowed, "Calibrate it at camera.locked's size.")
+    measure = _metres(board.square_mm) or "Measure ten squares of the print with calipers and divide by ten."
+    yield within("square of the board", board.square_mm, 3.0, 60.0, "mm", measure)
+    # Corners must be seen on all sides of the sheet.
+    far_mm = [o + s - p for o, s, p in zip(board.origin_mm, size_mm(board), config.paper.size_mm, strict=True)]
+    rim_mm = min(*(-o for o in board.origin_mm), *far_mm)
+    remedy = "The sheet lies in the middle of a board that is larger than it: print a larger one, or teach the sheet."
+    yield within("board around the sheet", rim_mm, 8.0, math.inf, "mm", remedy)
+    if force is not None:
+        remedy = "A soft brush pushes with less than 3 N when it is pressed flat: force.max_n."
+        yield within("force ceiling", force.max_n, 0.2, 30.0, "N", remedy)
+    if force is not None and config.touch.method == "force":
+        axis = config.touch.force.push_axis
+        off_deg = math.degrees(math.acos(min(abs(axis[2]) / math.hypot(*axis), 1.0)))
+        remedy = "The paper pushes along the tool: brushloop rig teach force finds axis and sign by a push."
+        yield within("push axis", off_deg, 0.0, 20.0, "deg", remedy)
 
 
 def _metres(length: float) -> str:
@@ -262,77 +239,53 @@ def _metres(length: float) -> str:
     return looks if 0.0 < length < METRES else ""
 
 
-def _camera_and_sheet(config: RigConfig) -> Iterator[Check]:
-    camera, paper, board, touch = config.camera, config.paper, config.board, config.touch
-    unlocked = [name for name, value in camera.locked.model_dump().items() if value is None]
-    if unlocked:
-        stream = "://" in camera.source
-        value = "set by the stream's server" if stream else f"not locked: {', '.join(unlocked)}"
-        remedy = "Switch automatic exposure, white balance and focus off there." if stream else "They may drift."
-        yield unmeasured("camera settings", value, remedy)
-    if camera.optics is None:
-        yield unmeasured("lens", "not calibrated", "brushloop camera intrinsics makes camera.lens_file.")
-    elif (set_to := (camera.locked.width, camera.locked.height)) not in ((None, None), camera.optics.size_px):
-        value = "calibrated at {} x {} px".format(*camera.optics.size_px)
-        yield Check("lens", "contradicts", value, "{} x {} px".format(*set_to), "Calibrate it at camera.locked's size.")
-    measure = _metres(board.square_mm) or "Measure ten squares of the print with calipers and divide by ten."
-    yield within("square of the board", board.square_mm, 3.0, 60.0, "mm", measure)
-    # Corners must be seen on all sides of the sheet.
-    far_mm = [o + s - p for o, s, p in zip(board.origin_mm, size_mm(board), paper.size_mm, strict=True)]
-    rim_mm = min(*(-o for o in board.origin_mm), *far_mm)
-    remedy = "The sheet lies in the middle of a board that is larger than it: print a larger one, or teach the sheet."
-    yield within("board around the sheet", rim_mm, 8.0, math.inf, "mm", remedy)
-    points = len(touch.points_mm) or 1
-    if touch.method == "taught" or points < 3:
-        value = "taught by hand" if touch.method == "taught" else f"{points} touch points: taken as level"
-        yield unmeasured("height and slope of the paper", value, "Touch three points or more far apart: [touch].")
-    if config.self_check.enabled is False:
-        remedy = "Three marks before a session show a mirrored or turned sheet: [self_check] enabled."
-        yield unmeasured("self-check", "switched off", remedy)
-
-
 def _places(config: RigConfig) -> Iterator[Check]:
     ink, motion, limits, board = config.ink, config.motion, limits_of(config), config.board
     # A well stands on the same table as the sheet.
     remedy = "The bottom of a dip is far from the table: teach the well again."
     yield within("dip above the paper", ink.dip_z_mm - config.paper.touch_z_mm, -60.0, 120.0, "mm", remedy)
-    if ink.wipe is None:
-        yield unmeasured("rim of the well", "no [ink.wipe]", "The height of the rim is unknown: travel must clear it.")
-    else:
+    if ink.wipe is not None:
         remedy = "Raise motion.safe_z_mm: a drop, or a tip bent by its ink, would catch the rim."
         yield within("travel above the rim", motion.safe_z_mm - ink.wipe.z_mm, 15.0, math.inf, "mm", remedy)
-    box_mm = (limits.x_mm, limits.y_mm, limits.z_mm)
-    ends = {place.name: (place.at_mm, (*place.at_mm[:2], place.top_mm)) for place in places_of(config)}
-    margins_mm = {
-        name: min(min(v - low, high - v) for end in both for v, (low, high) in zip(end, box_mm, strict=True))
-        for name, both in ends.items()
-    }
-    outside = [name for name, margin_mm in margins_mm.items() if margin_mm < 0.0]
+    places = places_of(config)
+    box_low, box_high = np.array((limits.x_mm, limits.y_mm, limits.z_mm)).T
+    lowest_mm = np.array([*places.values()])
+    highest_mm = np.maximum(lowest_mm, (-math.inf, -math.inf, motion.safe_z_mm))
+    margins_mm = np.minimum(lowest_mm - box_low, box_high - highest_mm).min(axis=1)
+    outside = np.flatnonzero(margins_mm < 0.0)
     remedy = "Outside the box of limits: brushloop rig teach limits, or correct the place."
-    for name in outside or [min(margins_mm, key=lambda name: margins_mm[name])]:
-        yield within(f"inside the box, {name}", margins_mm[name], 0.0, math.inf, "mm", remedy)
-    along = zip(*(end for both in ends.values() for end in both), strict=True)
-    room_mm = max(max(min(v) - low, high - max(v)) for v, (low, high) in zip(along, box_mm, strict=True))
+    for at in outside if outside.size else [margins_mm.argmin()]:
+        yield within(f"inside the box, {list(places)[at]}", float(margins_mm[at]), 0.0, math.inf, "mm", remedy)
+    room_mm = np.maximum(lowest_mm.min(axis=0) - box_low, box_high - highest_mm.max(axis=0)).max()
     remedy = "The box should enclose what was taught and little more: brushloop rig teach limits."
-    yield within("room in the box", room_mm, 0.0, LOOSE_MM, "mm", remedy)
+    yield within("room in the box", float(room_mm), 0.0, LOOSE_MM, "mm", remedy)
     sides = zip(to_paper(config.paper, *motion.park_mm[:2]), board.origin_mm, size_mm(board), strict=True)
     outside_mm = math.hypot(*(max(low - at, at - low - size, 0.0) for at, low, size in sides))
     remedy = "The parked arm stands over the board, in the picture: brushloop rig teach places."
     yield within("park beside the board", outside_mm, PARK_CLEAR_MM, math.inf, "mm", remedy)
 
 
-def _force(config: RigConfig) -> Iterator[Check]:
-    force = config.force
-    if force is None:
+def _not_measured(config: RigConfig) -> Iterator[Check]:
+    robot, camera, touch = config.robot, config.camera, config.touch
+    if not robot.payload_kg:
+        yield unmeasured("payload", "the pendant's", "Weigh holder, brush and sensor: robot.payload_kg.")
+    if robot.collision_level is None:
+        yield unmeasured("collision level", "the pendant's", "robot.collision_level fixes it; 9 is the most sensitive.")
+    if unlocked := [name for name, value in camera.locked.model_dump().items() if value is None]:
+        remedy = "They may drift: set camera.locked, or lock them where a stream is served."
+        yield unmeasured("camera settings", f"not locked: {', '.join(unlocked)}", remedy)
+    if camera.optics is None:
+        yield unmeasured("lens", "not calibrated", "brushloop camera intrinsics makes camera.lens_file.")
+    if touch.method == "taught" or len(touch.points_mm) < 3:
+        value = "taught by hand" if touch.method == "taught" else "fewer than three touch points: taken as level"
+        yield unmeasured("height and slope of the paper", value, "Touch three points or more far apart: [touch].")
+    if config.self_check.enabled is False:
+        remedy = "Three marks before a session show a mirrored or turned sheet: [self_check] enabled."
+        yield unmeasured("self-check", "switched off", remedy)
+    if config.ink.wipe is None:
+        yield unmeasured("rim of the well", "no [ink.wipe]", "The height of the rim is unknown: travel must clear it.")
+    if config.force is None:
         yield unmeasured("force", "no sensor", "Only the arm itself stops a press that meets something hard.")
-        return
-    remedy = "A soft brush pushes with less than 3 N when it is pressed flat: force.max_n."
-    yield within("force ceiling", force.max_n, 0.2, 30.0, "N", remedy)
-    if config.touch.method == "force":
-        axis = config.touch.force.push_axis
-        off_deg = math.degrees(math.acos(min(abs(axis[2]) / math.hypot(*axis), 1.0)))
-        remedy = "The paper pushes along the tool: brushloop rig teach force finds axis and sign by a push."
-        yield within("push axis", off_deg, 0.0, 20.0, "deg", remedy)
 
 
 def check_page(checks: list[Check]) -> Text:

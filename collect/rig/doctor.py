@@ -1,18 +1,12 @@
 """Asks every configured device for its identity and state, and reports in one table what is wrong. Powers nothing.
 
-`doctor --report` writes one archive for a bug report. It holds the answers of the devices, and nothing that is secret.
-
-| file | holds |
-|---|---|
-| `report.json` | versions, platform, the doctor's findings, numbers of `rig.toml`, the checks of `rig check` |
-| `arcs.jsonl` | the transcript of the controller: one question and its answer a line; tests replay it |
-| `rtde.json` | what RTDE offers and its newest sample, if `robot.rtde_port` is configured |
-| `README.txt` | what is in it and what was taken out |
+`doctor --report` writes one archive for a bug report: the answers of the devices, and nothing that is secret.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import getpass
 import importlib.metadata
 import json
@@ -24,7 +18,7 @@ import socket
 import statistics
 import time
 import zipfile
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -34,15 +28,13 @@ from rich.text import Text
 
 from brushloop.calibrate.board.pix2len import see_board
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.collect.errors import ConfigError
-from brushloop.collect.rig.check import check_rig
-from brushloop.collect.rig.config import PREFIX, RigConfig
+from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import make_robot
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, RobotMode, survey
 from brushloop.drivers.arcs.telemetry import rtde_answers
 from brushloop.drivers.arcs.wire import Framing
 from brushloop.drivers.camera import OpenCvCamera
-from brushloop.drivers.devices import Identity, Stamp
+from brushloop.drivers.devices import Camera, ForceSensor, Identity, Ink, Robot, Stamp
 from brushloop.drivers.errors import DeviceError
 from brushloop.drivers.force.sri_m8123 import ForceTable, SriM8123
 from brushloop.drivers.host import Clock
@@ -79,13 +71,15 @@ class Finding:
         """Every field, and the verdict."""
         return {**asdict(self), "well": self.well}
 
-    def answered(
-        self, identity: Identity, latency_ms: float | None, notes: str, problem: str = "", remedy: str = ""
-    ) -> Finding:
-        """The same with what the device says of itself, and what is wrong with it."""
+    def answered(self, identity: Identity, latency_ms: float | None, notes: str) -> Finding:
+        """The same with what the device says of itself."""
         notes += ", simulated" if identity.simulated else ""
-        who = replace(self, answers=True, identity=identity.model, firmware=identity.firmware)
-        return replace(who, latency_ms=latency_ms, notes=notes, problem=problem, remedy=remedy)
+        who, version = identity.model, identity.firmware
+        return replace(self, answers=True, identity=who, firmware=version, latency_ms=latency_ms, notes=notes)
+
+    def trouble(self, problem: str, remedy: str) -> Finding:
+        """The same with what is wrong, and what to do about it."""
+        return replace(self, problem=problem, remedy=remedy)
 
 
 async def examine(config: RigConfig, clock: Clock) -> list[Finding]:
@@ -109,8 +103,16 @@ async def _asked(silent: Finding, answer: Awaitable[Finding]) -> Finding:
     try:
         return await answer
     except DeviceError as error:
-        remedy = error.remedy or "Check power, cable and address."
-        return replace(silent, problem=f"{error.op}: {error.what}", remedy=remedy)
+        return silent.trouble(f"{error.op}: {error.what}", error.remedy or "Check power, cable and address.")
+
+
+@contextlib.asynccontextmanager
+async def _connected(device: Camera | ForceSensor | Ink | Robot) -> AsyncGenerator[Identity]:
+    """Connect a device for the block."""
+    try:
+        yield await device.connect()
+    finally:
+        await device.close()
 
 
 async def _timed(calls: int, ask: Callable[[], Awaitable[T]]) -> tuple[T, float]:
@@ -127,50 +129,40 @@ async def _timed(calls: int, ask: Callable[[], Awaitable[T]]) -> tuple[T, float]
 async def _camera(finding: Finding, config: RigConfig, clock: Clock) -> Finding:
     notices: list[str] = []
     camera = OpenCvCamera(config.camera, clock, notices.append)
-    try:
-        identity = await camera.connect()
+    async with _connected(camera) as identity:
         await camera.fresh(Stamp(clock.now_ns()))
         frame, latency_ms = await _timed(FRAMES, lambda: camera.fresh(Stamp(clock.now_ns())))
-    finally:
-        await camera.close()
     try:
         plane = await asyncio.to_thread(see_board, frame.image, config.board, lens=config.camera.optics)
     except CalibrationError as error:
         remedy = "Put the configured board into view, in focus and evenly lit."
-        return finding.answered(identity, latency_ms, "; ".join(notices), f"board: {error.what}", remedy)
+        return finding.answered(identity, latency_ms, "; ".join(notices)).trouble(f"board: {error.what}", remedy)
     board = f"board: {plane.corners} corners, residual {plane.rms_px:.2f} px, {plane.mm_per_px:.4f} mm/px"
     return finding.answered(identity, latency_ms, "; ".join([board, *notices]))
 
 
 async def _force(finding: Finding, config: ForceTable, clock: Clock) -> Finding:
     sensor = SriM8123(config, clock)
-    try:
-        identity = await sensor.connect()
+    async with _connected(sensor) as identity:
         await asyncio.sleep(LISTEN_S)
         age_ms = (clock.now_ns() - sensor.latest().stamp.host_ns) / 1e6
         force_n, stream = math.hypot(*sensor.latest().force_n), sensor.stream
-    finally:
-        await sensor.close()
-    problem = remedy = ""
     dropped = stream.assembler
+    answer = finding.answered(identity, age_ms, f"{stream.rate_hz():.0f} rounds/s, {force_n:.3f} N before bias")
     if dropped.torn or dropped.refused or stream.bus_errors:
         problem = f"{dropped.torn} torn, {dropped.refused} refused rounds, {stream.bus_errors} bus errors"
-        remedy = "Check wiring, shielding and termination."
-    elif force_n > config.max_n:
+        return answer.trouble(problem, "Check wiring, shielding and termination.")
+    if force_n > config.max_n:
         problem = f"{force_n:.2f} N with nothing pressing, above the ceiling force.max_n = {config.max_n:g} N"
         remedy = "Remove what touches the brush; the bias at each start takes off the weight of the holder."
-    return finding.answered(
-        identity, age_ms, f"{stream.rate_hz():.0f} rounds/s, {force_n:.3f} N before bias", problem, remedy
-    )
+        return answer.trouble(problem, remedy)
+    return answer
 
 
 async def _ink(finding: Finding, config: InkTable, clock: Clock) -> Finding:
     device = config.device(clock)
-    try:
-        identity = await device.connect()
+    async with _connected(device) as identity:
         level, latency_ms = await _timed(CALLS, device.level)
-    finally:
-        await device.close()
     if level is None:
         return finding.answered(identity, None, "no gauge")
     return finding.answered(identity, latency_ms, f"well {level:.0%} full")
@@ -179,19 +171,15 @@ async def _ink(finding: Finding, config: InkTable, clock: Clock) -> Finding:
 async def _robot(finding: Finding, config: RigConfig, clock: Clock) -> Finding:
     notices: list[str] = []
     robot = make_robot(config, clock, notices.append)
-    try:
-        identity = await robot.connect()
+    async with _connected(robot) as identity:
         _, latency_ms = await _timed(CALLS, robot.where)
         mode, safety = await robot.modes()
-    finally:
-        await robot.close()
-    problem = remedy = ""
+    answer = finding.answered(identity, latency_ms, "; ".join([*notices, f"{mode}, safety {safety}"]))
     if safety not in MOVING_ALLOWED:
-        problem, remedy = f"safety mode is {safety}", "Look at the pendant; this program clears nothing."
-    elif mode not in (RobotMode.POWER_OFF, RobotMode.IDLE, RobotMode.RUNNING):
-        problem, remedy = f"robot mode is {mode}", "Look at the pendant."
-    notes = "; ".join([*notices, f"{mode}, safety {safety}"])
-    return finding.answered(identity, latency_ms, notes, problem, remedy)
+        return answer.trouble(f"safety mode is {safety}", "Look at the pendant; this program clears nothing.")
+    if mode not in (RobotMode.POWER_OFF, RobotMode.IDLE, RobotMode.RUNNING):
+        return answer.trouble(f"robot mode is {mode}", "Look at the pendant.")
+    return answer
 
 
 def doctor_table(findings: list[Finding]) -> Table:
@@ -207,10 +195,9 @@ def doctor_table(findings: list[Finding]) -> Table:
 
 
 FORMAT = 1
-ENDING = ".zip"
 ABOUT = """\
 Made by `brushloop doctor --report`. Read it before you send it: it is meant to hold no secret.
-report.json  versions, platform, what each device answered, the numbers of rig.toml and what is doubtful in them
+report.json  versions, platform, what each device answered, the numbers of rig.toml
 arcs.jsonl   every question that was put to the arm's controller, and its answer
 rtde.json    what the controller's telemetry offers, if it is configured
 Taken out: names of hosts and users, addresses, paths, URLs, values of environment variables, every text of rig.toml.
@@ -236,9 +223,7 @@ class Scrubber:
 
     def __init__(self, known: Mapping[str, str]) -> None:
         """`known` are names of this rig, and what stands for each."""
-        names = {value: "<environment>" for name, value in os.environ.items() if name.upper().startswith(PREFIX)}
-        names |= known
-        names |= {
+        names = dict(known) | {
             socket.gethostname(): "<host>",
             socket.getfqdn(): "<host>",
             _user(): "<user>",
@@ -257,15 +242,21 @@ class Scrubber:
 
     def value(self, value: Any) -> Any:
         """The same for every text in a JSON value."""
-        match value:
-            case str():
-                return self.text(value)
-            case dict():
-                return {key: self.value(inner) for key, inner in cast("dict[str, Any]", value).items()}
-            case list() | tuple():
-                return [self.value(inner) for inner in cast("list[Any]", value)]
-            case _:
-                return value
+        return _with_texts(value, lambda _, text: self.text(text))
+
+
+def _with_texts(value: Any, changed: Callable[[str, str], str], field: str = "") -> Any:
+    """A JSON value with each text changed; `changed` gets the name of its field and the text."""
+    match value:
+        case str():
+            return changed(field, value)
+        case dict():
+            table = cast("dict[str, Any]", value)
+            return {name: _with_texts(inner, changed, name) for name, inner in table.items()}
+        case list() | tuple():
+            return [_with_texts(inner, changed, field) for inner in cast("list[Any]", value)]
+        case _:
+            return value
 
 
 def _user() -> str:
@@ -286,40 +277,16 @@ def scrubber_of(config: RigConfig) -> Scrubber:
 
 def numbers_only(table: Mapping[str, Any]) -> dict[str, Any]:
     """A table of `rig.toml` without its texts, which may name anything."""
-
-    def kept(name: str, value: Any) -> Any:
-        match value:
-            case str() if name not in KEPT:
-                return "<text>"
-            case dict():
-                return numbers_only(cast("dict[str, Any]", value))
-            case _:
-                return value
-
-    return {name: kept(name, value) for name, value in table.items()}
-
-
-def check_report(path: Path) -> None:
-    """Raise `ConfigError` if no archive can be written to this path. Called before any device is asked."""
-    if path.suffix.lower() != ENDING:
-        raise ConfigError("--report", "", f"{path} must end in {ENDING}")
-    if not path.parent.is_dir():
-        raise ConfigError("--report", "", f"{path}: there is no folder {path.parent}")
-    if path.exists():
-        raise ConfigError("--report", "", f"{path} exists and is not overwritten: choose another name")
+    return _with_texts(table, lambda field, text: text if field in KEPT else "<text>")
 
 
 async def write_report(path: Path, config: RigConfig, findings: list[Finding]) -> None:
-    """Record a transcript of the controller and write the archive; `check_report` must have passed.
-
-    Raises OSError if it cannot be written.
-    """
+    """Record a transcript of the controller and write the archive. Raises OSError if it cannot be written."""
     robot, scrubber = config.robot, scrubber_of(config)
     known = {
         "framing": robot.framing,
         "findings": scrubber.value([finding.as_json() for finding in findings]),
         "rig": numbers_only(config.model_dump(mode="json")),
-        "checks": scrubber.value([asdict(check) for check in check_rig(config)]),
     }
     files = {"arcs.jsonl": await transcript(robot.host, robot.port, robot.framing, scrubber)}
     if robot.rtde_port is not None:
@@ -340,9 +307,7 @@ def write_archive(path: Path, known: dict[str, Any], files: dict[str, str]) -> N
         "format": FORMAT,
         "versions": _versions(),
         "platform": {
-            "system": platform.system(),
-            "release": platform.release(),
-            "machine": platform.machine(),
+            "system": platform.platform(),
             "python": platform.python_version(),
             "cores": os.cpu_count(),
         },
@@ -355,12 +320,7 @@ def write_archive(path: Path, known: dict[str, Any], files: dict[str, str]) -> N
 
 
 def _versions() -> dict[str, str]:
-    """Versions of brushloop and of its libraries."""
-    versions: dict[str, str] = {}
-    for requirement in ("brushloop", *(importlib.metadata.requires("brushloop") or ())):
-        name = re.split(r"[^\w.-]", requirement, maxsplit=1)[0]
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue  # an extra that is not installed
-    return versions
+    """Versions of brushloop and of the libraries that it names."""
+    named = [re.split(r"[^\w.-]", line, maxsplit=1)[0] for line in importlib.metadata.requires("brushloop") or ()]
+    installed = {package.name: package.version for package in importlib.metadata.distributions()}
+    return {name: installed[name] for name in ("brushloop", *named) if name in installed}

@@ -82,7 +82,7 @@ def test_every_kind_has_a_picture(rig_path: Path, tmp_path: Path, name: str) -> 
 @pytest.mark.parametrize(
     ("picture", "message"),
     [
-        ("plan.xyz", r"^--picture: .*plan\.xyz must end in \.png, \.svg, \.pdf or \.jpg$"),
+        ("plan.xyz", r"^--picture: .*plan\.xyz must end in \.png or \.svg or \.pdf or \.jpg$"),
         ("plan", r"^--picture: .*plan must end in \.png"),
         ("nope/plan.png", r"^--picture: .*nope/plan\.png: there is no folder .*nope$"),
         ("folder.png", r"^--picture: .*folder\.png is a folder$"),

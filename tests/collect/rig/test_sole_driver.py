@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -85,18 +84,6 @@ def test_a_second_driver_is_refused_while_the_first_lives_and_not_afterwards(
     process.wait()
     with sole_driver(rig.robot.host, rig.robot.port):
         pass
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="a name in the kernel")
-def test_nothing_is_left_that_could_refuse_anybody(rig: RigConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
-    (tmp_path / "tmp").mkdir()
-    for _ in range(2):
-        with sole_driver(rig.robot.host, rig.robot.port):
-            for _ in range(sole.WAITING + 10):
-                with pytest.raises(ConfigError, match="another brushloop"):
-                    sole_driver(rig.robot.host, rig.robot.port).__enter__()
-            assert not list((tmp_path / "tmp").iterdir())
 
 
 def test_where_the_kernel_keeps_no_names_a_lock_that_all_may_open_does(rig: RigConfig, monkeypatch: pytest.MonkeyPatch):
