@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import socket
 import time
-import webbrowser
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,28 +73,22 @@ class DemoRig:
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             port = int(probe.getsockname()[1])
-        earlier = self.config.read_bytes() if self.config.exists() else None
         self.config.unlink(missing_ok=True)  # the new rig writes its own
         options = ["--idle-exit", str(IDLE_EXIT_S), "--arcs-port", str(port), "--control", str(self._control(port))]
-        try:
-            self._started = start(self.config, self._folder / "rig.log", *self._options, *options, detached=True)
-        except BaseException:
-            if earlier is not None and not self.config.exists():
-                self.config.write_bytes(earlier)  # sessions are compared with it when the demo is continued
-            raise
+        self._started = start(self.config, self._folder / "rig.log", *self._options, *options, detached=True)
 
     def ready(self) -> None:
-        """Go on with the rig that `rig.toml` names; start one with a blank sheet if it has ended.
+        """Go on with the rig that `rig.toml` names; start one with a blank sheet if it has ended, or there is none.
 
         Raises `RigDidNotStart` and `ConfigError`.
         """
-        if not self.config.exists():
-            self.start()
-            return
         try:
-            self._ask("state")
+            if self.config.exists():
+                self._ask("state")
+                return
         except FaultRefused:
-            self.start()
+            pass
+        self.start()
 
     def fresh_sheet(self) -> None:
         """Put a blank sheet in. Raises `FaultRefused`, and `ConfigError` for a bad rig.toml."""
@@ -118,13 +111,13 @@ class Demo:
 
     def __init__(self, request: DemoRequest, size: Size) -> None:
         self._out, self._repeats, self._seed = request.out, request.repeats, request.seed
-        self._size, self._verbose = size, request.verbose
+        self._size = size
         self._protocol, self._sessions = self._out / "protocol.toml", self._out / "sessions"
         self._rig = DemoRig(request)
         self._session: Path
         """What the first step collects, for every later step."""
-        self._validated: ValidationOutput | None = None
         self._left_out = 0
+        self._validated: ValidationOutput
 
     def run(self) -> None:
         """Run every step, and print how well the models predict the strokes, and where report and recording lie.
@@ -133,14 +126,28 @@ class Demo:
         `ConfigError`, `SessionError`, `CollectAborted`, and at the end `StrokesLeftOut` if some were left out.
         """
         self._out.mkdir(parents=True, exist_ok=True)
-        self._write_protocol()
-        steps = self._steps()
+        size = self._size
+        protocol = (
+            f'kind = "grid"\ndepths_mm = {list(size.depths_mm)}\ntilts_deg = {list(size.tilts_deg)}\n'
+            f"repeats = {self._repeats}\nseed = {self._seed}\n"
+        )
+        self._protocol.write_text(protocol, encoding="utf-8")
+        presses = len(size.depths_mm) * len(size.tilts_deg) * self._repeats
+        write = [(f"write {CHARACTER} {size.writings} times", self._write)] if size.writings else []
+        # Title of each step, and what does the part of it that is not done yet.
+        steps = [
+            (f"press {presses} times, photograph, record", self._collect),
+            ("calibrate the camera, fit the brush", self._fit),
+            (f"recover {size.again} presses from their images and make them again", self._press_again),
+            *write,
+            ("compare every model with every stroke", self._validate),
+        ]
         say(f"Demo on the loopback rig, all simulated: {len(steps)} steps.")
         began_s = time.monotonic()
         for number, (title, run) in enumerate(steps, 1):
             say(f"[{number}/{len(steps)}] {title} ...")
             step_began_s = time.monotonic()
-            with self._logged():
+            with _logged(self._out / LOG):
                 run()
             say(f"  ✓   {time.monotonic() - step_began_s:.0f} s")
         self._rig.end()
@@ -155,54 +162,12 @@ class Demo:
         """Print how much of the ink is predicted, and what follows."""
         from brushloop.calibrate.validate.findings import headline, verdict  # slow to import
 
-        report = None if self._validated is None else self._validated.report
-        if report is None:
+        if (report := self._validated.report) is None:
             return
         say("", f"How much of the ink is predicted (average CSIM; {report.label}):")
         for label, percent in headline(report):
             say(f"  {label:30} {'█' * round(percent / 100 * BAR):{BAR}} {percent:.1f} %")
         say(*verdict(report))
-
-    @contextmanager
-    def _logged(self) -> Generator[None]:
-        """Write what a step prints to demo.log, unless it is to be shown; an error says where to read on."""
-        if self._verbose:
-            yield
-            return
-        path = self._out / LOG
-        with path.open("a", encoding="utf-8") as log, redirect_stdout(log), redirect_stderr(log):
-            try:
-                yield
-            except Exception as error:
-                error.add_note(f"What was printed before is in {path}.")
-                raise
-
-    def _steps(self) -> list[tuple[str, Callable[[], None]]]:
-        """Title of each step, and what does the part of it that is not done yet."""
-        size = self._size
-        presses = len(size.depths_mm) * len(size.tilts_deg) * self._repeats
-        write = [(f"write {CHARACTER} {size.writings} times", self._write)] if size.writings else []
-        return [
-            (f"press {presses} times, photograph, record", self._collect),
-            ("calibrate the camera, fit the brush", self._fit),
-            (f"recover {size.again} presses from their images and make them again", self._press_again),
-            *write,
-            ("compare every model with every stroke", self._validate),
-        ]
-
-    @property
-    def report(self) -> Path | None:
-        """The report's page, once it is written."""
-        return None if self._validated is None else _report(self._session)
-
-    def _write_protocol(self) -> None:
-        size = self._size
-        protocol = (
-            f'kind = "grid"\ndepths_mm = {list(size.depths_mm)}\ntilts_deg = {list(size.tilts_deg)}\n'
-            f"repeats = {self._repeats}\nseed = {self._seed}\n"
-        )
-        if not self._protocol.exists() or self._protocol.read_text(encoding="utf-8") != protocol:
-            self._protocol.write_text(protocol, encoding="utf-8")
 
     def _collect(self) -> None:
         if self._sessions.is_dir() and not self._rig.config.exists():
@@ -244,9 +209,8 @@ class Demo:
 
         command = f"brushloop validate {self._session} --generator {SHIPPED_GENERATOR}"
         say(f"$ {command}")
-        places = (str(self._session),)
-        wanted = ValidateRequest(places, command=command, generators=(SHIPPED_GENERATOR,))
-        self._validated = show_work(validate, wanted)
+        request = ValidateRequest((str(self._session),), command=command, generators=(SHIPPED_GENERATOR,))
+        self._validated = show_work(validate, request)
 
     def _blank_sheet(self, protocol: Path) -> None:
         """Make the rig ready for the session of this protocol, with a blank sheet unless the session has begun."""
@@ -257,15 +221,21 @@ class Demo:
             self._rig.fresh_sheet()
 
 
+@contextmanager
+def _logged(path: Path) -> Generator[None]:
+    """Write to this file what is printed within the block; an error says where to read on."""
+    with path.open("a", encoding="utf-8") as log, redirect_stdout(log), redirect_stderr(log):
+        try:
+            yield
+        except Exception as error:
+            error.add_note(f"What was printed before is in {path}.")
+            raise
+
+
 def _report(session: Path) -> Path:
     return session / "validation" / "report.html"
 
 
 def demo(request: DemoRequest) -> None:
-    """Run the demo, as `Demo.run` does, and open its report if that is asked."""
-    run = Demo(request, FULL if request.full else QUICK)
-    try:
-        run.run()
-    finally:
-        if request.show and run.report is not None:
-            webbrowser.open(run.report.resolve().as_uri())
+    """Run the demo, as `Demo.run` does."""
+    Demo(request, FULL if request.full else QUICK).run()

@@ -45,10 +45,9 @@ def run_loop(request: LoopRequest) -> Path:
         check_fresh_sheet(root, request.sheet)  # now, not after minutes of fitting
     if not header.source.imported:
         calibrated(folder)
-    if (fit := request.fit) is None:
-        # The fit that the loop was begun with, even if another one was made since.
-        begun = begun_with(out)
-        fit = fitted(folder) if begun is None else folder / FITS / f"{begun.fit}.json"
+    begun = begun_with(out)
+    # The fit that the loop was begun with, even if another one was made since.
+    fit = request.fit or (fitted(folder) if begun is None else folder / FITS / f"{begun.fit}.json")
     settings = Settings(
         original=header.session_id,
         original_sha256=recording.sha256,
@@ -61,7 +60,11 @@ def run_loop(request: LoopRequest) -> Path:
     )
     keep_settings(settings, out)
     if not (out / PROTOCOL).exists():  # it is written last: where it exists, this stage is done
-        _recover(folder, out / RECOVERED, fit, settings)
+        from brushloop.calibrate.recover import recover  # slow to import
+
+        say(f"recover {folder}")
+        chosen = settings.model_dump(include={"depth_range_mm", "tilt_range_deg", "presses", "repeats", "seed"})
+        show_work(recover, RecoverRequest(folder, out / RECOVERED, fit=fit, **chosen))
     check_recovered(out / RECOVERED)
     screen = on_screen(request.tui)
     again = collected_session(
@@ -73,24 +76,6 @@ def run_loop(request: LoopRequest) -> Path:
     command = f"brushloop repress compare {folder} {again} --fit {fit} --out {out}"
     say(f"$ {command}")
     return show_work(compare, CompareLoopRequest(folder, again, fit, out=out, command=command)).path
-
-
-def _recover(folder: Path, out: Path, fit: Path, settings: Settings) -> None:
-    """Recover depth and tilt of each press into a file, and write the protocol that presses them again beside it."""
-    from brushloop.calibrate.recover import recover  # slow to import
-
-    wanted = RecoverRequest(
-        folder,
-        out,
-        fit=fit,
-        depth_range_mm=settings.depth_range_mm,
-        tilt_range_deg=settings.tilt_range_deg,
-        presses=settings.presses,
-        repeats=settings.repeats,
-        seed=settings.seed,
-    )
-    say(f"recover {folder}")
-    show_work(recover, wanted)
 
 
 def check_recovered(path: Path) -> None:

@@ -108,7 +108,8 @@ def finished(config: Path, protocol: Path, out: Path, number: int) -> Path:
     """A finished session of this protocol with what that rig holds."""
     rig = load_rig(config)
     known = {"brush": rig.brush.name, "ink": rig.ink.name, "paper": rig.paper.name}
-    asked = {"session_id": f"grid-{number}", "protocol": load_protocol(protocol).model_dump_json()}
+    gone = '{"wait_after_dip_s":null,'  # a key of an earlier version
+    asked = {"session_id": f"grid-{number}", "protocol": gone + load_protocol(protocol).model_dump_json()[1:]}
     Make().session(out / f"grid-{number}", closed=True, **known, **asked)
     return out / f"grid-{number}"
 
