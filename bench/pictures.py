@@ -106,7 +106,8 @@ def main(arguments: list[str] | None = None) -> int:
 def _screens() -> None:
     rig = LoopbackRig(SimConfig(rate=RATE, view=View(fps=3.0)))
     with _serving(rig):
-        app = OperatorApp(browser=SessionBrowser(engine_for))
+        browser = SessionBrowser(engine_for)
+        app = OperatorApp(browser.engine, browser=browser)
         try:
             asyncio.run(_tour(app, rig))
         finally:

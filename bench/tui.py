@@ -115,7 +115,7 @@ class BusyEngine:
 async def main() -> None:
     """Run the app for `SECONDS`, press the stop key now and then, and print what was measured as JSON."""
     engine: Any = BusyEngine()
-    app = OperatorApp(engine)
+    app = OperatorApp(lambda _: engine, engine)
     lag_ms: list[float] = []
     to_stop_ms: list[float] = []
 

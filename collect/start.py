@@ -6,12 +6,12 @@ Commands that collect among other things look here for the finished session of a
 from __future__ import annotations
 
 import contextlib
-import tempfile
+import json
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from brushloop.calibrate.artefact import current
 from brushloop.calibrate.commands import CalibrateRequest, FitRequest, show_work
@@ -75,14 +75,6 @@ def collect_session(
     return collect(CollectRequest(Path(config), Path(protocol), Path(out), sheet=sheet, armed=armed)).folder
 
 
-def dry_run(request: CollectRequest) -> None:
-    """Move through the protocol in the air; the recording is thrown away, so that no cell counts as used."""
-    with tempfile.TemporaryDirectory(prefix="brushloop-dry-") as folder:
-        in_the_air = replace(request, out=Path(folder), new=False, sheet=None, guided=False, live=None)
-        _run(engine_for(Opening.load(in_the_air)), None, on_screen=request.on_screen)
-    say("dry run done; nothing was kept")
-
-
 def ending(folder: Path, kind: str) -> list[str]:
     """Lines that name the recording of a finished session and the next command; `kind` is its protocol's kind."""
     lines = [f"recorded: {folder / folder.name}.mcap"]
@@ -93,7 +85,7 @@ def ending(folder: Path, kind: str) -> list[str]:
     return lines
 
 
-def _run(engine: Engine, again: Callable[[str], Engine] | None, *, on_screen: bool) -> Engine:
+def _run(engine: Engine, again: Callable[[str], Engine], *, on_screen: bool) -> Engine:
     """Run to the end; return the engine that ran last, as the operator may resume after a stop."""
     if not on_screen:
         run_headless(engine)
@@ -102,7 +94,7 @@ def _run(engine: Engine, again: Callable[[str], Engine] | None, *, on_screen: bo
     from brushloop.collect.tui.pictures import look_for_pixels
 
     look_for_pixels()
-    app = OperatorApp(engine, again=again)
+    app = OperatorApp(again, engine)
     run_app(app)
     return app.engine or engine
 
@@ -167,17 +159,20 @@ def finished_session(root: Path, config: Path, protocol: Path) -> Path | None:
     """
     if not root.is_dir():
         return None
-    rig, wanted = load_rig(config), load_protocol(protocol).model_dump_json()
+    rig, wanted = load_rig(config), _settings(load_protocol(protocol).model_dump_json())
     material = (rig.brush.name, rig.ink.name, rig.paper.name)
     sessions: list[Path] = []
     for folder in root.iterdir():
-        try:
+        with contextlib.suppress(SessionError, ValueError):  # open, damaged, imported, or no session
             header = Recording(folder).header
-            if header.protocol == wanted and (header.brush, header.ink, header.paper) == material:
+            if _settings(header.protocol) == wanted and (header.brush, header.ink, header.paper) == material:
                 sessions.append(folder)
-        except SessionError:
-            continue  # open, damaged, or no session
     return max(sessions, key=lambda path: (path / f"{path.name}.mcap").stat().st_mtime_ns, default=None)
+
+
+def _settings(protocol: str) -> Any:
+    """A recorded protocol without its nulls: a key that another version does not know was left out, if it is null."""
+    return json.loads(protocol, object_hook=lambda table: {k: v for k, v in table.items() if v is not None})
 
 
 def collected(request: CollectRequest) -> Collected:

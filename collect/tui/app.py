@@ -19,7 +19,7 @@ from brushloop.collect.engine.control import FINAL, State
 from brushloop.collect.engine.snapshot import REFRESH_S, Snapshot
 from brushloop.collect.errors import NOT_AT_REST, CollectAborted, ConfigError
 from brushloop.collect.operator import Choice, Prompt, stop_signals
-from brushloop.collect.tui.run_screen import CAN_RESUME, RunScreen, live_content
+from brushloop.collect.tui.run_screen import RunScreen, live_content
 from brushloop.collect.tui.start_screen import SessionBrowser, StartScreen
 from brushloop.collect.tui.terminal import PlainApp
 from brushloop.collect.tui.widgets import HELP_KEY, YES, AskScreen, plain, yes_or_no
@@ -56,11 +56,7 @@ class OperatorApp(PlainApp):
     ]
 
     def __init__(
-        self,
-        engine: Engine | None = None,
-        *,
-        browser: SessionBrowser | None = None,
-        again: Callable[[str], Engine] | None = None,
+        self, again: Callable[[str], Engine], engine: Engine | None = None, *, browser: SessionBrowser | None = None
     ) -> None:
         """With an engine, show that run; with a browser, the start screen first.
 
@@ -71,7 +67,7 @@ class OperatorApp(PlainApp):
         self.leaving = False
         """Whether the app is to end soon, whatever the state; may be set by any thread."""
         self._browser = browser
-        self._again = again if browser is None else browser.engine
+        self._again = again
         self._now: Snapshot | None = None if engine is None else engine.snapshot()
         self._main: RunScreen | None = None
         self._leave_when_over = False
@@ -107,7 +103,7 @@ class OperatorApp(PlainApp):
             case "stop":
                 return self.at_work
             case "begin_again":
-                return self._can_begin_again
+                return now is not None and now.state in CAN_BEGIN_AGAIN and bool(now.folder)
             case "review":
                 return now is not None and bool(now.folder)
             case _:
@@ -131,22 +127,16 @@ class OperatorApp(PlainApp):
         from brushloop.collect.tui.review_screen import Review, ReviewScreen  # slow to import
 
         try:
-            review = Review(folder)
-            self.push_screen(ReviewScreen(review, self._finish, at_work=lambda: self.at_work))
+            self.push_screen(ReviewScreen(Review(folder), self._finish, at_work=lambda: self.at_work))
         except SessionError as error:
             self._complain(error)
 
     def _complain(self, error: Exception) -> None:
         self.notify(plain(str(error)), severity="error", timeout=20)
 
-    @property
-    def _can_begin_again(self) -> bool:
-        now = self._now
-        return self._again is not None and now is not None and now.state in CAN_BEGIN_AGAIN and bool(now.folder)
-
     def action_begin_again(self) -> None:
         """Resume the session of a run that ended before its time: the engine asks first."""
-        if self._now is not None and self._again is not None and self.screen is self._main:
+        if self._now is not None and self.screen is self._main:
             self._begin(partial(self._again, Path(self._now.folder).name))
 
     async def action_quit(self) -> None:
@@ -217,7 +207,7 @@ class OperatorApp(PlainApp):
 
     def _show_run(self, engine: Engine) -> None:
         if self._main is None:
-            self._main = RunScreen(engine, resumable=self._again is not None)
+            self._main = RunScreen(engine)
             self.push_screen(self._main)
         self._main.engine = engine
 
@@ -232,13 +222,14 @@ class OperatorApp(PlainApp):
         if self._main is not None and self._main.is_mounted:
             self._main.show(self._now)
         self._ask(self._now)
-        if _what_keys_depend_on(self._now) != _what_keys_depend_on(before):
+        keys_depend_on = [(now.state, now.last is None, bool(now.folder)) for now in (before, self._now)]
+        if keys_depend_on[0] != keys_depend_on[1]:
             self.refresh_bindings()
         if self._now.state is not before.state:
             over = self._now.state in FINAL | {State.STOPPING}
             if over and isinstance(self.screen, AskScreen) and self.screen.own:
                 self.pop_screen()  # what it asks about is over
-            if self._now.state is State.DONE and self._again is not None:
+            if self._now.state is State.DONE:
                 self._show_end(self._now)
         if self._leave_when_over and self._now.state in FINAL:
             if self._now.rest_unknown:
@@ -278,12 +269,6 @@ class OperatorApp(PlainApp):
                 self._main.answered()
         if prompt is not None and self.engine is not None and not isinstance(self.screen, AskScreen):
             self.push_screen(AskScreen(prompt, partial(self.engine.answer, prompt.number)))
-
-
-def _what_keys_depend_on(now: Snapshot) -> tuple[bool, ...]:
-    """Few things: textual makes the whole line of keys again when one of them changes."""
-    state = now.state
-    return state in FINAL, state in CAN_RESUME, state in CAN_BEGIN_AGAIN, now.last is None, bool(now.folder)
 
 
 class ScreenCrashed(Exception):

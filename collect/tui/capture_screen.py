@@ -91,10 +91,10 @@ class CaptureScreen(Screen[None], inherit_bindings=False):
         *(Binding(str(number), f"choose({number - 1})", "Picture", show=False) for number in range(1, 5)),
     ]
 
-    def __init__(self, capture: LastCapture, checks: Sequence[Check], model: str) -> None:
+    def __init__(self, capture: LastCapture, model: str) -> None:
         """`model` says what predicts the mark of this capture, or why nothing does."""
         super().__init__()
-        self._capture, self._checks, self._model = capture, checks, model
+        self._capture, self._model = capture, model
         photo, binary, predicted = capture.photo, capture.binary, capture.model
         self._images: dict[str, NDArray[np.uint8]] = {}
         if photo is not None:
@@ -145,7 +145,8 @@ class CaptureScreen(Screen[None], inherit_bindings=False):
 
     def _words(self) -> Content:
         """The checks, then what is compared."""
-        lines = [checks_content(self._checks), Content(""), Content.styled(plain(self._model), "bold")]
+        checks = () if self._capture.verdict is None else self._capture.verdict.checks
+        lines = [checks_content(checks), Content(""), Content.styled(plain(self._model), "bold")]
         if (csim := self._capture.likeness) is not None:
             lines.append(labelled("CSIM", f"{100.0 * csim:.1f} % in mm"))
         if "difference" in self._images:

@@ -1,10 +1,8 @@
-"""The review of a session: captures by condition, their pictures, marks and notes, and how alike the presses are."""
+"""The review of a session: captures by condition, with their pictures, marks and notes."""
 
 from __future__ import annotations
 
 import asyncio
-import itertools
-import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -26,10 +24,10 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.fit import FOLDER as FITS
 from brushloop.calibrate.fit.fit import BrushFit
 from brushloop.calibrate.session import rig_of
-from brushloop.calibrate.stats import odd_waits, waits_of
 from brushloop.collect.engine.capture import mark_of, pictures_of
 from brushloop.collect.engine.snapshot import LastCapture
 from brushloop.collect.operator import Prompt
+from brushloop.collect.photograph.checks import Verdict
 from brushloop.collect.rig.paper import Patch
 from brushloop.collect.tui.capture_screen import CaptureScreen
 from brushloop.collect.tui.pictures import binary_picture, picture_widget
@@ -47,7 +45,6 @@ from brushloop.collect.tui.widgets import (
     plain,
     trouble,
 )
-from brushloop.model.similarity import csim
 from brushloop.sessions.disk import check_folder
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError
 from brushloop.sessions.events import CaptureResult, Press, Remark
@@ -55,14 +52,12 @@ from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.messages import decode_gray, decode_still
 from brushloop.sessions.recording import add_remark, merged_file, remarks_of
-from brushloop.sessions.records import Check, Condition, Quality, Stroke, Topic
+from brushloop.sessions.records import Quality, Stroke, Topic
 
 if TYPE_CHECKING:
     from brushloop.calibrate.board.lens import Lens
 
 NO_FIT = "no fit yet: run `brushloop fit`"
-Alike = tuple[float, int] | None
-"""Mean CSIM of every pair of presses of one condition, and their number; None for fewer than two."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +70,6 @@ class ReviewCapture:
     """Whether a person marked it bad."""
     note: str = ""
     """What a person wrote about it."""
-    unlike: str = ""
-    """How its time from dip to touch differs from that of the session's other strokes; empty if it does not differ."""
 
     @property
     def press(self) -> Press:
@@ -92,8 +85,8 @@ class ReviewCapture:
 class Review:
     """One session's folder, open or closed; reads it and writes nothing."""
 
-    not_compared: str = ""
-    """Why photographs are shown whole and presses are not compared; empty where board and lens are known."""
+    shown_whole: str = ""
+    """Why no photograph is rectified; empty where board and lens are known."""
 
     def __init__(self, folder: Path) -> None:
         """Raises `SessionDamaged`, and `InputError` if the session was not collected here or holds links."""
@@ -103,7 +96,6 @@ class Review:
         check_folder(folder)
         self._plane: Plane | None = None
         self._pictures: dict[int, LastCapture] = {}
-        self._checks: dict[int, tuple[Check, ...]] = {}
         self._board: BoardSpec | None = None
         self._lens: Lens | None = None
         try:
@@ -111,18 +103,17 @@ class Review:
             rig = rig_of(folder)
             self._lens, self._board = rig.lens, rig.board
         except CalibrationError as error:
-            self.not_compared = str(error)
+            self.shown_whole = str(error)
         self.read()
 
     def read(self) -> None:
         """Read the journal and the remarks again."""
         state, remarks = replay(self.folder / JOURNAL_NAME), remarks_of(self.folder)
         self.open = state.is_open
-        odd = odd_waits(waits_of(state))
         captures: list[ReviewCapture] = []
         for step in state.files.values():
             if isinstance(result := step.result, CaptureResult):
-                capture = ReviewCapture(result, step.file, unlike=odd.get(result.still, ""))
+                capture = ReviewCapture(result, step.file)
                 if (remark := remarks.get(result.still)) is not None:
                     capture = replace(capture, marked_bad=remark.bad, note=remark.note)
                 captures.append(capture)
@@ -139,52 +130,37 @@ class Review:
             self._pictures[still] = self._make_pictures(capture)
         return self._pictures[still]
 
-    def repeatability(self, condition: Condition) -> Alike:
-        """How alike the counted presses of one condition are.
-
-        CSIM is that of the validation, on the binarised 128 x 128 images in the millimetre alignment.
-        """
-        binaries = [
-            pictures.binary.astype("float32")
-            for capture in self.captures
-            if capture.press.condition == condition and capture.counts
-            if (pictures := self.pictures(capture)).binary is not None
-        ]
-        if len(binaries) < 2:
-            return None
-        return statistics.fmean(csim(a, b) for a, b in itertools.combinations(binaries, 2)), len(binaries)
-
-    def predicted(self, capture: ReviewCapture) -> tuple[LastCapture, tuple[Check, ...], str]:
-        """A capture with the mark that the session's fitted brush predicts, its checks, and which fit that is.
+    def predicted(self, capture: ReviewCapture) -> tuple[LastCapture, str]:
+        """A capture with the mark that the session's fitted brush predicts, and which fit that is.
 
         Call it off a screen's loop. Raises `SessionDamaged` as `pictures` does.
         """
-        pictures, model = self.pictures(capture), NO_FIT
+        pictures = self.pictures(capture)
         try:
-            if (path := current(self.folder, FITS)) is not None:
-                fit = load_artefact(path, BrushFit)
-                pictures = replace(pictures, model=mark_of(fit.press(), capture.press.condition))
-                model = f"CCD-BSM fitted to {fit.strokes} strokes of {fit.session_id}"
+            if (path := current(self.folder, FITS)) is None:
+                return pictures, NO_FIT
+            fit = load_artefact(path, BrushFit)
         except CalibrationError as error:
-            model = str(error)
-        return pictures, self._checks.get(capture.result.still, ()), model
+            return pictures, str(error)
+        pictures = replace(pictures, model=mark_of(fit.press(), capture.press.condition))
+        return pictures, f"CCD-BSM fitted to {fit.strokes} strokes of {fit.session_id}"
 
     def _make_pictures(self, capture: ReviewCapture) -> LastCapture:
         path, result = self.folder / capture.file, capture.result
         path = path if path.is_file() else merged_file(self.folder)
-        image, stroke = None, None
+        image = stroke = verdict = None
         for _schema, channel, message in McapFile(path).sound().messages([Topic.STILL, Topic.STROKE, Topic.QUALITY]):
             if message.sequence != result.still:
                 continue
             if channel.topic == Topic.STILL:
                 image = decode_gray(decode_still(message.data, path), str(path))
             elif channel.topic == Topic.QUALITY:
-                self._checks[result.still] = Quality.model_validate_json(message.data).checks
+                verdict = Verdict(Quality.model_validate_json(message.data).checks)
             else:
                 stroke = Stroke.model_validate_json(message.data)
         if image is None:
             raise SessionDamaged(path, f"holds no still {result.still}")
-        whole = LastCapture(result.press, result.still, result.kept, None, image)
+        whole = LastCapture(result.press, result.still, result.kept, verdict, image)
         if stroke is None or stroke.cell_mm is None or self._board is None:
             return whole  # a take that does not count has no stroke record
         if self._lens is not None:
@@ -227,7 +203,6 @@ class ReviewScreen(Screen[None]):
         self._review = review
         self._finish, self._at_work = finish, at_work
         self._capture: ReviewCapture | None = None
-        self._alike: dict[Condition, Alike] = {}
         self._title, self._words = Line("review-title"), Line("words")
         self._options = Rows("captures")
         self._photo, self._binary = picture_widget("review-photo"), picture_widget("review-binary")
@@ -257,7 +232,7 @@ class ReviewScreen(Screen[None]):
     def on_option_list_option_highlighted(self, event: OptionList.OptionHighlighted) -> None:
         """Show the capture under the cursor."""
         self._capture = self._review.captures[event.option_index]
-        self._show_words()
+        self._show_words(self._capture)
         self._load(self._capture)
 
     @work(exclusive=True, group="large")
@@ -306,7 +281,6 @@ class ReviewScreen(Screen[None]):
         except SessionError as error:
             self.notify(plain(str(error)), severity="error")
             return
-        self._alike.pop(capture.press.condition, None)
         at = self._options.highlighted or 0
         self._capture = self._review.captures[at]
         self._list(at)
@@ -322,52 +296,35 @@ class ReviewScreen(Screen[None]):
 
     @work(exclusive=True, group="look")
     async def _load(self, capture: ReviewCapture) -> None:
-        """Show its pictures, then how alike the presses of its condition are; both are made off the screen's loop."""
+        """Show its pictures, which are made off the screen's loop."""
         try:
             pictures = await asyncio.to_thread(self._review.pictures, capture)
-            self._photo.show(pictures.photo)
-            self._binary.show(binary_picture(pictures.binary))
-            condition = capture.press.condition
-            if condition not in self._alike:
-                self._alike[condition] = await asyncio.to_thread(self._review.repeatability, condition)
-            self._show_words()
         except SessionError as error:
             self._words.show(trouble(error))
-
-    def _show_words(self) -> None:
-        capture, review = self._capture, self._review
-        if capture is None:
             return
-        result, press = capture.result, capture.press
+        self._photo.show(pictures.photo)
+        self._binary.show(binary_picture(pictures.binary))
+
+    def _show_words(self, capture: ReviewCapture) -> None:
+        result, press, folder = capture.result, capture.press, self._review.folder
         why = "  marked bad" if capture.marked_bad else ""
         if not result.kept:
             why = f"  not counted by the run{f': {result.verdict}' if result.verdict else ''}"
-        file = capture.file if (review.folder / capture.file).is_file() else merged_file(review.folder).name
+        file = capture.file if (folder / capture.file).is_file() else merged_file(folder).name
         lines = [
             Content.assemble((press.stroke_id, "bold"), f"  {condition_text(press.condition)}", (why, "bold")),
             labelled("MCAP", f"{file}  still {result.still}"),
-            labelled("Repeats", self._alike_text(press.condition)),
         ]
-        if capture.unlike:
-            lines.append(labelled("Waited", Content.styled(f"! {capture.unlike}", "bold $text-warning")))
-        elif press.dip_to_touch_s is not None:
+        if press.dip_to_touch_s is not None:
             lines.append(labelled("Waited", f"{press.dip_to_touch_s:.1f} s from dip to touch"))
+        if self._review.shown_whole:
+            lines.append(labelled("Whole", plain(self._review.shown_whole)))
         if capture.note:
             lines.append(labelled("Note", plain(capture.note)))
         self._words.show(Content("\n").join(lines))
-
-    def _alike_text(self, condition: Condition) -> str:
-        if self._review.not_compared:
-            return f"not compared: {plain(self._review.not_compared)}"
-        if condition not in self._alike:
-            return "comparing ..."
-        alike = self._alike[condition]
-        return "one press only" if alike is None else f"mean CSIM {alike[0]:.3f} of every pair of {alike[1]} presses"
 
 
 def _row_content(capture: ReviewCapture) -> Content:
     sign, style = ("✓", "") if capture.counts else ("!", "bold $text-warning")
     noted = " ✎" if capture.note else ""
-    waited = " dip?" if capture.unlike else ""
-    name = f" {one_line(capture.press.stroke_id)}{noted}"
-    return Content.assemble((sign, style), name, (waited, "bold $text-warning"))
+    return Content.assemble((sign, style), f" {one_line(capture.press.stroke_id)}{noted}")

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, cast
 
 from rich.text import Text
 from textual.app import ComposeResult
@@ -14,6 +14,7 @@ from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical, VerticalScroll
 from textual.content import Content
 from textual.screen import Screen
+from textual.signal import Signal
 from textual.widgets import DataTable, Footer
 
 from brushloop.collect.engine.control import FINAL, State
@@ -108,7 +109,8 @@ class LogPane(VerticalScroll, inherit_bindings=False):
     def on_mount(self) -> None:
         """Stay at the newest line until the operator scrolls away; draw the scrollbar, which textual moves undrawn."""
         self.anchor()
-        self.screen.screen_layout_refresh_signal.subscribe(self, lambda _: self.vertical_scrollbar.refresh())
+        laid_out = cast("Signal[object]", self.screen.screen_layout_refresh_signal)  # pyright: ignore[reportUnknownMemberType]
+        laid_out.subscribe(self, lambda _: self.vertical_scrollbar.refresh())
 
 
 class RunScreen(Screen[None], inherit_bindings=False):
@@ -161,12 +163,10 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
     """
     BINDINGS: ClassVar[list[BindingType]] = [*RUN_BINDINGS]
 
-    def __init__(self, engine: Engine, *, resumable: bool = False) -> None:
-        """`resumable`: whether this screen can go on with a run that was stopped."""
+    def __init__(self, engine: Engine) -> None:
         super().__init__()
         self.engine = engine
         self._now = engine.snapshot()
-        self._resumable = resumable
         # Kept, not queried: a snapshot may come before the parts are mounted or after they are gone.
         self._title = Line("title", sized=True)
         self._state, self._figures = Line("state", sized=True), Line("figures", sized=True)
@@ -226,19 +226,19 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
             case "request" | "mark_last":
                 return state not in FINAL
             case "pause":
-                return state not in FINAL | CAN_RESUME
+                # While the arm is being stopped or a question waits, nothing is to be paused.
+                return state in CAN_PAUSE
             case "go_on":
                 return state in CAN_RESUME
             case "enlarge":
                 # After a stop or a failure, the same key resumes the session.
-                return last is not None and not (self._resumable and state in FINAL - {State.DONE})
+                return last is not None and state not in FINAL - {State.DONE}
             case _:
                 return super().check_action(action, parameters)
 
     def action_pause(self) -> None:
-        """Pause before the next step; while the arm is being stopped or a question waits, nothing is to be paused."""
-        if self._now.state in CAN_PAUSE:
-            self.engine.pause()
+        """Pause before the next step."""
+        self.engine.pause()
 
     def action_go_on(self) -> None:
         """Go on after a pause."""
@@ -266,8 +266,7 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
         """Show the last capture large."""
         if (last := self._now.last) is not None:
             model = "CCD-BSM as published" if last.model is not None else "no prediction for this stroke"
-            checks = () if last.verdict is None else last.verdict.checks
-            app_of(self).push_screen(CaptureScreen(last, checks, model))
+            app_of(self).push_screen(CaptureScreen(last, model))
 
     def stop_sent(self) -> None:
         """Show at once that a stop key was pressed, before the engine answers."""
@@ -303,7 +302,7 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
             self._log.show(Content("\n").join(_message_content(line) for line in now.messages))
         if before is None or now.last is not before.last:
             self._show_capture(now.last)
-        self._note.show(_note_content(now, resumable=self._resumable and bool(now.folder)))
+        self._note.show(_note_content(now))
 
     def _show_state(self, now: Snapshot) -> None:
         state = now.state
@@ -434,10 +433,10 @@ def _message_content(line: str) -> Content:
     return Content.styled(text, "bold $text-warning") if text.startswith(WARNING) else Content(text)
 
 
-def _note_content(now: Snapshot, *, resumable: bool) -> Content:
+def _note_content(now: Snapshot) -> Content:
     """Pending requests and the stop key; once the run is over, how to leave."""
     if now.state in FINAL:
-        on = GOES_ON if resumable else COMMAND_GOES_ON
+        on = GOES_ON if now.folder else COMMAND_GOES_ON
         following = SOFTWARE_STOP if now.state is State.DONE or now.rest_unknown else on
         return Content.assemble((f" {OVER} ", "bold reverse"), f"  {following}")
     if now.state is State.STOPPING:

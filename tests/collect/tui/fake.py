@@ -227,9 +227,6 @@ class FakeEngine:
         raise CollectAborted("stopped; the same command resumes from here")
 
 
-LATE = "touched the paper 10.2 s after its dip, the others after 1.1 s"
-
-
 def engine_for(*_arguments: Any, **_options: Any) -> Any:
     raise AssertionError("no engine is made")
 
@@ -276,7 +273,7 @@ class FakeReview(Review):
         self.captures = (
             ReviewCapture(captured("H13-a0-r01", 4, 1.24), "0004-capture-a.mcap"),
             ReviewCapture(captured("H13-a0-r02", 7), "0007-capture-b.mcap", marked_bad=True, note="smudged, 墨 ran"),
-            ReviewCapture(captured("H13-a0-r03", 10, 10.2, "split"), "0010-capture-c.mcap", unlike=LATE),
+            ReviewCapture(captured("H13-a0-r03", 10, 10.2, "split"), "0010-capture-c.mcap"),
         )
 
     def pictures(self, capture: ReviewCapture) -> LastCapture:
@@ -284,8 +281,10 @@ class FakeReview(Review):
         photo = np.where(binary, 40, 210).astype(np.uint8)
         return LastCapture(capture.press, capture.result.still, True, None, photo, binary)
 
-    def repeatability(self, condition: Condition) -> tuple[float, int] | None:
-        return 0.914, 9
+
+def app_of(engine: FakeEngine | None = None, browser: FakeBrowser | None = None) -> OperatorApp:
+    """The app of one run, or of a day; neither resumes anything."""
+    return OperatorApp(engine_for, engine, browser=browser)
 
 
 def a_review(folder: Path, app: OperatorApp) -> ReviewScreen:

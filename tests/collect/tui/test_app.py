@@ -19,7 +19,7 @@ from brushloop.collect.tui.app import OperatorApp, ScreenCrashed, run_app
 from brushloop.collect.tui.run_screen import COMMAND_GOES_ON, GOES_ON, OVER, STOP_SENT, RunScreen
 from brushloop.collect.tui.terminal import TerminalDriver, _LostWrites
 from brushloop.collect.tui.widgets import SOFTWARE_STOP, AskScreen
-from tests.collect.tui.fake import FAILED, SPLIT, FakeEngine, look, picture, shown
+from tests.collect.tui.fake import FAILED, SPLIT, FakeEngine, app_of, look, picture, shown
 from tests.waiting import PATIENCE_S
 
 AT_WORK = sorted(set(State) - FINAL)
@@ -32,7 +32,7 @@ def asks(app: OperatorApp) -> bool:
 
 async def test_space_pauses_and_resumes_and_says_which() -> None:
     engine = FakeEngine(picture())
-    app = OperatorApp(engine)
+    app = app_of(engine)
     async with app.run_test(size=(80, 24)) as pilot:
         for state, word, calls in (
             (State.RUNNING, "space Pause", ["pause"]),
@@ -50,7 +50,7 @@ async def test_space_pauses_and_resumes_and_says_which() -> None:
 
 async def test_stop_keys_stop_in_every_state_of_a_run() -> None:
     engine = FakeEngine(picture())
-    app = OperatorApp(engine)
+    app = app_of(engine)
     async with app.run_test() as pilot:
         for state in AT_WORK:
             engine.now = picture(state=state)
@@ -63,7 +63,7 @@ async def test_stop_keys_stop_in_every_state_of_a_run() -> None:
 @pytest.mark.parametrize("over", ["q", "question_mark", "prompt"])
 async def test_the_stop_key_stops_over_whatever_lies_on_the_screen(over: str) -> None:
     engine = FakeEngine(picture())
-    app = OperatorApp(engine)
+    app = app_of(engine)
     async with app.run_test() as pilot:
         await look(app, pilot)
         if over == "prompt":
@@ -77,7 +77,7 @@ async def test_the_stop_key_stops_over_whatever_lies_on_the_screen(over: str) ->
 
 async def test_a_stop_is_on_the_screen_in_less_than_a_tenth_of_a_second_whatever_the_engine_says() -> None:
     engine = FakeEngine(picture())
-    app = OperatorApp(engine)
+    app = app_of(engine)
     async with app.run_test(size=(80, 24)) as pilot:
         await look(app, pilot)
         await pilot.press("s")
@@ -93,7 +93,7 @@ async def test_a_stop_is_on_the_screen_in_less_than_a_tenth_of_a_second_whatever
 
 async def test_requests_are_passed_on_and_shown_until_they_are_carried_out() -> None:
     engine = FakeEngine(picture())
-    app = OperatorApp(engine)
+    app = app_of(engine)
     async with app.run_test(size=(80, 24)) as pilot:
         for key, request in (("r", "RETAKE"), ("k", "SKIP"), ("n", "NEW_SHEET"), ("j", "JOG")):
             engine.calls.clear()
@@ -108,7 +108,7 @@ async def test_requests_are_passed_on_and_shown_until_they_are_carried_out() -> 
 
 async def test_q_asks_while_the_run_is_on_and_parks_before_it_leaves() -> None:
     engine = FakeEngine(picture())
-    app = OperatorApp(engine)
+    app = app_of(engine)
     async with app.run_test() as pilot:
         await look(app, pilot)
         for quit_key, no_key in (("q", "n"), ("ctrl+q", "escape")):
@@ -126,7 +126,7 @@ async def test_q_asks_while_the_run_is_on_and_parks_before_it_leaves() -> None:
 
 async def test_while_the_arm_is_being_stopped_q_asks_nothing_and_the_red_button_is_named() -> None:
     engine = FakeEngine(picture(state=State.STOPPING))
-    app = OperatorApp(engine)
+    app = app_of(engine)
     async with app.run_test(size=(80, 24)) as pilot:
         assert "not seen at rest yet: press the red button" in await look(app, pilot)
         await pilot.press("q")
@@ -136,7 +136,7 @@ async def test_while_the_arm_is_being_stopped_q_asks_nothing_and_the_red_button_
 
 async def test_an_arm_that_was_not_seen_at_rest_is_never_said_to_rest() -> None:
     engine = FakeEngine(replace(FAILED, rest_unknown=True, parked=False, target_mm=(0.0, 0.0, 0.0)))
-    app = OperatorApp(engine)
+    app = app_of(engine)
     async with app.run_test(size=(80, 24)) as pilot:
         await look(app, pilot)
         await pilot.press("q")
@@ -153,7 +153,7 @@ async def test_a_key_that_bounces_after_an_answer_asks_for_nothing(
 ) -> None:
     monkeypatch.setattr(run_screen, "BOUNCE_S", bounce_s)
     engine = FakeEngine(picture(state=State.ASKING, prompt=SPLIT))
-    app = OperatorApp(engine)
+    app = app_of(engine)
     async with app.run_test(size=(80, 24)) as pilot:
         await look(app, pilot)
         await pilot.press("k")
@@ -166,7 +166,7 @@ async def test_a_key_that_bounces_after_an_answer_asks_for_nothing(
 @pytest.mark.parametrize("state", sorted(FINAL))
 async def test_what_is_over_can_only_be_left(state: State) -> None:
     engine = FakeEngine(picture(state=state, parked=True, target_mm=(0.0, 0.0, 0.0)))
-    app = OperatorApp(engine)
+    app = app_of(engine)
     async with app.run_test(size=(80, 24)) as pilot:
         text = await look(app, pilot)
         assert OVER in text
@@ -191,7 +191,7 @@ async def test_enter_resumes_a_stopped_session_and_leaves_the_question_to_the_en
         asked.append(session_id)
         return resumed
 
-    app = OperatorApp(stopped, again=again)
+    app = OperatorApp(again, stopped)
     async with app.run_test(size=(80, 24)) as pilot:
         text = await look(app, pilot)
         assert "Resume the session" in text
@@ -216,7 +216,7 @@ async def test_a_run_that_cannot_begin_leaves_the_screen_as_it_is(why: str) -> N
         app.leaving = True  # the signal comes while files are read
         return resumed
 
-    app = OperatorApp(stopped, again=again)
+    app = OperatorApp(again, stopped)
     async with app.run_test(size=(80, 24)) as pilot:
         await look(app, pilot)
         await pilot.press("enter")
@@ -250,7 +250,7 @@ def test_a_signal_stops_the_arm_a_lost_terminal_parks_it_and_both_end_the_screen
     engine = FakeEngine(picture())
     before = signal.getsignal(number)
     with pytest.raises(CollectAborted):
-        run_app(OperatorApp(engine))
+        run_app(app_of(engine))
     assert engine.calls == ["start", call, "join"]
     assert signal.getsignal(number) == before
 
@@ -267,7 +267,7 @@ def test_a_screen_that_breaks_stops_the_arm(
     without_terminal(monkeypatch, until_over)
     engine = Broken(picture())
     with pytest.raises(ScreenCrashed):
-        run_app(OperatorApp(engine))
+        run_app(app_of(engine))
     assert engine.calls == ["start", "stop", "join"]
     assert "ZeroDivisionError" in capsys.readouterr().err
 
@@ -279,7 +279,7 @@ def test_a_screen_that_cannot_begin_stops_the_arm(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(OperatorApp, "run", refuse)
     engine = FakeEngine(picture())
     with pytest.raises(OSError, match="no terminal"):
-        run_app(OperatorApp(engine))
+        run_app(app_of(engine))
     assert engine.calls == ["start", "stop", "join"]
 
 

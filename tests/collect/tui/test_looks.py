@@ -10,7 +10,6 @@ from textual.pilot import Pilot
 
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.snapshot import Snapshot
-from brushloop.collect.tui.app import OperatorApp
 from tests.collect.tui.fake import (
     FAILED,
     SPLIT,
@@ -19,6 +18,7 @@ from tests.collect.tui.fake import (
     FakeBrowser,
     FakeEngine,
     a_review,
+    app_of,
     capture,
     commission_app_of,
     full_picture,
@@ -67,16 +67,16 @@ async def settled(pilot: Pilot[None]) -> None:
 )
 def test_run(snap_compare: Callable[..., bool], now: Snapshot, size: tuple[int, int], keys: str) -> None:
     run = pressing(*([keys] if keys else []))
-    assert snap_compare(OperatorApp(FakeEngine(now)), terminal_size=size, run_before=run)
+    assert snap_compare(app_of(FakeEngine(now)), terminal_size=size, run_before=run)
 
 
 def test_no_colour(snap_compare: Callable[..., bool], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NO_COLOR", "1")
-    assert snap_compare(OperatorApp(FakeEngine(full_picture())), terminal_size=LARGE, run_before=pressing())
+    assert snap_compare(app_of(FakeEngine(full_picture())), terminal_size=LARGE, run_before=pressing())
 
 
 def test_start(snap_compare: Callable[..., bool]) -> None:
-    assert snap_compare(OperatorApp(browser=FakeBrowser()), terminal_size=SMALL, run_before=pressing())
+    assert snap_compare(app_of(browser=FakeBrowser()), terminal_size=SMALL, run_before=pressing())
 
 
 @pytest.mark.parametrize("keys", [[], ["f"]])
@@ -84,7 +84,7 @@ def test_review(
     snap_compare: Callable[..., bool], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, keys: list[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    app = OperatorApp(browser=FakeBrowser())
+    app = app_of(browser=FakeBrowser())
 
     async def review(pilot: Pilot[None]) -> None:
         await settled(pilot)

@@ -41,6 +41,7 @@ from tests.collect.tui.fake import (
     FakeBrowser,
     FakeEngine,
     a_review,
+    app_of,
     capture,
     full_picture,
     has_picture,
@@ -53,7 +54,7 @@ from tests.collect.tui.fake import (
 async def test_what_comes_from_outside_is_shown_as_it_is() -> None:
     markup = "[red]x[/red] [/] [link='"
     engine = FakeEngine(picture(messages=(markup, "a\x1b[31mb"), step=markup, source=markup, error=markup))
-    app = OperatorApp(engine)
+    app = app_of(engine)
     async with app.run_test(size=(109, 40)) as pilot:
         await app.screen.mount(Static("a\x1b]0;owned\x07b \x9b31m \u202eltr", markup=False, id="hostile"))
         text = await look(app, pilot)
@@ -64,7 +65,7 @@ async def test_what_comes_from_outside_is_shown_as_it_is() -> None:
 
 
 async def test_what_did_not_change_is_not_drawn_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    app = OperatorApp(FakeEngine(full_picture()))
+    app = app_of(FakeEngine(full_picture()))
     async with app.run_test(size=(120, 40)) as pilot:
         for _ in range(3):
             await look(app, pilot)
@@ -109,7 +110,7 @@ async def test_b_marks_the_last_capture_and_takes_it_back_while_the_run_is_on(tm
     engine = FakeEngine(full_picture(folder=str(tmp_path)))
     last = engine.now.last
     assert last is not None
-    app = OperatorApp(engine)
+    app = app_of(engine)
     async with app.run_test(size=(120, 40)) as pilot:
         engine.now = replace(engine.now, last=replace(last, kept=False))
         await look(app, pilot)
@@ -129,7 +130,7 @@ async def test_b_marks_the_last_capture_and_takes_it_back_while_the_run_is_on(tm
 
 
 async def test_a_disk_that_refuses_is_reported(tmp_path: Path) -> None:
-    app = OperatorApp(FakeEngine(full_picture(folder=str(tmp_path / "gone"))))
+    app = app_of(FakeEngine(full_picture(folder=str(tmp_path / "gone"))))
     async with app.run_test(size=(120, 40)) as pilot:
         await pilot.press("b")
         assert "gone" in " ".join(note.message for note in app._notifications)
@@ -146,7 +147,7 @@ PROMPT = Prompt(
 
 async def test_enter_shows_the_last_capture_large_with_the_missed_check_first() -> None:
     engine = FakeEngine(full_picture(last=capture(kept=False)))
-    app = OperatorApp(engine)
+    app = app_of(engine)
     async with app.run_test(size=(80, 24)) as pilot:
         await look(app, pilot)
         await pilot.press("enter")
@@ -173,7 +174,7 @@ def test_a_difference_has_four_colours_and_an_overlay_the_line_of_the_prediction
 
 async def test_a_key_answers_the_question_that_is_shown_and_the_next_one_comes() -> None:
     engine = FakeEngine(picture(state=State.ASKING, step="wait for an answer", prompt=PROMPT))
-    app = OperatorApp(engine)
+    app = app_of(engine)
     async with app.run_test(size=(80, 24)) as pilot:
         assert "Waits until it is answered" in await look(app, pilot)
         await pilot.press("z", "escape", "g")
@@ -187,7 +188,7 @@ async def test_a_key_answers_the_question_that_is_shown_and_the_next_one_comes()
 
 async def test_q_over_a_question_leaves_it_unanswered_and_parks() -> None:
     engine = FakeEngine(picture(state=State.ASKING, prompt=PROMPT))
-    app = OperatorApp(engine)
+    app = app_of(engine)
     async with app.run_test(size=(80, 24)) as pilot:
         assert "q Leave: park the arm" in await look(app, pilot)
         for answer, calls in (("n", []), ("y", ["park"])):
@@ -217,7 +218,7 @@ async def ready(app: OperatorApp, pilot: Pilot[None]) -> str:
 
 async def test_enter_goes_on_with_an_open_session_and_n_asks_for_a_blank_sheet_first() -> None:
     browser = Beginning()
-    app = OperatorApp(browser=browser)
+    app = OperatorApp(browser.engine, browser=browser)
     async with app.run_test(size=(80, 24)) as pilot:
         text = await ready(app, pilot)
         for part in ("▶ 2026-11-21-grid-02 open", "13 of 30 planned", "13 capture", "the process", "H15-a5-r01"):
@@ -244,7 +245,7 @@ async def test_enter_goes_on_with_an_open_session_and_n_asks_for_a_blank_sheet_f
 
 async def test_other_files_can_be_typed_and_letters_of_stop_keys_too() -> None:
     browser = FakeBrowser()
-    app = OperatorApp(browser=browser)
+    app = OperatorApp(browser.engine, browser=browser)
     async with app.run_test(size=(80, 24)) as pilot:
         await ready(app, pilot)
         await pilot.press("e", "ctrl+u", *"s2.toml", "enter", "ctrl+u", "enter")
@@ -256,7 +257,7 @@ async def test_other_files_can_be_typed_and_letters_of_stop_keys_too() -> None:
 
 async def test_no_note_is_typed_while_a_run_is_in_progress(tmp_path: Path) -> None:
     engine = FakeEngine(PAUSED)
-    app = OperatorApp(engine)
+    app = app_of(engine)
     async with app.run_test(size=(120, 40)) as pilot:
         await look(app, pilot)
         app.push_screen(review := a_review(tmp_path, app))
@@ -279,7 +280,7 @@ async def test_after_a_session_the_next_commands_run_in_the_terminal(
         return subprocess.CompletedProcess(command, 0)
 
     monkeypatch.chdir(tmp_path)
-    app = OperatorApp(browser=FakeBrowser())
+    app = app_of(browser=FakeBrowser())
     monkeypatch.setattr(app, "suspend", nullcontext)
     monkeypatch.setattr("subprocess.run", run)
     monkeypatch.setattr("sys.stdin", io.StringIO())

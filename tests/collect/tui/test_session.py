@@ -131,7 +131,7 @@ def day(tmp_path: Path) -> Iterator[Day]:
 @pytest.mark.timeout(400)
 async def test_a_day_at_the_rig(day: Day) -> None:
     browser = SessionBrowser(engine_for, day.sessions, day.folder / "rig.toml", day.folder / "protocol.toml")
-    app = OperatorApp(browser=browser)
+    app = OperatorApp(browser.engine, browser=browser)
     async with app.run_test(size=(80, 24)) as pilot:
         operator = Operator(app, pilot)
 
