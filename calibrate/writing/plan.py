@@ -16,7 +16,7 @@ from brushloop.calibrate.writing import Figure, Plan, PlannedBy, as_medians, as_
 from brushloop.calibrate.writing.learn import FootprintArtefact
 from brushloop.model.ccdbsm import Brush, DomainError
 from brushloop.model.characters.glyph import CHARACTERS, parse_csv, parse_glyph, paths_of, reference, swept
-from brushloop.model.characters.plan import Floats, Image, Patch, Reach, covered, drawn, first_lead, lead
+from brushloop.model.characters.plan import Image, Patch, Reach, covered, drawn, first_lead, lead
 from brushloop.model.characters.presses import refine, trajectory, written
 from brushloop.model.drag import Footprint
 from brushloop.model.similarity import csim, ssim
@@ -32,8 +32,6 @@ TILT_DEG = 5.0
 """The initial tilt; refinement may change it within reach."""
 MAX_FIGURES = 20
 MOST_TILT_DEG = 30.0
-Planned = tuple[Figure, Image]
-"""A figure, and the model's image of its first plan."""
 
 
 def plan(request: PlanRequest, _progress: Progress = unseen) -> Written:
@@ -43,15 +41,8 @@ def plan(request: PlanRequest, _progress: Progress = unseen) -> Written:
     """
     check_writable(request.out)
     fitted = load_artefact(request.footprint, FootprintArtefact) if request.footprint is not None else None
-    by = PlannedBy(
-        radius_mm=request.radius_mm,
-        length_mm=request.length_mm,
-        depth_range_mm=request.depth_range_mm,
-        tilt_range_deg=request.tilt_range_deg,
-        speed_mm_s=request.speed_mm_s,
-        wrist_deg_s=request.wrist_deg_s,
-        footprint=None if fitted is None else fitted.footprint().values,
-    )
+    limits = {name: getattr(request, name) for name in PlannedBy.model_fields if name != "footprint"}
+    by = PlannedBy(**limits, footprint=None if fitted is None else fitted.footprint().values)
     low, high = by.tilt_range_deg
     tilt_deg = min(max(TILT_DEG, low), high)
     try:
@@ -64,11 +55,11 @@ def plan(request: PlanRequest, _progress: Progress = unseen) -> Written:
         raise CalibrationError("write plan", str(error)) from None
     wanted = read_wanted(request.what, request.data, patch)
     if fitted is None:
-        label, simulated = model.label, "CCD-BSM, marks laid over each other along the way"
-        planned = [pressed(figure, model, reach, patch, tilt_deg, request.steps) for figure in wanted]
+        drawing, label, simulated = model, model.label, "CCD-BSM, marks laid over each other along the way"
     else:
-        label, simulated = "fitted footprint", f"the footprint fitted to {fitted.session_id}, {fitted.source}"
-        planned = [led(figure, fitted.footprint(), reach, patch, tilt_deg) for figure in wanted]
+        drawing, label = fitted.footprint(), "fitted footprint"
+        simulated = f"the footprint fitted to {fitted.session_id}, {fitted.source}"
+    planned = [planned_figure(figure, drawing, reach, patch, tilt_deg, request.steps) for figure in wanted]
     request.out.mkdir(parents=True, exist_ok=True)
     draw(planned, patch.side_mm, request.out / PICTURE)
     figures = tuple(figure for figure, _ in planned)
@@ -77,7 +68,7 @@ def plan(request: PlanRequest, _progress: Progress = unseen) -> Written:
     return Written(protocol, (*_said(planned, simulated), str(protocol), str(request.out / PICTURE)))
 
 
-def _said(planned: Sequence[Planned], simulated: str) -> Iterator[str]:
+def _said(planned: Sequence[tuple[Figure, Image]], simulated: str) -> Iterator[str]:
     yield f"simulated by {simulated}: not ink"
     for figure, first in planned:
         points = sum(len(stroke) for stroke in figure.commanded)
@@ -89,27 +80,26 @@ def _likeness(figure: Figure, image: Image) -> str:
     return f"CSIM {csim(figure.wanted, image):.4f}, SSIM {ssim(figure.wanted, image):.4f}"
 
 
-def pressed(figure: Figure, model: StrokeModel, reach: Reach, patch: Patch, tilt_deg: float, steps: int) -> Planned:
-    """Plan a figure as presses that are laid over each other along the way."""
-    side_mm = patch.side_mm
-    first = [trajectory(path, model, reach, patch, tilt_deg) for path in figure.paths]
-    refined = refine(model, first, figure.wanted, side_mm, reach, steps)
-    strokes = [reach.spaced(np.round(reach.within(stroke, side_mm), 3)) for stroke in refined]
-    return _planned(figure, strokes, *(written(model, each, side_mm) for each in (first, strokes)))
+def planned_figure(
+    figure: Figure, drawing: StrokeModel | Footprint, reach: Reach, patch: Patch, tilt_deg: float, steps: int
+) -> tuple[Figure, Image]:
+    """The figure with its trajectories, and the (128, 128) image of the first plan of them.
 
-
-def led(figure: Figure, footprint: Footprint, reach: Reach, patch: Patch, tilt_deg: float) -> Planned:
-    """Plan a figure so that the ink of a dragged footprint follows it."""
-    side_mm, size_px = patch.side_mm, len(figure.wanted)
-    first = first_lead(figure.paths, footprint, reach, side_mm, tilt_deg)
-    footprints = [footprint] * len(first)
-    strokes = lead(footprints, first, figure.wanted, side_mm, reach)
-    images = (covered(drawn(footprints, each, side_mm, size_px), side_mm) for each in (first, strokes))
-    return _planned(figure, strokes, *images)
-
-
-def _planned(figure: Figure, strokes: list[Floats], first: Image, simulated: Image) -> Planned:
-    return figure.model_copy(update={"commanded": as_points(strokes), "simulated": simulated}), first
+    With a stroke model, its presses are laid over each other along the way, refined in so many steps; with a
+    footprint, the ink that it drags follows the figure.
+    """
+    side_mm, wanted = patch.side_mm, figure.wanted
+    if isinstance(drawing, Footprint):
+        first = first_lead(figure.paths, drawing, reach, side_mm, tilt_deg)
+        footprints = [drawing] * len(first)
+        strokes = lead(footprints, first, wanted, side_mm, reach)
+        images = [covered(drawn(footprints, each, side_mm, len(wanted)), side_mm) for each in (first, strokes)]
+    else:
+        first = [trajectory(path, drawing, reach, patch, tilt_deg) for path in figure.paths]
+        refined = refine(drawing, first, wanted, side_mm, reach, steps)
+        strokes = [reach.spaced(np.round(reach.within(stroke, side_mm), 3)) for stroke in refined]
+        images = [written(drawing, each, side_mm) for each in (first, strokes)]
+    return figure.model_copy(update={"commanded": as_points(strokes), "simulated": images[1]}), images[0]
 
 
 def read_wanted(what: str, data: Path | None, patch: Patch) -> list[Figure]:
@@ -130,7 +120,7 @@ def read_wanted(what: str, data: Path | None, patch: Patch) -> list[Figure]:
 
 def _drawn_by_hand(path: Path, patch: Patch) -> Figure:
     try:
-        paths = parse_csv(_text(path), patch, STEP_MM)
+        paths = parse_csv(read_bounded(path).decode(), patch, STEP_MM)
     except ValueError as error:
         raise CalibrationError(str(path), str(error)) from None
     name = "".join(c if c.isalnum() or c in "-_" else "-" for c in path.stem)[:50].strip("-") or "figure"
@@ -147,7 +137,7 @@ def _character(name: str, data: Path | None, patch: Patch) -> Figure:
             f"character {name!r}", f"is not shipped ({shipped}): --data names a folder of hanzi-writer-data that has it"
         )
     try:
-        strokes = parse_glyph(_text(path))
+        strokes = parse_glyph(read_bounded(path).decode())
     except ValueError as error:
         raise CalibrationError(str(path), str(error)) from None
     source = SHIPPED_SOURCE if data is None else data.name
@@ -155,14 +145,7 @@ def _character(name: str, data: Path | None, patch: Patch) -> Figure:
     return Figure(name=name, source=source, medians=medians, wanted=reference(strokes, patch))
 
 
-def _text(path: Path) -> str:
-    try:
-        return read_bounded(path).decode("utf-8")
-    except UnicodeDecodeError:
-        raise CalibrationError(str(path), "is no UTF-8 text") from None
-
-
-def draw(planned: Sequence[Planned], side_mm: float, path: Path) -> None:
+def draw(planned: Sequence[tuple[Figure, Image]], side_mm: float, path: Path) -> None:
     """Draw a row per figure: wanted, first plan, refined plan, and the tip's trajectory over the wanted ink."""
     picture, rows = picture_grid(len(planned), 4, (12.0, 3.4 * len(planned)))
     extent = (0.0, side_mm, 0.0, side_mm)

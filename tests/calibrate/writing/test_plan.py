@@ -14,7 +14,7 @@ from brushloop.__main__ import app
 from brushloop.calibrate.commands import PlanRequest
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.writing import PROTOCOL
-from brushloop.calibrate.writing.plan import PICTURE, plan, pressed, read_wanted
+from brushloop.calibrate.writing.plan import PICTURE, plan, planned_figure, read_wanted
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.kinds import WriteConfig
 from brushloop.model.ccdbsm import Brush
@@ -51,7 +51,7 @@ def test_the_command_writes_a_protocol_within_reach_and_a_picture(tmp_path: Path
 
 def test_refinement_raises_both_scores() -> None:
     [wanted] = read_wanted("永", None, PATCH)
-    figure, first = pressed(wanted, MODEL, Reach(), PATCH, 5.0, 20)
+    figure, first = planned_figure(wanted, MODEL, Reach(), PATCH, 5.0, 20)
     for measure, least in ((csim, 0.98), (ssim, 0.97)):
         assert measure(figure.wanted, figure.simulated) > max(measure(figure.wanted, first), least)
 
@@ -61,7 +61,7 @@ def test_a_data_set_is_a_folder_with_a_file_for_each_character(tmp_path: Path) -
     [figure] = read_wanted("一", tmp_path, PATCH)
     assert len(figure.paths) == 1
     assert figure.wanted.max() == 1.0
-    for content, words in ((b"\xff\xfe", "is no UTF-8 text"), (b"{}", "strokes: Field required")):
+    for content, words in ((b"\xff\xfe", "'utf-8' codec can't decode"), (b"{}", "strokes: Field required")):
         (tmp_path / "一.json").write_bytes(content)
         with pytest.raises(CalibrationError, match=rf"一\.json: {words}"):
             read_wanted("一", tmp_path, PATCH)
