@@ -119,7 +119,7 @@ COMMANDS: tuple[tuple[str, str, type[Any], str], ...] = (
     ("twin", RESEARCH, commands.TwinRequest, "twin.run:twin"),
     ("validate sessions", "", commands.ValidateRequest, "calibrate.validate.command:validate"),
     ("validate diff", "", commands.DiffRequest, "calibrate.validate.diff:compare"),
-    ("write plan", "", commands.PlanRequest, "calibrate.writing.plan:plan"),
+    ("write plan", "", commands.PlanRequest, "calibrate.writing:plan"),
     ("write compare", "", commands.CompareWrittenRequest, "calibrate.writing.compare:compare"),
     ("write learn", "", commands.LearnRequest, "calibrate.writing.learn:learn"),
     ("write practice", "", commands.PracticeRequest, "calibrate.writing.learn:practice"),

@@ -13,7 +13,7 @@ import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Self, TypeVar, cast
+from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -156,21 +156,16 @@ def recording_facts(
     return [(name, text) for name, text in facts if text]
 
 
-def png_uri(data: bytes) -> str:
-    """An encoded PNG as a data URI: no report ever fetches anything."""
-    return "data:image/png;base64," + base64.b64encode(data).decode()
-
-
-def svg_uri(data: bytes) -> str:
-    """An SVG file as a data URI."""
-    return "data:image/svg+xml;base64," + base64.b64encode(data).decode()
+def data_uri(data: bytes, kind: str = "png") -> str:
+    """An encoded PNG, or picture of another kind, as a data URI: no report ever fetches anything."""
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
 
 
 def image_uri(image: NDArray[np.uint8]) -> str:
     """An (h, w) gray or (h, w, 3) BGR image as a PNG data URI."""
     import cv2
 
-    return png_uri(cv2.imencode(".png", image)[1].tobytes())
+    return data_uri(cv2.imencode(".png", image)[1].tobytes())
 
 
 def photograph_uri(image: NDArray[np.uint8], longest_px: int = PHOTOGRAPH_PX) -> str:
@@ -180,7 +175,7 @@ def photograph_uri(image: NDArray[np.uint8], longest_px: int = PHOTOGRAPH_PX) ->
     share = min(1.0, longest_px / max(image.shape))
     small = cv2.resize(image, None, fx=share, fy=share, interpolation=cv2.INTER_AREA) if share < 1.0 else image
     data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
-    return "data:image/jpeg;base64," + base64.b64encode(data).decode()
+    return data_uri(data, "jpeg")
 
 
 def ink_uri(ink: Image) -> str:
@@ -259,7 +254,7 @@ def chart_uri(panels: Sequence[Panel], size_px: tuple[int, int], title: str = ""
         axes = {"x": panel.x, "y": panel.y, "x_ticks": x_ticks, "y_ticks": y_ticks}
         drawn.append({"title": heads[k], "marks": marks, "legend": legends[k], **axes, **frame})
     about = {"width": width, "height": height, "title": head, "above": above, "top": top, "bottom": bottom}
-    return svg_uri(render("chart.svg.j2", panels=drawn, **about).encode())
+    return data_uri(render("chart.svg.j2", panels=drawn, **about).encode(), "svg+xml")
 
 
 def _scale(
@@ -357,25 +352,21 @@ S = TypeVar("S", bound=Sealed)
 
 def load_sealed(path: Path, kind: type[S], most_bytes: int) -> S:
     """Read a JSON report. Raises `CalibrationError`, naming the file, if it is not one, is too new or was edited."""
-    fields: dict[str, Any] = {}
     try:
-        parsed: Any = json.loads(read_bounded(path, most_bytes))
-        fields = cast("dict[str, Any]", parsed) if isinstance(parsed, dict) else {}
+        fields: Any = json.loads(read_bounded(path, most_bytes))
         # Digest of the file, not of the model: a field that was added to the model later is not an edit.
-        digest = _digest(fields)
-    except (ValueError, RecursionError):  # no JSON, or text that is no Unicode
-        digest = ""
-    if not digest or not {"format", "digest"} <= fields.keys():
-        raise CalibrationError(str(path), f"is not a report with a digest: write it with `{kind.MADE_BY}`")
-    if fields["format"] != kind.FORMAT:
-        raise CalibrationError(str(path), f"format is {str(fields['format'])[:40]!r}, expected {kind.FORMAT!r}")
+        known, digest, fields_format = fields["digest"], _digest(fields), fields["format"]
+    except (ValueError, RecursionError, TypeError, KeyError):  # no JSON, text that is no Unicode, or something else
+        what = f"is not a report with a digest: write it with `{kind.MADE_BY}`"
+        raise CalibrationError(str(path), what) from None
+    if fields_format != kind.FORMAT:
+        raise CalibrationError(str(path), f"format is {str(fields_format)[:40]!r}, expected {kind.FORMAT!r}")
+    if known != digest:
+        raise CalibrationError(str(path), "was edited: its digest does not match its contents")
     try:
-        record = kind.model_validate(fields)
+        return kind.model_validate(fields)
     except ValidationError as error:
         raise invalid(str(path), error) from None
-    if fields["digest"] != digest:
-        raise CalibrationError(str(path), "was edited: its digest does not match its contents")
-    return record
 
 
 def _digest(contents: dict[str, Any]) -> str:

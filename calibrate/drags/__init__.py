@@ -6,9 +6,7 @@ reached from the middle over a third of the length: `depth_ends_mm`, or `z_frac_
 `z_frac_mid`.
 
 A stroke with a defect (torn into parts, hollow, under glare) is measured and predicted, but no brush is fitted to it.
-Parts of a drag lie farther apart than drops beside a press, so more of them are taken for the stroke. A press model
-does not predict a drag. Both depend on how wide the brush opens at a depth, so the fitted slope of width against depth
-can be compared with the one that CCD-BSM gives.
+Parts of a drag lie farther apart than drops beside a press, so more of them are taken for the stroke.
 """
 
 from __future__ import annotations
@@ -25,7 +23,6 @@ from numpy.typing import NDArray
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.presses import Refused, rectified
 from brushloop.calibrate.session import OpenSession, open_session
-from brushloop.calibrate.stats import Line, fit_line
 from brushloop.calibrate.stroke import (
     PX_PER_MM,
     Gray,
@@ -58,8 +55,6 @@ HOLLOW_SHARE = 0.75
 """Share of its outline that ink covers, below which a stroke is hollow: dry bristles, or glare on wet ink."""
 THUMB_PX = 160
 OUTLINE_GRAY = 128
-LEVEL_DEG = 20.0
-"""Bent strokes along x have a rectangle that is a little tilted: only strokes of another direction are turned."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,15 +131,11 @@ class Drags:
         paths = [commanded_path(*command[:4]) for command in self.commands.tolist()]
         return Drawings.of([[path] for path in paths], np.array([drag.ink for drag in self.placed]), *self.grid)
 
-    def widths(self) -> list[tuple[float, float]]:
-        """(commanded depth, width at the middle) in mm of the strokes that are neither cut nor have a defect."""
+    def widths(self) -> Floats:
+        """(n, 2) commanded depth and width at the middle, mm, of strokes that are neither cut nor have a defect."""
         whole = ((depth_of(drag.stroke), drag) for drag in self.strokes if not drag.cut and not drag.flags)
-        return [(depth_mm, drag.measured.mid_width_mm) for depth_mm, drag in whole if depth_mm is not None]
-
-    def width_on_depth(self) -> Line | None:
-        """The line through them."""
-        points = self.widths()
-        return fit_line([depth for depth, _ in points], [width for _, width in points])
+        points = [(depth_mm, drag.measured.mid_width_mm) for depth_mm, drag in whole if depth_mm is not None]
+        return np.array(points, np.float64).reshape(-1, 2)
 
 
 def read_drags(path: Path, progress: Progress = unseen) -> Drags:
@@ -224,8 +215,7 @@ def _read(capture: Capture, command: tuple[float, ...] | None, grid: tuple[Float
     return Drag(
         capture.stroke,
         command,
-        # A start in the table means a commanded path, which runs along x. Scanned strokes have neither.
-        measure(along_axis(mask) if anchor is None else mask),
+        measure(mask),
         touches_edge(whole),
         (*defects(whole), *glare),
         _thumbnail(raster, mask),
@@ -256,24 +246,6 @@ def defects(mask: Mask) -> tuple[str, ...]:
     if covered < HOLLOW_SHARE:
         phrases.append(f"hollow: ink covers {100 * covered:.0f} % of the outline")
     return tuple(phrases)
-
-
-def along_axis(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The mask turned until the stroke's longer axis, that of its smallest enclosing rectangle, is the x axis.
-
-    A mask whose axis is within `LEVEL_DEG` of x is returned as it is.
-    """
-    points = cv2.findNonZero(mask.astype(np.uint8))
-    centre, (width, height), angle = cv2.minAreaRect(points)
-    turn = angle if width >= height else angle - 90.0
-    turn = (turn + 90.0) % 180.0 - 90.0
-    if abs(turn) < LEVEL_DEG:
-        return mask
-    side = int(np.hypot(*mask.shape)) + 2
-    matrix = cv2.getRotationMatrix2D(centre, turn, 1.0)
-    matrix[:, 2] += 0.5 * side - np.array(centre)
-    turned = cv2.warpAffine(255 * mask.astype(np.uint8), matrix, (side, side), flags=cv2.INTER_LINEAR)
-    return np.asarray(turned > 127, np.bool_)
 
 
 def _thumbnail(raster: Gray, mask: Mask) -> Gray:

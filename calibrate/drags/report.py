@@ -7,7 +7,6 @@ and IoU of ink as 0 or 1 at the commanded place; no shift is searched for.
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,7 +36,7 @@ from brushloop.calibrate.report import (
     source_note,
     write_files,
 )
-from brushloop.calibrate.stats import CEILING, ceiling_values, pair_means
+from brushloop.calibrate.stats import CEILING, ceiling_values, fit_line, pair_means
 from brushloop.model.drag import Floats
 from brushloop.model.similarity import binary_scores, inked_window
 from brushloop.sessions.disk import csv_text
@@ -160,7 +159,7 @@ def write_drags(validation: DragValidation, folder: Path, command: str) -> Path:
         note=source_note(header.source, header.brush),
         provenance=[*facts, ("validated with", made_by()), ("command", command)],
         drags=drags,
-        sentences=list(fit_sentences(drags)),
+        width=width_sentence(drags),
         plot=_plot(drags) if drags.strokes else "",
         thumbnails=[(drag.stroke.stroke_id, image_uri(drag.thumbnail)) for drag in drags.strokes[::step]],
         means=validation.means(),
@@ -233,34 +232,25 @@ def _worst(validation: DragValidation) -> Iterator[tuple[str, float, float, str]
         yield drag.stroke.stroke_id, csim, iou, uri
 
 
-def fit_sentences(drags: Drags) -> Iterator[str]:
-    """Sentences on the line through a session's widths, and how it relates to CCD-BSM."""
-    width = drags.width_on_depth()
-    if width is None:
-        yield "Width against depth: no fit (fewer than 3 whole strokes, or one depth only)."
-        return
-    low, high = width.interval
-    yield (
-        f"Width at the middle against commanded depth: {width.slope:.3f} mm/mm (95 % {low:.3f} to {high:.3f}), "
-        f"{width.intercept:+.2f} mm at depth 0, r = {width.r:.2f}, n = {width.n}."
+def width_sentence(drags: Drags) -> str:
+    """The line through the widths of a session, and how well it is known."""
+    line = fit_line(*drags.widths().T.tolist())
+    if line is None:
+        return "Width against depth: no fit (fewer than 3 whole strokes, or one depth only)."
+    low, high = line.interval
+    return (
+        f"Width at the middle against commanded depth: {line.slope:.3f} mm/mm (95 % {low:.3f} to {high:.3f}), "
+        f"{line.intercept:+.2f} mm at depth 0, r = {line.r:.2f}, n = {line.n}."
     )
-    if low <= 0.0:
-        yield "The slope's interval reaches 0: these strokes do not show how the brush opens with depth."
-    else:
-        ratio = width.slope / (2.0 * math.pi)
-        yield (
-            "CCD-BSM opens linearly with depth from zero, 2 λ R/L per mm. With λ = π this slope would be that of a "
-            f"brush with R/L = {ratio:.4f} (the paper's brush: 6/48 = {6 / 48:.4f}); a width at depth 0 is an "
-            "error of the zero touch, or ink that spreads, which CCD-BSM does not describe."
-        )
 
 
 def _plot(drags: Drags) -> str:
     """Width against depth, with the fitted line."""
-    points, line = np.array(drags.widths()).reshape(-1, 2), drags.width_on_depth()
-    marks = [Marks(points[:, 0], points[:, 1], dot_px=5.0)]
+    depth_mm, width_mm = drags.widths().T
+    line = fit_line(depth_mm.tolist(), width_mm.tolist())
+    marks = [Marks(depth_mm, width_mm, dot_px=5.0)]
     if line is not None:
-        ends = np.array([points[:, 0].min(), points[:, 0].max()])
+        ends = np.array([depth_mm.min(), depth_mm.max()])
         marks.append(Marks(ends, line.slope * ends + line.intercept, ORANGE, line_px=1.5))
     across, up = Axis("commanded depth, mm"), Axis("measured width at the middle, mm")
     return chart_uri([Panel(str(drags.session.header.source), across, up, marks)], (720, 400))
@@ -271,7 +261,7 @@ def summary(validation: DragValidation) -> Iterator[Table | str]:
     drags, header = validation.drags, validation.header
     yield f"{header.session_id}: {source_note(header.source)}"
     yield f"{len(drags.strokes)} strokes measured: {MEASURED} has length, width and area beside what was commanded"
-    yield from fit_sentences(drags)
+    yield width_sentence(drags)
     yield from prediction_sentences(validation)
     if means := validation.means():
         table = Table("", "n", "CSIM", "sd", "IoU", title=f"over all, percent ({header.source})")

@@ -20,7 +20,7 @@ from brushloop.calibrate.fit.fit import BrushFit
 from brushloop.calibrate.loop import FILE as LOOP_FILE
 from brushloop.calibrate.loop import LoopRecord, read_loop
 from brushloop.calibrate.remote import URL, local_path
-from brushloop.calibrate.report import framed, png_uri, write_files
+from brushloop.calibrate.report import data_uri, framed, write_files
 from brushloop.calibrate.scores import scores_csv, write_parquet
 from brushloop.calibrate.session import open_session as open_recording
 from brushloop.calibrate.validate.findings import terminal_lines
@@ -187,7 +187,7 @@ def figure_13(path: Path, record: WrittenRecord) -> str:
     data = read_bounded(path, MAX_PICTURE_BYTES)
     if hashlib.sha256(data).hexdigest() != record.figure_13_sha256:
         raise CalibrationError(str(path), f"is not the picture of {WRITTEN_FILE} beside it: its SHA-256 differs")
-    return png_uri(data)
+    return data_uri(data)
 
 
 def _write(outcome: Outcome, folder: Path, curves: Sequence[Curve], beside: Beside) -> Report:

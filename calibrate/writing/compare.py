@@ -8,10 +8,10 @@ from __future__ import annotations
 import functools
 import hashlib
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, cast
+from typing import ClassVar, cast
 
 import cv2
 import numpy as np
@@ -36,12 +36,12 @@ from brushloop.calibrate.presses import Refused, prepare_cell
 from brushloop.calibrate.report import (
     Sealed,
     about,
+    data_uri,
     ink_uri,
     load_sealed,
     overlay,
     overlay_uri,
     picture_grid,
-    png_uri,
     recording_facts,
     render,
     save_picture,
@@ -86,8 +86,6 @@ class Character:
     reference: Image
     captured: dict[str, Ink]
     """Ink by stroke id."""
-    cut: tuple[str, ...] = ()
-    """Writings whose ink reaches the edge of their cell."""
 
     def mean_ink(self) -> Image:
         """(128, 128) share of the writings that inked each pixel."""
@@ -172,6 +170,8 @@ class WritingComparison:
     plan: Plan
     characters: list[Character]
     refused: tuple[Refused, ...] = ()
+    cut: tuple[str, ...] = ()
+    """Writings whose ink reaches the edge of their cell."""
 
     @functools.cached_property
     def table_3(self) -> tuple[Table3Row, ...]:
@@ -180,9 +180,8 @@ class WritingComparison:
         for character, key, pair in itertools.product(self.characters, KEYS, PAIRS):
             csim, ssim = (summarise(percent) for percent in 100.0 * character.scores[pair, key].T)
             if csim is not None and ssim is not None:
-                how = dict(zip(("alignment", "tone", "polarity"), key, strict=True))
-                about_it = {"character": character.figure.name, "reference": character.reference_name, "pair": pair}
-                rows.append(Table3Row.model_validate(about_it | how | {"csim": csim, "ssim": ssim}))
+                row = (character.figure.name, character.reference_name, pair, *key, csim, ssim)
+                rows.append(Table3Row.model_validate(dict(zip(Table3Row.model_fields, row, strict=True))))
         return tuple(rows)
 
     @property
@@ -217,21 +216,21 @@ def compare_written(
     if unknown := sorted(set(references) - {figure.name for figure in plan.figures}):
         raise CalibrationError("--reference", f"{unknown[0]!r} is not in the plan")
     writings: dict[str, dict[str, Ink]] = {}
-    cut = set[str]()
+    cut = list[str]()
     for stroke_id, name, prepared in read_writings(session, refused, progress):
         ink = {Tone.BINARY: _small(prepared.mask.astype(np.float32)), Tone.GRAY: _small(prepared.soft)}
         writings.setdefault(name, {})[stroke_id] = ink
-        cut |= {stroke_id} if prepared.cut else set()
-    characters: list[Character] = []
-    for figure in plan.figures:
-        if captured := writings.get(figure.name):
-            name, image = references.get(figure.name) or (figure.source, figure.wanted)
-            at_the_edge = tuple(stroke_id for stroke_id in captured if stroke_id in cut)
-            characters.append(Character(figure, name, image, captured, at_the_edge))
+        if prepared.cut:
+            cut.append(stroke_id)
+    characters = [
+        Character(figure, *references.get(figure.name, (figure.source, figure.wanted)), writings[figure.name])
+        for figure in plan.figures
+        if figure.name in writings
+    ]
     if not characters:
         why = f": {refused[0][0]}: {refused[0][1]}" if refused else ""
         raise CalibrationError(str(session.recording.path), f"no character can be compared{why}")
-    return WritingComparison(session, plan, characters, tuple(refused))
+    return WritingComparison(session, plan, characters, tuple(refused), tuple(cut))
 
 
 def read_writings(
@@ -347,13 +346,15 @@ def write_written(written: WritingComparison, folder: Path, command: str) -> Pat
         "written.html.j2",
         **about(header),
         written=written,
-        tables=_tables(written.table_3),
+        ways=list(itertools.product(Tone, (Alignment.SIZE_NORMALISED, Alignment.MM))),
+        order=list(itertools.product(PAIRS, Polarity)),
         paper_rows=PAPER_ROWS,
-        rounds=[_rounds(character, plan.cell_mm) for character in written.characters],
+        rounds=[[*each.figure.rounds, round_of(each, plan.cell_mm)] for each in written.characters],
+        phases=[str(phase) for phase in Phase],
         ink_uri=ink_uri,
         overlay_uri=overlay_uri,
         ssim_settings=SSIM_SETTINGS,
-        picture=png_uri(picture),
+        picture=data_uri(picture),
         provenance=[*facts, ("compared with", record.software), ("command", command)],
     )
     write_files(folder, {TABLE: scores_csv(written), FILE: record.sealed().to_json(), PAGE: page})
@@ -393,19 +394,3 @@ def draw(written: WritingComparison, path: Path) -> None:
         for axis, (text, image) in zip(axes, parts, strict=True):
             show_picture(axis, image, text, fontsize=8)
     save_picture(figure, path)
-
-
-def _tables(table: Sequence[Table3Row]) -> list[dict[str, Any]]:
-    """A table for each alignment and tone, with both polarities."""
-    out: list[dict[str, Any]] = []
-    for tone, alignment in itertools.product(Tone, (Alignment.SIZE_NORMALISED, Alignment.MM)):
-        rows = [row for row in table if (row.alignment, row.tone) == (alignment, tone)]
-        rows.sort(key=lambda row: (PAIRS.index(row.pair), row.polarity is Polarity.PAPER))
-        out.append({"alignment": alignment, "tone": tone, "rows": rows})
-    return out
-
-
-def _rounds(character: Character, side_mm: float) -> tuple[list[Round], list[str]]:
-    """The rounds of learning of a character, these writings last, and the phases that any of them lists."""
-    rounds = [*character.figure.rounds, round_of(character, side_mm)]
-    return rounds, [str(phase) for phase in Phase if any(phase in each.lost_percent for each in rounds)]

@@ -15,14 +15,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
 
-from brushloop.calibrate.artefact import SessionFit, made_by, put_to_use
+from brushloop.calibrate.artefact import made_by, put_to_use
 from brushloop.calibrate.commands import FitFootprintRequest, LearnRequest, PracticeRequest
 from brushloop.calibrate.compare import Image
 from brushloop.calibrate.drags.fit import captured_distance
@@ -32,6 +30,7 @@ from brushloop.calibrate.session import open_session
 from brushloop.calibrate.stroke import PX_PER_MM
 from brushloop.calibrate.writing import (
     Figure,
+    FootprintArtefact,
     Plan,
     PlannedBy,
     Round,
@@ -86,28 +85,6 @@ DEEPEST = 0.3
 MM_BETWEEN = 2.0
 TILT_DEG = 5.0
 NAME = "practice"
-
-
-class FootprintArtefact(SessionFit):
-    """A fitted footprint on disk. Equal inputs give an equal file."""
-
-    values: dict[str, Annotated[float, Field(allow_inf_nan=False)]]
-    images: int
-    strokes: int
-    csim_percent: float
-    """Mean agreement with the ink that it was fitted to, ink = 1: an upper bound of what it predicts."""
-
-    def footprint(self) -> Footprint:
-        """The fitted footprint."""
-        return Footprint(tuple(self.values[name] for name in NAMES))
-
-    @model_validator(mode="after")
-    def _whole(self) -> Self:
-        if set(self.values) != set(NAMES):
-            raise ValueError(
-                f"values: expected the {len(NAMES)} of this version; fit the session again with `brushloop write fit`"
-            )
-        return self
 
 
 def fit(request: FitFootprintRequest, progress: Progress = unseen) -> Written:

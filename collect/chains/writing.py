@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from brushloop.calibrate import writing
 from brushloop.calibrate.artefact import current
 from brushloop.calibrate.commands import (
     CompareWrittenRequest,
@@ -62,8 +63,6 @@ class Writing:
             check_fresh_sheet(request.sessions, request.sheet)  # now, not after planning
         brush = load_rig(request.config).brush
 
-        from brushloop.calibrate.writing import plan as planning  # slow to import
-
         wanted = PlanRequest(
             request.what,
             plan,
@@ -76,7 +75,7 @@ class Writing:
             repeats=self._repeats(1),
         )
         say(f"write plan {request.what} --out {plan}")
-        show_work(planning.plan, wanted)
+        show_work(writing.plan, wanted)
         return plan
 
     def _footprint(self) -> Path:

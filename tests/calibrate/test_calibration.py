@@ -215,7 +215,7 @@ def test_where_it_is_to_be_written_is_looked_at_before_any_work(
     for name in ("taken", "s.mcap"):
         (tmp_path / name).write_text("kept")
     with monkeypatch.context() as patch:
-        patch.setattr("brushloop.calibrate.writing.plan.planned_figure", None)  # not called: it takes minutes
+        patch.setattr("brushloop.calibrate.writing.planned_figure", None)  # not called: it takes minutes
         ran = CliRunner().invoke(app, [*words])
     assert isinstance(ran.exception, InputError | CalibrationError)
     assert why in str(ran.exception)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from brushloop.calibrate.commands import PracticeRequest
+from brushloop.calibrate.writing import FootprintArtefact
 from brushloop.calibrate.writing.learn import (
     FIGURES,
     MARGIN,
-    FootprintArtefact,
     fitted,
     practice,
     practice_strokes,

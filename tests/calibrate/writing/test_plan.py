@@ -13,8 +13,7 @@ from typer.testing import CliRunner
 from brushloop.__main__ import app
 from brushloop.calibrate.commands import PlanRequest
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.writing import PROTOCOL
-from brushloop.calibrate.writing.plan import PICTURE, plan, planned_figure, read_wanted
+from brushloop.calibrate.writing import PICTURE, PROTOCOL, plan, planned_figure, read_wanted
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.kinds import WriteConfig
 from brushloop.model.ccdbsm import Brush

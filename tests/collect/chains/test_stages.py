@@ -243,8 +243,8 @@ class Commands:
     def __init__(self, settled_after: int, monkeypatch: pytest.MonkeyPatch) -> None:
         self.ran: list[str] = []
         self._rounds, self._settled_after = 0, settled_after
-        for name in ("plan.plan", "compare.compare", "learn.learn", "learn.practice", "learn.fit"):
-            command = getattr(self, name.split(".")[1])
+        for name in ("plan", "compare.compare", "learn.learn", "learn.practice", "learn.fit"):
+            command = getattr(self, name.split(".")[-1])
             monkeypatch.setattr(f"brushloop.calibrate.writing.{name}", command)
 
     def plan(self, request: PlanRequest, _: object) -> Written:
