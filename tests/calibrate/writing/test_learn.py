@@ -1,4 +1,4 @@
-"""A plan learns from ink that lies off and comes out thin: the command moves the other way."""
+"""A practice sheet shows how a brush is dragged, and a plan learns from ink that lies off and comes out thin."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from brushloop.calibrate.commands import PracticeRequest
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.writing import Figure, Plan, PlannedBy, as_points
+from brushloop.calibrate.writing import Figure, FootprintArtefact, Plan, PlannedBy, as_points
 from brushloop.calibrate.writing.compare import (
     Character,
     WritingComparison,
@@ -17,10 +18,28 @@ from brushloop.calibrate.writing.compare import (
     round_of,
     write_written,
 )
-from brushloop.calibrate.writing.learn import MOST_MM, learned, missed
+from brushloop.calibrate.writing.learn import (
+    FIGURES,
+    MARGIN,
+    fitted,
+    learned,
+    practice,
+    practice_strokes,
+)
+from brushloop.collect.protocols.config import load_protocol
+from brushloop.collect.protocols.kinds import WriteConfig
 from brushloop.model.characters.glyph import swept
-from brushloop.model.characters.plan import StrokePath, covered, drawn, first_lead, lead
-from brushloop.model.drag import NAMES, START, Footprint
+from brushloop.model.characters.plan import (
+    Reach,
+    StrokePath,
+    covered,
+    drawn,
+    first_lead,
+    grid,
+    lead,
+    without_tilt,
+)
+from brushloop.model.drag import NAMES, START, Drawings, Footprint, inked
 from brushloop.sessions.records import Header, Source
 from tests.calibrate.given import CALIBRATION
 
@@ -117,23 +136,39 @@ def test_a_character_that_was_not_captured_teaches_nothing(plan: Plan) -> None:
         learned(session(plan, "other"))
 
 
-def test_a_miss_is_the_distance_between_the_two_edges() -> None:
-    wide = swept([StrokePath(LINE.points, np.full(9, 3.0))], SIDE_MM)
-    off = missed(wide, drawn_disc(2.0), SIDE_MM)
-    assert off[64, 64] == pytest.approx(1.0, abs=0.15)
-    assert np.abs(off).max() <= MOST_MM
-    assert not missed(np.zeros((128, 128), np.float32), drawn_disc(2.0), SIDE_MM).any()
-
-
-def drawn_disc(half_mm: float) -> np.ndarray:
-    middle = (np.arange(128) + 0.5) * SIDE_MM / 128
-    x, y = np.meshgrid(middle, SIDE_MM - middle)
-    return half_mm - np.hypot(np.clip(x, 12.0, 36.0) - x, y - 24.0)
-
-
 def test_what_is_lost_is_listed_by_phase(plan: Plan) -> None:
     cut = WANTED.copy()
     cut[:, :40] = 0.0  # the first 3 mm of the stroke and its rounding are missing
     lost = round_of(session(plan, ink=cut).characters[0], SIDE_MM).lost_percent
     assert max(lost, key=lambda phase: lost[phase]) == "initiation, hidden tip"
     assert lost["termination, hidden tip"] == 0.0
+
+
+# The practice sheet, and the footprint that its ink becomes
+
+PATCH_MM = 70.0
+
+
+def test_a_practice_sheet_is_a_protocol_that_stays_inside_its_cells(tmp_path: Path) -> None:
+    protocol = load_protocol(practice(PracticeRequest(tmp_path)).path)
+    assert isinstance(protocol, WriteConfig)
+    assert len(protocol.figures) == FIGURES
+    points = np.concatenate([np.array(stroke.points) for one in protocol.figures for stroke in one.strokes])
+    assert points[:, :2].min() >= MARGIN * PATCH_MM - 1e-3
+    assert points[:, :2].max() <= (1.0 - MARGIN) * PATCH_MM + 1e-3
+    assert points[:, 2].max() <= 14.0
+
+
+def test_figures_become_a_footprint() -> None:
+    true = brush_of(half_mm_2=0.8)
+    paths = [without_tilt(stroke) for stroke in practice_strokes(PATCH_MM, Reach(), 34.0)[:4]]
+    x_mm, y_mm = grid(PATCH_MM, 70)
+    ink = np.array([inked([true] * 2, paths[k : k + 2], x_mm, y_mm) > 0.0 for k in (0, 2)], np.float32)
+    footprint, csim_percent = fitted(Drawings(paths, np.array([0, 2, 4]), ink, x_mm, y_mm))
+    assert csim_percent > 95.0
+    values = dict(zip(NAMES, footprint.values, strict=True))
+    about = {"session_id": "practice-01", "source": "loopback rig", "recording_sha256": "", "calibration": ""}
+    fields = about | {"software": "test", "images": 2, "strokes": 4, "csim_percent": csim_percent}
+    assert FootprintArtefact.model_validate(fields | {"values": values}).footprint() == footprint
+    with pytest.raises(ValueError, match="fit the session again with `brushloop write fit`"):
+        FootprintArtefact.model_validate(fields | {"values": {"drift_along_mm": 0.0}})
