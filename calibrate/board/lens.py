@@ -35,13 +35,12 @@ OUTLIER_MEDIANS = 3.0
 LEAST_OUTLIER_PX = 0.4
 RMS_LIMIT_PX = 0.5
 """Above this a pre-flight check warns: a flat, sharp, still board gives 0.1 to 0.3 px."""
-GRID = (3, 3)
-"""Columns and rows of the image on which coverage is judged."""
-GRID_WORDS = (
-    ("upper left", "upper middle", "upper right"),
-    ("left", "middle", "right"),
-    ("lower left", "lower middle", "lower right"),
+THIRDS = (
+    *("upper left", "upper middle", "upper right"),
+    *("left", "middle", "right"),
+    *("lower left", "lower middle", "lower right"),
 )
+"""Parts of the image on which coverage is judged, row by row."""
 LEAST_SLANT_DEG = 15.0
 """Boards seen face on determine only the ratio of focal length and distance."""
 DISTINCT_DEG = 5.0
@@ -230,12 +229,9 @@ def fit_lens(
     """
     useless = [f"{name}: {why}" for name, why in unusable.items()]
     where = f"{len(views) + len(unusable)} photographs"
-    sizes: dict[tuple[int, int], list[str]] = {}
-    for view in views:
-        sizes.setdefault(view.size_px, []).append(view.name)
-    if len(sizes) > 1:
-        problem = "; ".join(f"{w} x {h} px: {', '.join(names)}" for (w, h), names in sorted(sizes.items()))
-        raise CalibrationError(where, f"have several sizes, so they are of two cameras or settings ({problem})")
+    if len({view.size_px for view in views}) > 1:
+        sizes = ", ".join(f"{view.name} is {view.size_px[0]} x {view.size_px[1]} px" for view in views)
+        raise CalibrationError(where, f"have several sizes, so they are of two cameras or settings: {sizes}")
     kept, dropped = list(views), dict[str, float]()
     while True:
         if len(kept) < LEAST_VIEWS:
@@ -300,18 +296,17 @@ def guidance(views: Sequence[BoardView], slants_deg: Sequence[float], ways: int 
         wanted.append(f"take more photographs ({len(views)} used, {GOOD_VIEWS} are good)")
     width, height = views[0].size_px
     places = np.concatenate([view.pixels for view in views])
-    counts, _, _ = np.histogram2d(places[:, 1], places[:, 0], bins=(GRID[1], GRID[0]), range=((0, height), (0, width)))
-    empty = [GRID_WORDS[r][c] for r in range(GRID[1]) for c in range(GRID[0]) if counts[r, c] == 0]
+    counts, _, _ = np.histogram2d(places[:, 1], places[:, 0], bins=3, range=((0, height), (0, width)))
+    empty = [name for name, count in zip(THIRDS, counts.ravel(), strict=True) if not count]
     if ways < EARNED_WAYS:
         needed = f"{EARNED_WAYS} are needed before an error can be stated"
         wanted.append(f"hold the board in more ways ({ways} so far): {needed}")
     if empty:
         wanted.append(f"bring the board into the {', '.join(empty)} of the image: no corner was seen there")
     slanted = sum(slant >= LEAST_SLANT_DEG for slant in slants_deg)
-    if slanted < min(4, LEAST_VIEWS):
-        wanted.append(
-            f"slant the board by {LEAST_SLANT_DEG:.0f} to 45 deg in at least 4 photographs ({slanted} so far)"
-        )
+    if slanted < LEAST_VIEWS:
+        how = f"slant the board by {LEAST_SLANT_DEG:.0f} to 45 deg in at least {LEAST_VIEWS} photographs"
+        wanted.append(f"{how} ({slanted} so far)")
     return tuple(wanted)
 
 
@@ -319,9 +314,9 @@ def held(normals: Floats) -> Ways:
     """(n,) index of each board's orientation, from the (n, 3) unit normals of the boards."""
     first, ways = list[Floats](), list[int]()
     for normal in normals:
-        near = [k for k, one in enumerate(first) if float(normal @ one) > np.cos(np.radians(DISTINCT_DEG))]
-        ways.append(near[0] if near else len(first))
-        if not near:
+        alike = (k for k, other in enumerate(first) if float(normal @ other) > np.cos(np.radians(DISTINCT_DEG)))
+        ways.append(next(alike, len(first)))
+        if ways[-1] == len(first):
             first.append(normal)
     return np.array(ways, np.int64)
 

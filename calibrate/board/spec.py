@@ -16,10 +16,9 @@ from brushloop.calibrate.errors import CalibrationError, invalid
 from brushloop.calibrate.files import Written, check_target
 from brushloop.sessions.terminal import Progress, unseen
 
-Corners = Annotated[int, Field(ge=3, le=60)]
+Corners, Squares = Annotated[int, Field(ge=3, le=60)], Annotated[int, Field(ge=2, le=50)]
+Side = Annotated[float, Field(gt=0.0, le=1000.0)]
 Place = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
-
-
 MM_PER_INCH = 25.4
 PAGES_MM = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "a2": (420.0, 594.0), "letter": (215.9, 279.4)}
 MARGIN_MM, TEXT_ROOM_MM = 8.0, 8.0
@@ -30,10 +29,10 @@ Rectangle = tuple[float, float, float, float]
 class BoardSpec(Frozen):
     """A ChArUco board in the plane of the paper, in view of the camera."""
 
-    squares: tuple[Annotated[int, Field(ge=2, le=50)], Annotated[int, Field(ge=2, le=50)]]
+    squares: tuple[Squares, Squares]
     """Columns and rows of squares."""
-    square_mm: Annotated[float, Field(gt=0.0, le=1000.0)]
-    marker_mm: Annotated[float, Field(gt=0.0, le=1000.0)]
+    square_mm: Side
+    marker_mm: Side
     dictionary: Annotated[str, Field(pattern=r"^DICT_[0-9A-Z_]+$")] = "DICT_5X5_1000"
     origin_mm: tuple[Place, Place]
     """Lower left corner of the board, in the paper frame."""
@@ -52,7 +51,7 @@ class Checkerboard(Frozen):
 
     inner_corners: tuple[Corners, Corners]
     """Columns and rows."""
-    square_mm: Annotated[float, Field(gt=0.0, le=1000.0)]
+    square_mm: Side
 
 
 Board = Checkerboard | BoardSpec
@@ -141,30 +140,17 @@ def rectangles(board: Board) -> list[Rectangle]:
         return _squares(columns, rows, board.square_mm)
     made = charuco_board(board, "board")
     dictionary = made.getDictionary()
+    side = dictionary.markerSize + 2
+    bit_mm = board.marker_mm / side
     black = _squares(*board.squares, board.square_mm)
     for number, corners in zip(np.ravel(made.getIds()), made.getObjPoints(), strict=True):
-        left, top = (float(v) for v in np.asarray(corners)[0, :2])
-        side = dictionary.markerSize + 2
-        bits = dictionary.generateImageMarker(int(number), side)
-        bit_mm = board.marker_mm / side
-        for row in range(side):
-            for start, end in _runs(np.asarray(bits)[row] == 0):
-                black.append((left + start * bit_mm, top + row * bit_mm, (end - start) * bit_mm, bit_mm))
+        left, top = np.asarray(corners)[0, :2].tolist()
+        bits = np.asarray(dictionary.generateImageMarker(int(number), side)) == 0
+        for row, line in enumerate(bits):
+            # Where a run of black bits begins and where it ends: one rectangle each, without seams.
+            runs = np.flatnonzero(np.diff(line, prepend=False, append=False)).reshape(-1, 2).tolist()
+            black += [(left + a * bit_mm, top + row * bit_mm, (b - a) * bit_mm, bit_mm) for a, b in runs]
     return black
-
-
-def _page(board: Board, page: str) -> tuple[float, float]:
-    if page not in PAGES_MM:
-        raise CalibrationError(f"page {page!r}", f"is not one of {', '.join(PAGES_MM)}")
-    width, height = size_mm(board)
-    upright = PAGES_MM[page]
-    for page_mm in (upright, (upright[1], upright[0])):
-        if width + 2 * MARGIN_MM <= page_mm[0] and height + 2 * MARGIN_MM + TEXT_ROOM_MM <= page_mm[1]:
-            return page_mm
-    raise CalibrationError(
-        f"page {page}",
-        f"has no room for a board of {width:g} x {height:g} mm with {MARGIN_MM:g} mm around it and its name below",
-    )
 
 
 def drawn(board: Board, page: str) -> Any:
@@ -174,17 +160,23 @@ def drawn(board: Board, page: str) -> Any:
     from matplotlib.patches import Rectangle as Patch
     from matplotlib.transforms import Affine2D
 
-    page_mm = _page(board, page)
+    if page not in PAGES_MM:
+        raise CalibrationError(f"page {page!r}", f"is not one of {', '.join(PAGES_MM)}")
     width, height = size_mm(board)
+    needed_mm = width + 2 * MARGIN_MM, height + 2 * MARGIN_MM + TEXT_ROOM_MM
+    turned = (PAGES_MM[page], PAGES_MM[page][::-1])
+    page_mm = next((at for at in turned if needed_mm[0] <= at[0] and needed_mm[1] <= at[1]), None)
+    if page_mm is None:
+        size = f"{width:g} x {height:g} mm with {MARGIN_MM:g} mm around it and its name below"
+        raise CalibrationError(f"page {page}", f"has no room for a board of {size}")
     left, top = (page_mm[0] - width) / 2.0, (page_mm[1] - height - TEXT_ROOM_MM) / 2.0
     black = [(left + x, top + y, w, h) for x, y, w, h in rectangles(board)]
     figure: Any = Figure(figsize=(page_mm[0] / MM_PER_INCH, page_mm[1] / MM_PER_INCH))
     # From mm with y down to inches with y up.
     from_mm = Affine2D().translate(0.0, -page_mm[1]).scale(1.0 / MM_PER_INCH, -1.0 / MM_PER_INCH)
     patches = [Patch((x, y), w, h) for x, y, w, h in black]
-    figure.add_artist(
-        PatchCollection(patches, color="black", linewidth=0.0, transform=from_mm + figure.dpi_scale_trans)
-    )
+    placed = from_mm + figure.dpi_scale_trans
+    figure.add_artist(PatchCollection(patches, color="black", linewidth=0.0, transform=placed))
     words = f"{describe(board)}. Print at 100 %: the board is {width:g} x {height:g} mm."
     figure.text(left / page_mm[0], 1.0 - (top + height + 6.0) / page_mm[1], words, fontsize=7.0)
     return figure
@@ -192,8 +184,3 @@ def drawn(board: Board, page: str) -> Any:
 
 def _squares(columns: int, rows: int, side: float) -> list[Rectangle]:
     return [(c * side, r * side, side, side) for r in range(rows) for c in range(columns) if (c + r) % 2 == 0]
-
-
-def _runs(black: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> list[tuple[int, int]]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], black, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

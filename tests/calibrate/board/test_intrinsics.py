@@ -142,7 +142,7 @@ def test_too_few_photographs_or_mixed_sizes_are_refused() -> None:
         fit_lens(views(3))
     mixed = views(5)
     mixed[0] = dataclasses.replace(mixed[0], name="big.png", size_px=(1280, 960))
-    message = r"have several sizes, .*640 x 480 px: 1\.png, 2\.png, 3\.png, 4\.png; 1280 x 960 px: big\.png"
+    message = r"have several sizes, .*: big\.png is 1280 x 960 px, 1\.png is 640 x 480 px"
     with pytest.raises(CalibrationError, match=message):
         fit_lens(mixed)
 
