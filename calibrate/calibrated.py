@@ -26,7 +26,6 @@ from brushloop.calibrate.report import (
     about,
     framed,
     photograph_uri,
-    recording_facts,
     round_values,
     source_point,
     write_page,
@@ -118,13 +117,8 @@ def calibrate_session(request: CalibrateRequest, progress: Progress = unseen) ->
         sheet=edge,
         trust=[source_point(recording.header.source), *_trust(calibration, moved)],
         contours=_contours(calibration, image.shape[1], image.shape[0]),
-        facts=[
-            *recording_facts(recording.header, recording.path.name, recording.sha256, calibration),
-            ("board", describe(calibration.board)),
-            ("photograph of the board", f"sha256 {calibration.still_sha256}"),
-            ("lens in use", f"{calibration.lens.source}; k1 {calibration.lens.distortion[0]:+.4f}"),
-            ("calibrated with", calibration.software),
-        ],
+        recorded=recording,
+        board=describe(calibration.board),
     )
     return Calibrated(calibration, path, page, moved)
 

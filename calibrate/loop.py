@@ -39,7 +39,6 @@ from brushloop.calibrate.report import (
     ink_uri,
     load_sealed,
     overlay_uri,
-    recording_facts,
     render,
     source_point,
     write_files,
@@ -278,11 +277,6 @@ def write_loop(
     The sessions are the original and the one that pressed it again.
     """
     header = sessions[0].header
-    facts = [
-        recording_facts(session.header, session.recording.path.name, session.sha256, session.calibration)
-        for session in sessions
-    ]
-    made = [("recovered by", record.model), ("compared with", record.software), ("command", record.command)]
     percent = 100.0 * scores.of_key(AGAIN, HEADLINE)
     worst_first: list[int] = percent[:, 0].argsort(kind="stable").tolist()
     page = render(
@@ -296,7 +290,7 @@ def write_loop(
         paper=TABLE_1[ROBOT_WRITING],
         rows=[_shown(pairs[k], percent[k]) for k in worst_first],
         ssim_settings=SSIM_SETTINGS,
-        provenance=[*facts, made],
+        sessions=sessions,
     )
     write_files(folder, {TABLE: scores_csv(scores), FILE: record.to_json(), PAGE: page})
     return folder / PAGE

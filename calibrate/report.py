@@ -22,7 +22,6 @@ from pydantic import ValidationError
 from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.errors import CalibrationError, invalid
 from brushloop.calibrate.files import read_bounded, write_whole
-from brushloop.calibrate.session import Calibration
 from brushloop.sessions.records import Header, Source
 
 Image = NDArray[np.float32]
@@ -73,13 +72,12 @@ def _templates() -> Any:
     """The templates; each is compiled once in a process."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    return Environment(
-        loader=PackageLoader("brushloop.calibrate"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+    loader = PackageLoader("brushloop.calibrate")
+    templates = Environment(
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
+    templates.globals["brush_and_size"] = brush_and_size
+    return templates
 
 
 def framed(page: Path) -> str:
@@ -128,32 +126,6 @@ def brush_and_size(header: Header) -> str:
     if header.brush_radius_mm is not None and header.brush_length_mm is not None:
         size = f"R = {header.brush_radius_mm:g} mm, L = {header.brush_length_mm:g} mm"
     return ", ".join(filter(None, (header.brush, size)))
-
-
-def recording_facts(
-    header: Header, recording: str, sha256: str, calibration: Calibration | None
-) -> list[tuple[str, str]]:
-    """Name and text of what is known of a recording, for a page's provenance."""
-    scale = ""
-    if calibration is not None:
-        low, high = calibration.mm_per_px_low, calibration.mm_per_px_high
-        scale = f"{calibration.digest}: pix2len {calibration.mm_per_px:.5f} mm/px (95 % {low:.5f} to {high:.5f}), "
-        scale += f"board residual {calibration.rms_px:.3f} px"
-    facts = (
-        ("session", header.session_id),
-        ("source", str(header.source)),
-        ("recording", f"{recording}, sha256 {sha256}"),
-        ("recorded with", header.software),
-        ("robot", f"{header.robot} {header.robot_firmware}".strip()),
-        ("camera", f"{header.camera} {header.lens}".strip()),
-        ("brush", brush_and_size(header)),
-        ("ink, paper", ", ".join(filter(None, (header.ink, header.paper)))),
-        ("protocol", header.protocol),
-        ("origin", header.origin),
-        ("licence", header.licence),
-        ("calibration", scale),
-    )
-    return [(name, text) for name, text in facts if text]
 
 
 def data_uri(data: bytes, kind: str = "png") -> str:

@@ -225,13 +225,12 @@ def _read(capture: Capture, command: tuple[float, ...] | None, grid: tuple[Float
 
 def _on_grid(mask: Mask, anchor_px: tuple[float, float], x_mm: Floats, y_mm: Floats) -> NDArray[np.float32]:
     """The ink of a stroke that starts at `anchor_px` of its raster."""
-    half = 0.5 * float(x_mm[1] - x_mm[0])
-    left = round(anchor_px[0] + (x_mm[0] - half) * PX_PER_MM)
-    top = round(anchor_px[1] - (y_mm[0] + half) * PX_PER_MM)
-    height, width = (round(2 * half * len(axis) * PX_PER_MM) for axis in (y_mm, x_mm))
-    pad = max(height, width) + abs(left) + abs(top)
-    ink = np.pad(mask, pad)[top + pad : top + pad + height, left + pad : left + pad + width].astype(np.float32)
-    return np.asarray(cv2.resize(ink, (len(x_mm), len(y_mm)), interpolation=cv2.INTER_AREA), np.float32)
+    step_px = round(MM_PER_PX * PX_PER_MM)
+    left = round(anchor_px[0] + x_mm[0] * PX_PER_MM - 0.5 * step_px)
+    top = round(anchor_px[1] - y_mm[0] * PX_PER_MM - 0.5 * step_px)
+    to_grid, size = np.array([[1.0, 0.0, -left], [0.0, 1.0, -top]]), (len(x_mm), len(y_mm))
+    ink = cv2.warpAffine(mask.astype(np.float32), to_grid, (step_px * size[0], step_px * size[1]))
+    return np.asarray(cv2.resize(ink, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
 def defects(mask: Mask) -> tuple[str, ...]:

@@ -19,7 +19,7 @@ from rich.table import Table
 from brushloop.calibrate.artefact import load_artefact, made_by, put_to_use
 from brushloop.calibrate.commands import FitRequest
 from brushloop.calibrate.drags import Drags, read_drags
-from brushloop.calibrate.drags.fit import FOLDER, PREDICTED, DragArtefact, adapt_drags, fit_drags, predicted
+from brushloop.calibrate.drags.fit import FOLDER, LAG, PREDICTED, DragArtefact, adapt_drags, fit_drags, predicted
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written
 from brushloop.calibrate.report import (
@@ -30,7 +30,6 @@ from brushloop.calibrate.report import (
     chart_uri,
     image_uri,
     overlay_uri,
-    recording_facts,
     render,
     source_label,
     source_note,
@@ -49,18 +48,28 @@ MAX_WORST = 12
 
 
 @dataclass(frozen=True, slots=True)
+class Predicted:
+    """A stroke of a recording, and what a fit predicts of it."""
+
+    stroke_id: str
+    captured: NDArray[np.float32]
+    """(rows, columns) from 0 to 1 on the grid of the session."""
+    ink: NDArray[np.bool_]
+    """(rows, columns) predicted."""
+    fitted: bool
+    """Whether the fit was fitted to this stroke."""
+    scores: dict[str, tuple[float, float]]
+    """CSIM and IoU, from 0 to 1, by row of the report; no ceiling where the command was not repeated."""
+
+
+@dataclass(frozen=True, slots=True)
 class DragValidation:
     """What was measured in a recording of drags, and what a fit predicts of those that can be predicted."""
 
     drags: Drags
     fit: DragArtefact | None
-    """What predicts them; without a fit, everything below is empty."""
-    scores: dict[str, Floats]
-    """(n, 2) CSIM and IoU by row of the report; NaN where a stroke has none."""
-    seen: NDArray[np.bool_]
-    """(n, rows, columns) predicted ink."""
-    fitted: NDArray[np.bool_]
-    """(n,) whether the fit was fitted to the stroke."""
+    strokes: list[Predicted]
+    """Empty without a fit."""
 
     @property
     def header(self) -> Header:
@@ -68,49 +77,45 @@ class DragValidation:
         return self.drags.session.header
 
     @property
-    def scored(self) -> NDArray[np.int64]:
+    def scored(self) -> list[Predicted]:
         """The strokes that the means are over: those that the fit has not seen, or all if it has seen all."""
-        return np.flatnonzero(~self.fitted | self.fitted.all())
+        return [stroke for stroke in self.strokes if not stroke.fitted] or self.strokes
 
     def means(self) -> dict[str, dict[str, float]]:
         """Mean CSIM, mean IoU, standard deviation of CSIM and number of strokes by row of the report."""
         rows: dict[str, dict[str, float]] = {}
-        for name, scores in self.scores.items():
-            each = scores[self.scored]
-            each = each[np.isfinite(each[:, 0])]
-            if len(each):
-                csim, iou = (round(float(mean), 6) for mean in each.mean(axis=0))
-                rows[name] = {"csim": csim, "iou": iou, "csim_sd": round(float(each[:, 0].std()), 6)}
-                rows[name]["strokes"] = len(each)
+        for name in (PREDICTED, LAG, CEILING):
+            scores = np.array([stroke.scores[name] for stroke in self.scored if name in stroke.scores])
+            if len(scores):
+                csim, iou, csim_sd = np.round([*scores.mean(axis=0), scores[:, 0].std()], 6).tolist()
+                rows[name] = {"csim": csim, "iou": iou, "csim_sd": csim_sd, "strokes": len(scores)}
         return rows
 
     def to_json(self, fit: DragArtefact) -> str:
         """All scores as JSON, with where ink and fit come from."""
-        header, drags = self.header, self.drags
         contents = {
-            "session_id": header.session_id,
-            "source": str(header.source),
-            "recording_sha256": drags.session.sha256,
+            "session_id": self.header.session_id,
+            "source": str(self.header.source),
+            "recording_sha256": self.drags.session.sha256,
             "fit": fit.digest,
             "fit_session": fit.session_id,
             "fit_source": fit.source,
             "prior": fit.prior,
             "mm_per_px": fit.mm_per_px,
-            "depth_at_the_ends": drags.ends,
-            "in_sample": bool(self.fitted.all()),
+            "depth_at_the_ends": self.drags.ends,
+            "in_sample": all(stroke.fitted for stroke in self.strokes),
             "over_all": self.means(),
-            "left_out": [{"stroke_id": name, "why": why} for name, why in drags.left_out],
+            "left_out": [{"stroke_id": name, "why": why} for name, why in self.drags.left_out],
             "strokes": [
                 {
-                    "stroke_id": drag.stroke.stroke_id,
-                    "in_sample": bool(self.fitted[k]),
+                    "stroke_id": stroke.stroke_id,
+                    "in_sample": stroke.fitted,
                     "scores": {
-                        row: {"csim": round(float(scores[k, 0]), 6), "iou": round(float(scores[k, 1]), 6)}
-                        for row, scores in self.scores.items()
-                        if np.isfinite(scores[k, 0])
+                        name: {"csim": round(csim, 6), "iou": round(iou, 6)}
+                        for name, (csim, iou) in stroke.scores.items()
                     },
                 }
-                for k, drag in enumerate(drags.placed)
+                for stroke in self.strokes
             ],
         }
         return json.dumps(contents, indent=1, ensure_ascii=False) + "\n"
@@ -121,18 +126,21 @@ def validate_drags(session: Path, fit: Path | None, progress: Progress = unseen)
 
     Raises `CalibrationError`, also for a file that is no fit of drags.
     """
-    if fit is None:
-        nothing = np.zeros(0, np.bool_)
-        return DragValidation(read_drags(session, progress), None, {}, nothing, nothing)
-    artefact = load_artefact(fit, DragArtefact)
+    artefact = None if fit is None else load_artefact(fit, DragArtefact)
     drags = read_drags(session, progress)
-    truth = drags.drawings.ink > 0.5
+    if artefact is None:
+        return DragValidation(drags, None, [])
+    captured = drags.drawings.ink
+    rows = predicted(artefact.model(), artefact.kept, drags, np.arange(len(captured)))
+    scores = {name: binary_scores(ink, captured > 0.5) for name, ink in rows.items()}
+    scores[CEILING] = _ceiling(drags.conditions, captured > 0.5)
     known = artefact.fitted_strokes if artefact.recording_sha256 == drags.session.sha256 else ()
-    fitted = np.array([drag.stroke.stroke_id in known for drag in drags.placed])
-    rows = predicted(artefact.model(), artefact.kept, drags, np.arange(len(truth)))
-    scores = {name: binary_scores(seen, truth) for name, seen in rows.items()}
-    scores[CEILING] = _ceiling(drags.conditions, truth)
-    return DragValidation(drags, artefact, scores, rows[PREDICTED], fitted)
+    strokes: list[Predicted] = []
+    for k, drag in enumerate(drags.placed):
+        name = drag.stroke.stroke_id
+        own = {row: (float(each[k, 0]), float(each[k, 1])) for row, each in scores.items() if np.isfinite(each[k, 0])}
+        strokes.append(Predicted(name, captured[k], rows[PREDICTED][k], name in known, own))
+    return DragValidation(drags, artefact, strokes)
 
 
 def _ceiling(conditions: NDArray[np.int64], truth: NDArray[np.bool_]) -> Floats:
@@ -152,12 +160,11 @@ def write_drags(validation: DragValidation, folder: Path, command: str) -> Path:
     """
     drags, header = validation.drags, validation.header
     step = max(1, -(-len(drags.strokes) // MAX_THUMBNAILS))
-    facts = recording_facts(header, drags.session.recording.path.name, drags.session.sha256, None)
     page = render(
         "drags.html.j2",
         header=header,
         note=source_note(header.source, header.brush),
-        provenance=[*facts, ("validated with", made_by()), ("command", command)],
+        provenance=(("validated with", made_by()), ("command", command)),
         drags=drags,
         width=width_sentence(drags),
         plot=_plot(drags) if drags.strokes else "",
@@ -193,20 +200,20 @@ def drags_csv(drags: Drags) -> str:
 
 def prediction_sentences(validation: DragValidation) -> Iterator[str]:
     """Sentences on what predicted these strokes, and over which strokes the scores are; none without a fit."""
-    fit, fitted = validation.fit, validation.fitted
+    fit, scored = validation.fit, validation.scored
     if fit is None:
         return
     adapted = f", adapted to {len(fit.fitted_strokes)} strokes of {fit.session_id}" if fit.prior else ""
     origin = fit.prior_session if fit.prior else f"{fit.session_id}, {fit.source}"
     yield (
-        f"{len(validation.scored)} strokes ({validation.header.source}) predicted by the fit {fit.digest} of "
+        f"{len(scored)} strokes ({validation.header.source}) predicted by the fit {fit.digest} of "
         f"{origin}{adapted}; ink as 0 or 1 at the commanded place, {fit.mm_per_px:g} mm per pixel, no shift."
     )
-    if fitted.all():
+    if scored[0].fitted:
         yield "In sample: the fit was fitted to every one of these strokes."
-    elif fitted.any():
-        yield f"The means leave out {fitted.sum()} strokes that the fit was fitted to."
-    if CEILING not in validation.means():
+    elif left_out := len(validation.strokes) - len(scored):
+        yield f"The means leave out {left_out} strokes that the fit was fitted to."
+    if not any(CEILING in stroke.scores for stroke in scored):
         yield "No command was repeated, so the ceiling (the score of a perfect model) is not known."
     yield ends_sentence(validation.drags.ends)
 
@@ -221,15 +228,11 @@ def ends_sentence(ends: str) -> str:
     )
 
 
-def _worst(validation: DragValidation) -> Iterator[tuple[str, float, float, str]]:
-    """Name, CSIM, IoU and overlay of the strokes with the lowest CSIM among those scored, the worst first."""
-    lowest = sorted(validation.scored.tolist(), key=lambda k: validation.scores[PREDICTED][k, 0])
-    for k in map(int, lowest[:MAX_WORST]):
-        seen, drag, ink = validation.seen[k], validation.drags.placed[k], validation.drags.drawings.ink[k]
-        window = inked_window(seen, ink > 0.5, 0)
-        csim, iou = validation.scores[PREDICTED][k].tolist()
-        uri = overlay_uri(ink[window], seen[window].astype(np.float32))
-        yield drag.stroke.stroke_id, csim, iou, uri
+def _worst(validation: DragValidation) -> Iterator[tuple[Predicted, str]]:
+    """The strokes with the lowest CSIM among those scored, the worst first, and their overlays."""
+    for stroke in sorted(validation.scored, key=lambda stroke: stroke.scores[PREDICTED][0])[:MAX_WORST]:
+        window = inked_window(stroke.ink, stroke.captured > 0.5, 0)
+        yield stroke, overlay_uri(stroke.captured[window], stroke.ink[window].astype(np.float32))
 
 
 def width_sentence(drags: Drags) -> str:

@@ -36,7 +36,6 @@ from brushloop.calibrate.report import (
     chart_uri,
     framed,
     ink_uri,
-    recording_facts,
     source_label,
     source_note,
     source_point,
@@ -262,7 +261,7 @@ def _write_page(result: FitResult, press: FittedPress) -> None:
         result.page,
         "fit.html.j2",
         **about(header),
-        session=header.session_id,
+        session=session,
         window=_window(presses, (press, published)),
         cells=[_cell(presses, cell, numbers, press, published) for cell, numbers in presses.cells.items()],
         verdict=list(_verdict(result)),
@@ -272,12 +271,8 @@ def _write_page(result: FitResult, press: FittedPress) -> None:
         middle="{:g} mm, {:g}°".format(*presses.middle),
         held_out=result.held_out,
         refused=result.refused,
-        facts=[
-            *recording_facts(header, session.recording.path.name, session.sha256, session.calibration),
-            ("images", f"{presses.grid.px_mm:g} mm per pixel"),
-            ("fitted with", made_by()),
-            ("artefact", result.path.name),
-        ],
+        px_mm=presses.grid.px_mm,
+        provenance=(("fitted with", made_by()), ("artefact", result.path.name)),
     )
 
 

@@ -27,7 +27,6 @@ from brushloop.calibrate.report import (
     chart_uri,
     ink_uri,
     overlay_uri,
-    recording_facts,
     render,
     source_note,
 )
@@ -91,7 +90,7 @@ def page_of(
         curves=losses(curves) if curves else "",
         refused=report.refused[:MAX_REFUSED],
         more_refused=max(0, len(report.refused) - MAX_REFUSED),
-        provenance=list(map(provenance, report.sessions)),
+        provenance=[(session, provenance(session)) for session in report.sessions],
         software=", ".join(f"{name} {number}" for name, number in report.software.items()),
     )
 
@@ -131,8 +130,8 @@ def _cell(report: Report, cell: Cell, columns: Sequence[ModelInfo]) -> tuple[Cel
     return cell, max((stat.csim.n for stat in stats if stat is not None), default=0), stats
 
 
-def provenance(session: Session) -> list[tuple[str, str]]:
-    """Name and text of what is known of a recording."""
+def provenance(session: Session) -> tuple[tuple[str, str], ...]:
+    """Name and text of what is known of the strokes of a recording."""
     collected, counts = session.collected, f"{session.strokes} captured, {session.compared} compared"
     if collected is not None:
         planned = "" if collected.planned is None else f"{collected.planned} planned, "

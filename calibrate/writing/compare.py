@@ -42,7 +42,6 @@ from brushloop.calibrate.report import (
     overlay,
     overlay_uri,
     picture_grid,
-    recording_facts,
     render,
     save_picture,
     show_picture,
@@ -323,12 +322,6 @@ def write_written(written: WritingComparison, folder: Path, command: str) -> Pat
     draw(written, folder / PICTURE)
     picture = (folder / PICTURE).read_bytes()
     session, plan, header = written.session, written.plan, written.session.header
-    facts = recording_facts(
-        header.model_copy(update={"protocol": ""}),  # the plan, point by point
-        session.recording.path.name,
-        session.sha256,
-        session.calibration,
-    )
     record = WrittenRecord(
         source=header.source,
         session=header.session_id,
@@ -355,7 +348,8 @@ def write_written(written: WritingComparison, folder: Path, command: str) -> Pat
         overlay_uri=overlay_uri,
         ssim_settings=SSIM_SETTINGS,
         picture=data_uri(picture),
-        provenance=[*facts, ("compared with", record.software), ("command", command)],
+        header=header.model_copy(update={"protocol": ""}),  # the plan, point by point
+        provenance=(("compared with", record.software), ("command", command)),
     )
     write_files(folder, {TABLE: scores_csv(written), FILE: record.sealed().to_json(), PAGE: page})
     return folder / PAGE
