@@ -165,10 +165,6 @@ class Plan(Frozen):
     software: str
     figures: Annotated[tuple[Figure, ...], Field(min_length=1, max_length=1000)]
 
-    def figure(self, name: str) -> Figure | None:
-        """The figure of that name."""
-        return next((figure for figure in self.figures if figure.name == name), None)
-
 
 def load_plan(path: Path) -> Plan:
     """Read plan.json, or the one in a plan's folder. Raises `CalibrationError`."""
@@ -213,9 +209,9 @@ def recorded_figures(header: Header) -> dict[str, list[Floats]]:
 def check_drawn_from(plan: Plan, session: OpenSession) -> None:
     """Check that the session's protocol drew the plan. Raises `CalibrationError` otherwise."""
     where, cell_mm = str(session.recording.path), session.strokes[0].cell_mm
+    commanded = {figure.name: figure.commanded for figure in plan.figures}
     for name, strokes in recorded_figures(session.header).items():
-        figure = plan.figure(name)
-        if figure is None or figure.commanded != as_points(strokes):
+        if commanded.get(name) != as_points(strokes):
             raise CalibrationError(where, f"{name!r} was not drawn from this plan")
     if cell_mm is not None and cell_mm[2:] != (plan.cell_mm, plan.cell_mm):
         raise CalibrationError(where, f"has cells of {cell_mm[2]:g} x {cell_mm[3]:g} mm, the plan {plan.cell_mm:g} mm")
