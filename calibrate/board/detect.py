@@ -8,7 +8,6 @@ phases, and their errors cancel.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -55,27 +54,24 @@ def find_board(image: Gray, board: Board, name: str, expected: int | None = None
 
     `expected` is the number of corners that a sheet on the board leaves visible; all of them by default.
     """
-    flags = _exposure(image)
-    found = _checkerboard(image, board, name) if isinstance(board, Checkerboard) else _charuco(image, board, name)
-    pixels, ids, board_mm, total = found
-    wanted = total if expected is None else expected
+    corners = _checkerboard(image, board, name) if isinstance(board, Checkerboard) else _charuco(image, board, name)
+    pixels, ids, board_mm, total = corners
+    flags, wanted = list[str](), total if expected is None else expected
+    saturated = float(np.count_nonzero(image >= SATURATED)) / image.size
+    if saturated > MOST_SATURATED:
+        flags.append(f"{100 * saturated:.0f} % of the pixels are saturated: expose less")
     if len(ids) < PARTLY_HIDDEN * wanted:
-        flags = (*flags, f"only {len(ids)} of {wanted} corners are seen: the board is partly hidden or out of view")
-    return BoardView(name, (image.shape[1], image.shape[0]), pixels, board_mm, ids, flags)
+        flags.append(f"only {len(ids)} of {wanted} corners are seen: the board is partly hidden or out of view")
+    return BoardView(name, (image.shape[1], image.shape[0]), pixels, board_mm, ids, tuple(flags))
 
 
 def _blank(image: Gray) -> bool:
     return float(np.percentile(image, 99) - np.percentile(image, 1)) < LEAST_CONTRAST
 
 
-def _exposure(image: Gray) -> tuple[str, ...]:
-    share = float(np.count_nonzero(image >= SATURATED)) / image.size
-    return (f"{100 * share:.0f} % of the pixels are saturated: expose less",) if share > MOST_SATURATED else ()
-
-
 def _charuco(image: Gray, spec: BoardSpec, name: str) -> tuple[Floats, NDArray[np.int64], Floats, int]:
     board = charuco_board(spec, name)
-    markers, numbers = _markers(image, board)
+    pixels, ids, numbers = _detected(image, board)
     twice = sorted(number for number, times in Counter(int(n) for n in numbers).items() if times > 1)
     if len(twice) > 1:
         raise CalibrationError(name, f"shows two boards: markers {twice[0]} and {twice[1]} appear twice")
@@ -88,15 +84,14 @@ def _charuco(image: Gray, spec: BoardSpec, name: str) -> tuple[Floats, NDArray[n
             f"0 to {own.max()}: it is another board",
         )
     total = (spec.squares[0] - 1) * (spec.squares[1] - 1)
-    pixels, ids = _charuco_corners(image, board, markers, numbers)
     if len(ids) < MIN_CORNERS:
         why = f"{len(ids)} of {total} board corners found, at least {MIN_CORNERS} are needed"
         if _blank(image):
             raise CalibrationError(name, BLANK)
-        if len(markers) > MIN_CORNERS:
-            why += f", though {len(markers)} markers are seen: they are not arranged as on this board"
-        mirrored, _ = _markers(np.ascontiguousarray(image[:, ::-1]), board)
-        if len(mirrored) >= max(4, 2 * len(markers)):
+        if len(numbers) > MIN_CORNERS:
+            why += f", though {len(numbers)} markers are seen: they are not arranged as on this board"
+        *_, mirrored = _detected(np.ascontiguousarray(image[:, ::-1]), board)
+        if len(mirrored) >= max(4, 2 * len(numbers)):
             why = "the photograph is mirrored: its markers can only be read in reverse"
         raise CalibrationError(name, why)
     board_mm = np.asarray(board.getChessboardCorners(), np.float64)[ids, :2]
@@ -105,29 +100,17 @@ def _charuco(image: Gray, spec: BoardSpec, name: str) -> tuple[Floats, NDArray[n
     return fine, ids, board_mm, total
 
 
-def _markers(image: Gray, board: cv2.aruco.CharucoBoard) -> tuple[Sequence[cv2.typing.MatLike], NDArray[np.int64]]:
+def _detected(image: Gray, board: cv2.aruco.CharucoBoard) -> tuple[Floats, NDArray[np.int64], NDArray[np.int64]]:
+    """(n, 2) corners of the board and their numbers (n,); and the numbers of all markers, those of others too."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    corners, ids, _ = cv2.aruco.ArucoDetector(board.getDictionary(), parameters).detectMarkers(image)
-    empty = ids is None  # pyright: ignore[reportUnnecessaryComparison]
-    return corners, np.zeros(0, np.int64) if empty else np.ravel(ids).astype(np.int64)
-
-
-def _charuco_corners(
-    image: Gray,
-    board: cv2.aruco.CharucoBoard,
-    markers: Sequence[cv2.typing.MatLike],
-    numbers: NDArray[np.int64],
-) -> tuple[Floats, NDArray[np.int64]]:
-    if not len(markers):
-        return np.zeros((0, 2)), np.zeros(0, np.int64)
-    found = cv2.aruco.CharucoDetector(board).detectBoard(
-        image, markerCorners=markers, markerIds=numbers.astype(np.int32).reshape(-1, 1)
-    )
-    pixels, ids = found[:2]
-    if ids is None:  # pyright: ignore[reportUnnecessaryComparison]
-        return np.zeros((0, 2)), np.zeros(0, np.int64)
-    return np.asarray(pixels, np.float64).reshape(-1, 2), np.ravel(ids).astype(np.int64)
+    detector = cv2.aruco.CharucoDetector(board, detectorParams=parameters)
+    pixels, ids, _, markers = detector.detectBoard(image)
+    # OpenCV gives None for nothing, whatever its types say.
+    corners = [] if pixels is None else pixels  # pyright: ignore[reportUnnecessaryComparison]
+    numbers = [[] if each is None else each for each in (ids, markers)]  # pyright: ignore[reportUnnecessaryComparison]
+    own, every = (np.ravel(each).astype(np.int64) for each in numbers)
+    return np.asarray(corners, np.float64).reshape(-1, 2), own, every
 
 
 def _checkerboard(image: Gray, board: Checkerboard, name: str) -> tuple[Floats, NDArray[np.int64], Floats, int]:

@@ -16,7 +16,8 @@ from brushloop.calibrate.errors import CalibrationError, invalid
 from brushloop.calibrate.files import Written, check_target
 from brushloop.sessions.terminal import Progress, unseen
 
-Corners, Squares = Annotated[int, Field(ge=3, le=60)], Annotated[int, Field(ge=2, le=50)]
+Corners = Annotated[int, Field(ge=3, le=60)]
+Squares = Annotated[int, Field(ge=2, le=50)]
 Side = Annotated[float, Field(gt=0.0, le=1000.0)]
 Place = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 MM_PER_INCH = 25.4
