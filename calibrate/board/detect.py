@@ -107,10 +107,12 @@ def _detected(image: Gray, board: cv2.aruco.CharucoBoard) -> tuple[Floats, NDArr
     detector = cv2.aruco.CharucoDetector(board, detectorParams=parameters)
     pixels, ids, _, markers = detector.detectBoard(image)
     # OpenCV gives None for nothing, whatever its types say.
-    corners = [] if pixels is None else pixels  # pyright: ignore[reportUnnecessaryComparison]
-    numbers = [[] if each is None else each for each in (ids, markers)]  # pyright: ignore[reportUnnecessaryComparison]
-    own, every = (np.ravel(each).astype(np.int64) for each in numbers)
-    return np.asarray(corners, np.float64).reshape(-1, 2), own, every
+    empty = np.zeros(0)
+    corners, own, every = (
+        np.ravel(empty if each is None else each)  # pyright: ignore[reportUnnecessaryComparison]
+        for each in (pixels, ids, markers)
+    )
+    return corners.reshape(-1, 2).astype(np.float64), own.astype(np.int64), every.astype(np.int64)
 
 
 def _checkerboard(image: Gray, board: Checkerboard, name: str) -> tuple[Floats, NDArray[np.int64], Floats, int]:
