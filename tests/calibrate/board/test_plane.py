@@ -28,7 +28,7 @@ from brushloop.calibrate.compare import field_around
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.stroke import PX_PER_MM as RASTER_PX_PER_MM
 from brushloop.calibrate.stroke import prepare, rectify_by
-from tests.calibrate.simulated_rigs import BRUSHES, CAMERAS, Shot, boards, sheet, true_mask, true_scale
+from tests.calibrate.simulated_rigs import CAMERAS, Shot, boards, sheet, true_mask, true_scale
 
 SPEC = BoardSpec(squares=(7, 5), square_mm=20.0, marker_mm=15.0, dictionary="DICT_5X5_50", origin_mm=(-10.0, 5.0))
 PLACES = np.array([[200.0, 150.0], [650.0, 150.0], [450.0, 300.0], [200.0, 420.0]])
@@ -127,8 +127,6 @@ def test_a_page_is_a4_holds_its_board_and_overwrites_nothing_but_a_pdf(tmp_path:
 # The frozen brushes and cameras of the loopback rig, held against the sheet itself
 
 WORST = 2e-4
-soak = pytest.mark.soak
-half_an_hour = pytest.mark.timeout(1800)
 
 
 def plane_of(shot: Shot) -> Plane:
@@ -174,20 +172,10 @@ def test_scale_strokes_and_anchors_are_right_whatever_the_camera_does(rig: int) 
     assert off_mm <= 0.1
 
 
-@soak
-@half_an_hour
+@pytest.mark.soak
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_interval_of_pix2len_holds_the_truth_as_often_as_it_says(seed: int) -> None:
     every = [one for rig in range(len(CAMERAS)) for one in draws(rig, 40, seed)]
     assert max(abs(error) for error, _ in every) <= WORST
     assert 0.93 <= np.mean([held for _, held in every]) <= 0.97
-
-
-@soak
-@half_an_hour
-def test_every_brush_under_every_camera() -> None:
-    found = [strokes(rig, 15) for rig in range(len(BRUSHES))]
-    every = [iou for overlaps, _ in found for iou in overlaps]
-    assert max(off_mm for _, off_mm in found) <= 0.1
-    assert np.mean(every) >= 0.985
-    assert min(every) >= 0.95

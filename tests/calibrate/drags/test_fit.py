@@ -6,10 +6,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from brushloop.calibrate.drags import MM_PER_PX, Drag, Drags, commanded_path
 from brushloop.calibrate.drags import fit as drags
 from brushloop.calibrate.drags.fit import LAG, PREDICTED, Kept, different, fit_values, model_of, predicted
+from brushloop.calibrate.stats import fit_line
 from brushloop.calibrate.stroke import Measured
 from brushloop.model.drag import DragModel, Drawings, ink, lagging
 from brushloop.sessions.records import Header, Source, Stroke
@@ -96,3 +98,14 @@ def test_the_commanded_path_is_the_curve_of_its_four_control_points() -> None:
     assert path[-1].tolist() == pytest.approx([30.0, 0.0, 0.2 * 18.0])
     assert path[:, 1].max() == pytest.approx(0.75 * 12.0, abs=0.02)
     assert path[:, 2].max() == pytest.approx(0.8 * 18.0)
+
+
+def test_the_slope_of_width_against_depth_has_its_interval() -> None:
+    depths_mm, widths_mm = [1.0, 2.0, 3.0, 4.0], [3.0, 3.6, 3.9, 4.5]
+    line, known = fit_line(depths_mm, widths_mm), stats.linregress(depths_mm, widths_mm)
+    assert line is not None
+    reach = stats.t.ppf(0.975, 2) * known.stderr
+    assert (line.slope, line.intercept, *line.interval) == pytest.approx(
+        (known.slope, known.intercept, known.slope - reach, known.slope + reach)
+    )
+    assert fit_line([1.0, 1.0, 1.0], [1.0, 2.0, 3.0]) is None

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from brushloop.calibrate.errors import CaptureRefused
-from brushloop.calibrate.stats import fit_line
 from brushloop.calibrate.stroke import PX_PER_MM, measure, prepare, rectify, rescale
 
 PAGE = (800, 800)
@@ -100,17 +99,3 @@ def test_holes_of_glare_do_not_narrow_a_stroke_but_are_no_ink() -> None:
     holed[385:415, 300:500] = False  # a stripe of glare along the stroke, 1.5 mm
     assert measure(holed).width_mm == pytest.approx(measure(whole).width_mm, abs=0.2)
     assert measure(holed).area_mm2 < measure(whole).area_mm2 - 10.0
-
-
-def test_a_line_is_fitted_with_its_interval() -> None:
-    rng = np.random.default_rng(5)
-    hits = 0
-    for _ in range(200):
-        x = rng.uniform(0, 10, 60)
-        y = 0.6 * x + 2.0 + rng.normal(0, 0.5, 60)
-        line = fit_line(list(x), list(y))
-        assert line is not None
-        hits += line.interval[0] <= 0.6 <= line.interval[1]
-    assert 180 <= hits <= 199  # 95 %, give or take what 200 draws allow
-    assert fit_line([1.0, 2.0], [1.0, 2.0]) is None
-    assert fit_line([1.0, 1.0, 1.0], [1.0, 2.0, 3.0]) is None
