@@ -283,10 +283,6 @@ class CompareWrittenRequest:
 
     session: Written
     plan: PlanFile
-    references: Annotated[
-        tuple[str, ...],
-        Option("--reference", help="字=picture.png: compare with this picture instead of the plan's font."),
-    ] = ()
     out: Annotated[Path, Option(help="Folder for written.html, .csv, .json and figure-13.png.")] = Path("written")
     command: str = field(default_factory=_command_line)
     """Named by the report as what made it."""

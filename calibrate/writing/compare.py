@@ -31,7 +31,7 @@ from brushloop.calibrate.compare import (
     to_tone,
 )
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
-from brushloop.calibrate.files import Written, read_gray
+from brushloop.calibrate.files import Written
 from brushloop.calibrate.presses import Refused, prepare_cell
 from brushloop.calibrate.report import (
     Sealed,
@@ -78,11 +78,9 @@ NORMAL_SIDE_PX = 100
 
 @dataclass(frozen=True)
 class Character:
-    """One character: its figure of the plan, the image asked for, and what was written."""
+    """One character: its figure of the plan, whose wanted image is the reference, and what was written."""
 
     figure: Figure
-    reference_name: str
-    reference: Image
     captured: dict[str, Ink]
     """Ink by stroke id."""
 
@@ -97,7 +95,7 @@ class Character:
         `PLANNED` has one row, since no writing is involved; a writing alone has NaN for another one.
         """
         inks = list(self.captured.values())
-        reference, simulated = as_ink(self.reference), as_ink(self.figure.simulated)
+        reference, simulated = as_ink(self.figure.wanted), as_ink(self.figure.simulated)
         scores: dict[tuple[str, Key], Floats] = {}
         for key in KEYS:
             scores[SIMULATED, key] = np.array([compare_ink(ink, simulated, key) for ink in inks])
@@ -119,7 +117,7 @@ class Table3Row(Frozen):
 
     character: str
     reference: str
-    """The font, or the user's picture."""
+    """Font or file that the wanted image comes from."""
     pair: str
     """What was compared with what."""
     alignment: Alignment
@@ -179,7 +177,7 @@ class WritingComparison:
         for character, key, pair in itertools.product(self.characters, KEYS, PAIRS):
             csim, ssim = (summarise(percent) for percent in 100.0 * character.scores[pair, key].T)
             if csim is not None and ssim is not None:
-                row = (character.figure.name, character.reference_name, pair, *key, csim, ssim)
+                row = (character.figure.name, character.figure.source, pair, *key, csim, ssim)
                 rows.append(Table3Row.model_validate(dict(zip(Table3Row.model_fields, row, strict=True))))
         return tuple(rows)
 
@@ -192,28 +190,18 @@ class WritingComparison:
 def compare(request: CompareWrittenRequest, progress: Progress = unseen) -> Written:
     """Compare written characters with their simulation and reference; write the report. Raises `CalibrationError`."""
     check_writable(request.out)
-    references: dict[str, tuple[str, Image]] = {}
-    for words in request.references:
-        name, _, path = words.partition("=")
-        if not name or not path:
-            raise CalibrationError("--reference", f"{words!r}: expected CHARACTER=FILE, as 字=zi.png")
-        references[name] = (Path(path).name, read_reference(Path(path)))
-    written = compare_written(request.session, load_plan(request.plan), references, progress)
+    written = compare_written(request.session, load_plan(request.plan), progress)
     report = write_written(written, request.out, request.command)
     return Written(report, (*summary(written), f"Picture: {request.out / PICTURE}", f"Report:  {report}"))
 
 
-def compare_written(
-    path: Path, plan: Plan, references: dict[str, tuple[str, Image]], progress: Progress = unseen
-) -> WritingComparison:
-    """Read the writings of a session beside their plan. `references` (character -> name, image) replace the plan's.
+def compare_written(path: Path, plan: Plan, progress: Progress = unseen) -> WritingComparison:
+    """Read the writings of a session beside their plan.
 
     Raises `CalibrationError` if the two do not belong together or nothing can be compared.
     """
     session, refused = open_session(path), list[Refused]()
     check_drawn_from(plan, session)
-    if unknown := sorted(set(references) - {figure.name for figure in plan.figures}):
-        raise CalibrationError("--reference", f"{unknown[0]!r} is not in the plan")
     writings: dict[str, dict[str, Ink]] = {}
     cut = list[str]()
     for stroke_id, name, prepared in read_writings(session, refused, progress):
@@ -221,11 +209,7 @@ def compare_written(
         writings.setdefault(name, {})[stroke_id] = ink
         if prepared.cut:
             cut.append(stroke_id)
-    characters = [
-        Character(figure, *references.get(figure.name, (figure.source, figure.wanted)), writings[figure.name])
-        for figure in plan.figures
-        if figure.name in writings
-    ]
+    characters = [Character(figure, writings[figure.name]) for figure in plan.figures if figure.name in writings]
     if not characters:
         why = f": {refused[0][0]}: {refused[0][1]}" if refused else ""
         raise CalibrationError(str(session.recording.path), f"no character can be compared{why}")
@@ -274,17 +258,6 @@ def aligned(ink: Image, alignment: Alignment) -> Image:
 def as_ink(image: Image) -> Ink:
     """Make ink from an image that was not photographed: its darkness is its coverage."""
     return dict.fromkeys(Tone, image)
-
-
-def read_reference(path: Path) -> Image:
-    """Read (128, 128) ink from a picture of a dark character on light, padded to square. Raises `CalibrationError`."""
-    ink = 1.0 - read_gray(path).astype(np.float32) / 255.0
-    if float(ink.mean()) > 0.5:
-        raise CalibrationError(str(path), "is mostly dark: a reference is dark ink on light paper")
-    height, width = ink.shape
-    side = max(height, width)
-    top, left = (side - height) // 2, (side - width) // 2
-    return _small(np.pad(ink, ((top, side - height - top), (left, side - width - left))))
 
 
 def _small(image: Image) -> Image:
@@ -377,7 +350,7 @@ def draw(written: WritingComparison, path: Path) -> None:
     title = f"{header.session_id} ({header.source})"
     figure, rows = picture_grid(count, 5, (13.0, 0.5 + 2.9 * count), title)
     for character, axes in zip(written.characters, rows, strict=True):
-        names, reference = character.ranked(), character.reference
+        names, reference = character.ranked(), character.figure.wanted
         parts: tuple[tuple[str, Image], ...] = (
             (f"reference {code_points(character.figure.name)}", reference),
             ("simulated", character.figure.simulated),

@@ -185,7 +185,7 @@ def practice_strokes(side_mm: float, reach: Reach, brush_length_mm: float) -> li
 def learn(request: LearnRequest, progress: Progress = unseen) -> Written:
     """Make the next plan from what the ink of this one showed. Raises `CalibrationError`."""
     check_writable(request.out)
-    following = learned(compare_written(request.session, load_plan(request.plan), {}, progress))
+    following = learned(compare_written(request.session, load_plan(request.plan), progress))
     settled = request.settled_repeats is not None and all(figure.settled for figure in following.figures)
     repeats = (request.settled_repeats if settled else None) or request.repeats
     protocol = write_plan(following, repeats, request.out)

@@ -53,7 +53,7 @@ class Writing:
                 say("No character gained by the last round: the best plans are written.")
                 break
         session = self._written(plan, request.repeats)
-        return self._compare(session, plan, request.out, request.references)
+        return self._compare(session, plan, request.out)
 
     def _first_plan(self) -> Path:
         request, plan = self._request, self._request.out / "plan"
@@ -140,13 +140,12 @@ class Writing:
         )
         return collected_session(wanted)
 
-    def _compare(self, session: Path, plan: Path, out: Path, references: tuple[str, ...] = ()) -> Path:
+    def _compare(self, session: Path, plan: Path, out: Path) -> Path:
         from brushloop.calibrate.writing import compare  # slow to import
 
-        options = "".join(f" --reference {reference}" for reference in references)
-        line = f"brushloop write compare {session} --plan {plan} --out {out}{options}"
+        line = f"brushloop write compare {session} --plan {plan} --out {out}"
         say(f"$ {line}")
-        return show_work(compare.compare, CompareWrittenRequest(session, plan, references, out, line)).path
+        return show_work(compare.compare, CompareWrittenRequest(session, plan, out, line)).path
 
 
 def write(request: WritingRequest) -> None:

@@ -60,7 +60,7 @@ def table_of(character: str = "字", reference: str = "a font") -> tuple[Table3R
     """Table 3 of one character, written twice: CSIM .8 and .9, where paper counts .99."""
     ink = np.zeros((128, 128), np.float32)
     figure = Figure(name=character, source=reference)
-    written = Character(figure, reference, ink, {f"x-r{k}": dict.fromkeys(Tone, ink) for k in range(2)})
+    written = Character(figure, {f"x-r{k}": dict.fromkeys(Tone, ink) for k in range(2)})
     twice = np.array([[0.8, 0.7], [0.9, 0.8]])
     # Takes the place of what would be computed from the images.
     written.__dict__["scores"] = {

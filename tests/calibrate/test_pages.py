@@ -104,7 +104,7 @@ def _written(folder: Path) -> str:
     ink = dict.fromkeys(Tone, cross)
     strokes = [np.array([[1.0, 2.0, 3.0, 4.0, 0.0], [5.0, 6.0, 7.0, 8.0, 9.0]])]
     figure = Figure(name="字", source="a font", commanded=as_points(strokes), wanted=cross, simulated=cross)
-    character = Character(figure, "a font", cross, {"zi-r01": ink, "zi-r02": ink})
+    character = Character(figure, {"zi-r01": ink, "zi-r02": ink})
     session = SimpleNamespace(
         header=Header(session_id="write-01", source=Source.LOOPBACK, software="test", brush=TWIN),
         recording=SimpleNamespace(path=folder),

@@ -24,7 +24,6 @@ from brushloop.calibrate.writing.compare import (
     aligned,
     as_ink,
     compare_ink,
-    read_reference,
     read_written,
 )
 from tests.calibrate.records import written_record
@@ -53,8 +52,8 @@ def test_size_normalised_forgives_place_and_size_and_mm_does_not() -> None:
 
 def character(writings: int = 3) -> Character:
     captured = {f"x-r{k + 1:02d}": as_ink(cross(k)) for k in range(writings)}
-    figure = Figure(name="x", source="font of the test", simulated=cross(width=10))
-    return Character(figure, figure.source, cross(), captured)
+    figure = Figure(name="x", source="font of the test", wanted=cross(), simulated=cross(width=10))
+    return Character(figure, captured)
 
 
 def test_table_3_has_a_row_for_each_comparison_and_survives_the_disk(tmp_path: Path) -> None:
@@ -97,16 +96,3 @@ def test_a_plan_keeps_its_images_and_its_points(tmp_path: Path) -> None:
         (tmp_path / "plan.json").write_text(text.replace(old, new))
         with pytest.raises(CalibrationError, match=rf"plan\.json: {words}"):
             load_plan(tmp_path)
-
-
-def test_a_picture_of_ones_own_is_padded_to_a_square_and_must_be_dark_on_light(tmp_path: Path) -> None:
-    image = np.full((100, 200), 255, np.uint8)
-    image[40:60, 20:180] = 0
-    cv2.imwrite(str(tmp_path / "mine.png"), image)
-    ink = read_reference(tmp_path / "mine.png")
-    assert ink.shape == (128, 128)
-    assert ink.sum() * (200 / 128) ** 2 == pytest.approx(20 * 160, rel=0.01)
-    assert ink[64, 64] == pytest.approx(1.0)
-    cv2.imwrite(str(tmp_path / "negative.png"), 255 - image)
-    with pytest.raises(CalibrationError, match=r"negative\.png: is mostly dark"):
-        read_reference(tmp_path / "negative.png")

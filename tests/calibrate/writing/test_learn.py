@@ -80,7 +80,7 @@ def came_out(plan: Plan) -> np.ndarray:
 def session(plan: Plan, name: str = "bar", ink: np.ndarray | None = None) -> WritingComparison:
     seen = came_out(plan) if ink is None else ink
     figure = plan.figures[0].model_copy(update={"name": name})
-    character = Character(figure, "test", WANTED, {f"{name}-r01": as_ink(seen)})
+    character = Character(figure, {f"{name}-r01": as_ink(seen)})
     header = Header(session_id="s", source=Source.LOOPBACK, software="test")
     recording = SimpleNamespace(path=Path("s.mcap"))
     opened = SimpleNamespace(header=header, recording=recording, sha256="", calibration=CALIBRATION)
