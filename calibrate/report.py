@@ -140,11 +140,11 @@ def image_uri(image: NDArray[np.uint8]) -> str:
     return data_uri(cv2.imencode(".png", image)[1].tobytes())
 
 
-def photograph_uri(image: NDArray[np.uint8], longest_px: int = PHOTOGRAPH_PX) -> str:
-    """An (h, w) gray photograph as a JPEG data URI, made smaller if a side is longer than `longest_px`."""
+def photograph_uri(image: NDArray[np.uint8]) -> str:
+    """An (h, w) gray photograph as a JPEG data URI, made smaller if a side is longer than `PHOTOGRAPH_PX`."""
     import cv2
 
-    share = min(1.0, longest_px / max(image.shape))
+    share = min(1.0, PHOTOGRAPH_PX / max(image.shape))
     small = cv2.resize(image, None, fx=share, fy=share, interpolation=cv2.INTER_AREA) if share < 1.0 else image
     data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
     return data_uri(data, "jpeg")

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.board.lens import Floats, Gray, apply
+from brushloop.calibrate.board.lens import Floats, Gray, apply, homography
 from brushloop.calibrate.board.spec import Board, BoardSpec, BoardView, Checkerboard, charuco_board
 from brushloop.calibrate.errors import CalibrationError
 
@@ -133,17 +133,20 @@ def _checkerboard(image: Gray, board: Checkerboard, name: str) -> tuple[Floats, 
     if _squares(rest, board.inner_corners, quick=True) is not None:
         raise CalibrationError(name, "shows two boards")
     ids = np.arange(columns * rows, dtype=np.int64)
-    places = np.column_stack([ids % columns, ids // columns]).astype(np.float64)
-    board_mm: Floats = (places + 1.0) * board.square_mm
+    board_mm = (_grid(board.inner_corners) + 1.0) * board.square_mm
     return _refined(image, pixels, board_mm, board.square_mm, board.square_mm), ids, board_mm, columns * rows
+
+
+def _grid(inner: tuple[int, int]) -> Floats:
+    """(n, 2) column and row of each inner corner."""
+    return np.stack(np.meshgrid(*map(np.arange, inner)), axis=-1).reshape(-1, 2).astype(np.float64)
 
 
 def _goes_on(image: Gray, pixels: Floats, inner: tuple[int, int]) -> tuple[int, int] | None:
     """Return the larger size if squares continue beyond the outermost corners, None if the board ends there."""
     columns, rows = inner
-    grid = np.array([(k % columns, k // columns) for k in range(columns * rows)], np.float64)
-    to_image, _ = cv2.findHomography(grid, pixels, 0)
-    matrix = np.asarray(to_image, np.float64)
+    grid = _grid(inner)
+    matrix = homography(grid, pixels, "board")
 
     def response(places: Floats) -> Floats:
         # Light minus dark across both diagonals: large only where four squares meet.
@@ -178,7 +181,7 @@ def _squares(image: Gray, inner: tuple[int, int], *, quick: bool = False) -> Flo
 
 def _is_grid(pixels: Floats, inner: tuple[int, int]) -> bool:
     """Whether the corners fit a flat board: OpenCV sometimes mistakes the edge of a shadow for a row."""
-    places = np.array([(k % inner[0], k // inner[0]) for k in range(inner[0] * inner[1])], np.float64)
+    places = _grid(inner)
     to_grid, _ = cv2.findHomography(pixels, places, 0)
     if to_grid is None:  # pyright: ignore[reportUnnecessaryComparison]
         return False

@@ -170,7 +170,7 @@ def write_drags(validation: DragValidation, folder: Path, command: str) -> Path:
         plot=_plot(drags) if drags.strokes else "",
         thumbnails=[(drag.stroke.stroke_id, image_uri(drag.thumbnail)) for drag in drags.strokes[::step]],
         means=validation.means(),
-        predicted_by=list(prediction_sentences(validation)),
+        validation=validation,
         worst=list(_worst(validation)),
     )
     files = {MEASURED: drags_csv(drags), "report.html": page}
@@ -196,36 +196,6 @@ def drags_csv(drags: Drags) -> str:
         marked = [int(drag.cut), "; ".join(drag.flags), source]
         rows.append([drag.stroke.stroke_id, *(values.get(name, "") for name in names), *measured, *marked])
     return csv_text([*head, "cut", "flags", "source"], rows)
-
-
-def prediction_sentences(validation: DragValidation) -> Iterator[str]:
-    """Sentences on what predicted these strokes, and over which strokes the scores are; none without a fit."""
-    fit, scored = validation.fit, validation.scored
-    if fit is None:
-        return
-    adapted = f", adapted to {len(fit.fitted_strokes)} strokes of {fit.session_id}" if fit.prior else ""
-    origin = fit.prior_session if fit.prior else f"{fit.session_id}, {fit.source}"
-    yield (
-        f"{len(scored)} strokes ({validation.header.source}) predicted by the fit {fit.digest} of "
-        f"{origin}{adapted}; ink as 0 or 1 at the commanded place, {fit.mm_per_px:g} mm per pixel, no shift."
-    )
-    if scored[0].fitted:
-        yield "In sample: the fit was fitted to every one of these strokes."
-    elif left_out := len(validation.strokes) - len(scored):
-        yield f"The means leave out {left_out} strokes that the fit was fitted to."
-    if not any(CEILING in stroke.scores for stroke in scored):
-        yield "No command was repeated, so the ceiling (the score of a perfect model) is not known."
-    yield ends_sentence(validation.drags.ends)
-
-
-def ends_sentence(ends: str) -> str:
-    """Where the depth at both ends of a stroke comes from."""
-    if ends:
-        return f"The depth at both ends is that of the column {ends}."
-    return (
-        "The table gives no depth at the ends (depth_ends_mm, or z_frac_ends beside z_frac_mid): the depth is taken "
-        "as constant."
-    )
 
 
 def _worst(validation: DragValidation) -> Iterator[tuple[Predicted, str]]:
@@ -265,9 +235,9 @@ def summary(validation: DragValidation) -> Iterator[Table | str]:
     yield f"{header.session_id}: {source_note(header.source)}"
     yield f"{len(drags.strokes)} strokes measured: {MEASURED} has length, width and area beside what was commanded"
     yield width_sentence(drags)
-    yield from prediction_sentences(validation)
     if means := validation.means():
-        table = Table("", "n", "CSIM", "sd", "IoU", title=f"over all, percent ({header.source})")
+        over = "in sample" if validation.scored[0].fitted else "not fitted to them"
+        table = Table("", "n", "CSIM", "sd", "IoU", title=f"over all, {over}, percent ({header.source})")
         for name, row in means.items():
             percent = (f"{100 * row[measure]:.2f}" for measure in ("csim", "csim_sd", "iou"))
             table.add_row(name, f"{row['strokes']:.0f}", *percent)
@@ -296,7 +266,7 @@ def fit_lines(drags: Drags, artefact: DragArtefact) -> Iterator[Any]:
     label = source_label(header.source, [header.brush])
     yield f"{source_note(header.source, header.brush)}; {len(artefact.fitted_strokes)} dragged strokes"
     yield from (f"left out: {name}: {why}" for name, why in drags.left_out)
-    yield ends_sentence(drags.ends)
+    yield f"depth at both ends: {drags.ends or 'that of the middle, for the table gives no depth at the ends'}"
     if artefact.prior:
         adapted = ", ".join(artefact.refitted)
         yield f"The brush of {artefact.prior_session} (fit {artefact.prior}), with these adapted: {adapted}."
