@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from brushloop.calibrate.artefact import Artefact, Frozen, load_artefact, made_by
 from brushloop.calibrate.board.spec import BoardView
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
-from brushloop.calibrate.stats import student_95
 
 Gray = NDArray[np.uint8]
 Floats = NDArray[np.float64]
@@ -26,10 +25,8 @@ FITTED = "k1 fitted on the board"
 Ways = NDArray[np.int64]
 LEAST_VIEWS = 4
 GOOD_VIEWS = 10
-EARNED_WAYS = 6
-"""Least number of orientations of the board for an interval: with fewer, leaving one out changes the lens too much."""
-MOST_LEFT_OUT = 12
-"""Most groups of orientations that are left out in turn: more do not improve the estimate of the spread."""
+GOOD_WAYS = 6
+"""Orientations of the board that determine a lens well: with fewer, leaving one out changes it too much."""
 OUTLIER_MEDIANS = 3.0
 """A view whose residual exceeds the median by this factor is dropped and named."""
 LEAST_OUTLIER_PX = 0.4
@@ -157,8 +154,6 @@ class LensFile(Artefact):
     """A lens, its uncertainty, how well it explains each photograph, and where these come from."""
 
     lens: Lens
-    focal_se_px: tuple[float, float] | None
-    """Standard errors of fx and fy, by leaving out each orientation of the board; None with too few orientations."""
     ways: int
     """Number of orientations of the board."""
     rms_px: float
@@ -175,26 +170,16 @@ class LensFile(Artefact):
     """What else to photograph; empty where the coverage is good."""
     warnings: tuple[str, ...]
     """What a pre-flight check must show."""
-    schema_version: Literal[4] = 4
+    schema_version: Literal[5] = 5
     software: str
     photographs: dict[str, str]
     """Name of every photograph that was given, and the sha256 of its bytes."""
     board: str
     """Description: kind, size in squares or corners, mm."""
 
-    @property
-    def focal_reach_px(self) -> tuple[float, float] | None:
-        """Half widths of the 95 % intervals of fx and fy: for noise in these views, not for a curved board."""
-        if self.focal_se_px is None:
-            return None
-        reach = student_95(min(self.ways, MOST_LEFT_OUT) - 1)
-        return reach * self.focal_se_px[0], reach * self.focal_se_px[1]
-
     def lines(self) -> list[str]:
         """What the command prints: every photograph, the lens, and what to do."""
         fx, fy, cx, cy = self.lens.matrix
-        reach = self.focal_reach_px
-        across, along = ("", "") if reach is None else (f" +- {reach[0]:.2f}", f" +- {reach[1]:.2f}")
         return [
             *(
                 f"{name}: {px:.3f} px, slanted by {self.slants_deg[name]:.0f} deg"
@@ -202,8 +187,7 @@ class LensFile(Artefact):
             ),
             *(f"{name}: {px:.3f} px, dropped: it does not fit the others" for name, px in self.dropped.items()),
             *(f"{name}: {why}" for name, why in self.unusable.items()),
-            f"fx {fx:.2f}{across} px, fy {fy:.2f}{along} px{'' if reach is None else ' (95 %)'}, "
-            f"centre {cx:.1f}, {cy:.1f} px, k1 {self.lens.distortion[0]:+.4f}",
+            f"fx {fx:.2f} px, fy {fy:.2f} px, centre {cx:.1f}, {cy:.1f} px, k1 {self.lens.distortion[0]:+.4f}",
             f"residual {self.rms_px:.3f} px over {len(self.residuals_px)} views, the board held in {self.ways} ways",
             *(f"warning: {warning}" for warning in self.warnings),
             *(f"to do: {advice}" for advice in self.guidance),
@@ -259,7 +243,6 @@ def fit_lens(
         warnings.insert(0, f"{exceeds}: is the board flat, sharp and still, and every photograph of one camera?")
     return LensFile(
         lens=solved.lens,
-        focal_se_px=_focal(kept, ways, where),
         ways=int(ways.max()) + 1,
         rms_px=solved.rms_px,
         residuals_px={view.name: float(r) for view, r in zip(kept, residuals, strict=True)},
@@ -274,22 +257,7 @@ def fit_lens(
     )
 
 
-def _focal(views: Sequence[BoardView], ways: Ways, where: str) -> tuple[float, float] | None:
-    """Standard errors of fx and fy, by leaving out each orientation of the board (jackknife).
-
-    Views of one orientation have similar errors, so they are left out together. None with too few orientations.
-    """
-    if ways.max() + 1 < EARNED_WAYS:
-        return None
-    count = min(int(ways.max()) + 1, MOST_LEFT_OUT)
-    left_out = (ways % count).tolist()
-    without = [solve([v for v, out in zip(views, left_out, strict=True) if out != k], where) for k in range(count)]
-    focal = np.array([solved.lens.matrix[:2] for solved in without])
-    spread = np.sqrt((count - 1) / count * ((focal - focal.mean(axis=0)) ** 2).sum(axis=0))
-    return float(spread[0]), float(spread[1])
-
-
-def guidance(views: Sequence[BoardView], slants_deg: Sequence[float], ways: int = EARNED_WAYS) -> tuple[str, ...]:
+def guidance(views: Sequence[BoardView], slants_deg: Sequence[float], ways: int = GOOD_WAYS) -> tuple[str, ...]:
     """Instructions for further photographs: what these views, in `ways` orientations of the board, do not cover."""
     wanted: list[str] = []
     if len(views) < GOOD_VIEWS:
@@ -298,9 +266,8 @@ def guidance(views: Sequence[BoardView], slants_deg: Sequence[float], ways: int 
     places = np.concatenate([view.pixels for view in views])
     counts, _, _ = np.histogram2d(places[:, 1], places[:, 0], bins=3, range=((0, height), (0, width)))
     empty = [name for name, count in zip(THIRDS, counts.ravel(), strict=True) if not count]
-    if ways < EARNED_WAYS:
-        needed = f"{EARNED_WAYS} are needed before an error can be stated"
-        wanted.append(f"hold the board in more ways ({ways} so far): {needed}")
+    if ways < GOOD_WAYS:
+        wanted.append(f"hold the board in more ways ({ways} so far, {GOOD_WAYS} are good)")
     if empty:
         wanted.append(f"bring the board into the {', '.join(empty)} of the image: no corner was seen there")
     slanted = sum(slant >= LEAST_SLANT_DEG for slant in slants_deg)

@@ -165,10 +165,9 @@ class CameraStep(Step):
         file = await asyncio.to_thread(fit_lens, views, describe(spec), digests, {})
         for warning in (*file.warnings, *file.guidance):
             visit.say(warning, tone="warning")
-        path, reach = file.save(visit.rig_path.parent), file.focal_reach_px
+        path = file.save(visit.rig_path.parent)
         how = f"fitted to {len(file.residuals_px)} photographs of the board held in {file.ways} ways"
         known = f"residual {file.rms_px:.2f} px"
-        known += "" if reach is None else f", focal length to +-{max(reach):.1f} px (95 %)"
         visit.keep({"camera.lens_file": Taught(str(path.relative_to(visit.rig_path.parent)), how, known=known)})
         visit.say(f"Lens: residual {file.rms_px:.2f} px over {len(file.residuals_px)} photographs.")
 

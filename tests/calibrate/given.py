@@ -104,7 +104,6 @@ def kept_lens(
         photographs={"0.png": "ab" * 32},
         board="a board",
         lens=lens,
-        focal_se_px=(1.0, 1.0),
         ways=6,
         rms_px=0.2,
         residuals_px={"0.png": 0.2},

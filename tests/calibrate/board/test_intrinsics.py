@@ -72,20 +72,11 @@ def test_opencvs_own_photographs_give_its_own_lens() -> None:
     """OpenCV's 13 photographs by one camera."""
     paths = sorted(DATA.glob("left[0-9]*.jpg"))
     fitted = fit_lens([find_board(cv2.imread(str(path), 0), CHECKERS, path.name) for path in paths])
-    assert fitted.focal_reach_px is not None
-    assert fitted.focal_reach_px[0] < 3.0
     assert len(fitted.residuals_px) == 13
     assert fitted.rms_px <= 0.20
     assert fitted.lens.matrix[0] == pytest.approx(535.92, rel=0.01)
     assert (fitted.dropped, fitted.warnings) == ({}, ())
     assert len(find_board(cv2.imread(str(DATA / "choriginal.jpg"), 0), CHARUCO, "photograph").ids) == 24
-
-
-def test_views_given_again_do_not_make_a_lens_surer() -> None:
-    seen = views(8)
-    once, twice = fit_lens(seen), fit_lens([*seen, *renamed(seen, "again-")])
-    assert twice.ways == once.ways
-    assert twice.focal_reach_px == pytest.approx(once.focal_reach_px, rel=1e-3)
 
 
 @pytest.mark.parametrize("slant", [0.0, 0.4], ids=["face on", "slanted alike"])
@@ -98,16 +89,7 @@ def test_a_board_that_is_always_held_alike_gives_no_lens(slant: float) -> None:
         fit_lens(alike)
 
 
-def test_an_interval_is_given_where_the_views_allow_it_and_then_holds_the_truth() -> None:
-    few = fit_lens(views(5))
-    assert (few.focal_se_px, few.focal_reach_px) == (None, None)
-    assert any("more ways (5 so far): 6 are needed" in line for line in few.guidance)
-    held = 0
-    for seed in range(6):
-        fitted = fit_lens(views(7, seed=seed))
-        assert fitted.focal_reach_px is not None
-        held += abs(fitted.lens.matrix[0] - TRUE.matrix[0]) <= fitted.focal_reach_px[0]
-    assert held >= 5
+def test_the_lens_is_found_and_its_distortion_undone() -> None:
     fitted = fit_lens(views(12))
     assert fitted.warnings == ()
     assert fitted.rms_px == pytest.approx(0.1 * 2**0.5, rel=0.1)
@@ -131,7 +113,10 @@ def test_photographs_that_do_not_fit_are_dropped_by_name_or_leave_a_residual_tha
 
 def test_it_says_what_else_to_photograph() -> None:
     one_corner = [one for one in views(60) if one.pixels.max(axis=0)[0] < 420][:5]
-    message = " / ".join(fit_lens(one_corner).guidance)
+    lens = fit_lens([*one_corner, *renamed(one_corner, "again-")])
+    assert lens.ways == 5, "a view given again is no other way to hold the board"
+    message = " / ".join((*lens.guidance, *fit_lens(one_corner).guidance))
+    assert "more ways (5 so far, 6 are good)" in message
     assert "take more photographs (5 used" in message
     assert "right" in message
     assert guidance(views(40), [20.0] * 40) == ()
