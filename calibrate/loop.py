@@ -56,8 +56,6 @@ if TYPE_CHECKING:
     from brushloop.model.strokes import StrokeModel
 
 FILE, PAGE, TABLE = "loop.json", "loop.html", "loop.csv"
-FORMAT = "brushloop-loop-3"
-MAX_BYTES = 8 * 1024 * 1024
 AGAIN, ANOTHER, SIMULATED = "re-pressed", "another press", "recovered, simulated"
 """What is compared with an original: its repetition, other originals of its condition, the model's image of it."""
 GOAL_POINTS = 1.0
@@ -102,10 +100,9 @@ class Verdict:
 class LoopRecord(Sealed):
     """A closed loop as stored in `loop.json`: everything but the images and the individual scores."""
 
-    FORMAT: ClassVar[str] = FORMAT
+    FORMAT: ClassVar[str] = "brushloop-loop-3"
     MADE_BY: ClassVar[str] = "brushloop repress compare"
 
-    format: str = FORMAT
     source: Source
     """Kind of ink of the session that pressed again."""
     original: str
@@ -155,7 +152,7 @@ class LoopRecord(Sealed):
 
 def read_loop(folder: Path) -> LoopRecord:
     """Read the `loop.json` in a folder. Raises `CalibrationError` if it is invalid or was edited."""
-    return load_sealed(folder / FILE, LoopRecord, MAX_BYTES)
+    return load_sealed(folder / FILE, LoopRecord)
 
 
 def compare(request: CompareLoopRequest, progress: Progress = unseen) -> Written:

@@ -34,6 +34,7 @@ LINE_PX, CHAR_PX, PADDING = 16, 7, 0.04
 """Height of a line of a chart's text, about the width of a character, and the margin of an axis as a share of it."""
 PHOTOGRAPH_PX, JPEG_QUALITY = 1600, 80
 """Longest side and quality of a photograph in a page: about 500 kB at most."""
+MAX_SEALED_BYTES = 256 * 1024 * 1024
 ORIGIN = {
     Source.LOOPBACK: "simulated brush, ink and camera; not a result on paper",
     Source.REAL: "ink on paper, pressed by the arm named below",
@@ -281,15 +282,6 @@ def picture_grid(rows: int, columns: int, size: tuple[float, float], title: str 
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def show_picture(axis: Any, image: Image, title: str, *, fontsize: int, **options: Any) -> None:
-    """Draw (h, w) ink in black, or (h, w, 3) RGB, without ticks."""
-    axis.set_title(title, fontsize=fontsize, pad=2)
-    axis.set_xticks([])
-    axis.set_yticks([])
-    shown: dict[str, Any] = {"cmap": "gray", "vmin": 0, "vmax": 1} if image.ndim == 2 else {}
-    axis.imshow(1 - image if image.ndim == 2 else image, interpolation="nearest", **shown, **options)
-
-
 def save_picture(figure: Any, path: Path) -> None:
     """Write a figure of `picture_grid` as PNG. Raises OSError."""
     figure.canvas.print_png(path, metadata={"Software": None})  # `savefig` would lay it out and draw it twice
@@ -299,20 +291,20 @@ class Sealed(Frozen):
     """Base class of JSON reports with a digest of their contents, by which an edited one is recognised.
 
     The digest is not a signature: it guards results and their source against accidental edits.
-    A subclass sets FORMAT and makes it the default of `format`.
     """
 
     FORMAT: ClassVar[str]
     MADE_BY: ClassVar[str]
     """The command that writes such a file."""
 
-    format: str
+    format: str = ""
     digest: str = ""
-    """SHA-256 of everything else."""
+    """`FORMAT`, and the SHA-256 of everything else, once it is sealed."""
 
     def sealed(self) -> Self:
-        """A copy with its digest."""
-        return self.model_copy(update={"digest": _digest(self.model_dump(mode="json"))})
+        """A copy with its format and digest."""
+        whole = self.model_copy(update={"format": self.FORMAT})
+        return whole.model_copy(update={"digest": _digest(whole.model_dump(mode="json"))})
 
     def to_json(self) -> str:
         """The text that is written to disk."""
@@ -322,10 +314,10 @@ class Sealed(Frozen):
 S = TypeVar("S", bound=Sealed)
 
 
-def load_sealed(path: Path, kind: type[S], most_bytes: int) -> S:
+def load_sealed(path: Path, kind: type[S]) -> S:
     """Read a JSON report. Raises `CalibrationError`, naming the file, if it is not one, is too new or was edited."""
     try:
-        fields: Any = json.loads(read_bounded(path, most_bytes))
+        fields: Any = json.loads(read_bounded(path, MAX_SEALED_BYTES))
         # Digest of the file, not of the model: a field that was added to the model later is not an edit.
         known, digest, fields_format = fields["digest"], _digest(fields), fields["format"]
     except (ValueError, RecursionError, TypeError, KeyError):  # no JSON, text that is no Unicode, or something else

@@ -59,8 +59,6 @@ from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.records import Header, Source, Stroke
 from brushloop.sessions.show import details
 
-FORMAT = "brushloop-validation-4"
-MAX_BYTES = 256 * 1024 * 1024
 PACKAGES = ("brushloop", "numpy", "opencv-python-headless", "scikit-image", "numba", "torch")
 STRICT: Key = (Alignment.MM, Tone.BINARY)
 NORMAL: Key = (Alignment.SIZE_NORMALISED, Tone.BINARY)
@@ -132,10 +130,9 @@ class Session(Frozen):
 class Report(Sealed):
     """All results of a validation."""
 
-    FORMAT: ClassVar[str] = FORMAT
+    FORMAT: ClassVar[str] = "brushloop-validation-4"
     MADE_BY: ClassVar[str] = "brushloop validate"
 
-    format: str = FORMAT
     source: Source
     """Kind of ink, from the recordings' own headers; shown on all tables and figures."""
     software: dict[str, str]
@@ -180,7 +177,7 @@ class Report(Sealed):
 
 def load_report(path: Path) -> Report:
     """Read a report.json. Raises `CalibrationError` if it is not one or was edited."""
-    return load_sealed(path, Report, MAX_BYTES)
+    return load_sealed(path, Report)
 
 
 def report_of(

@@ -44,7 +44,6 @@ from brushloop.calibrate.report import (
     picture_grid,
     render,
     save_picture,
-    show_picture,
     write_files,
 )
 from brushloop.calibrate.session import OpenSession, open_session
@@ -59,8 +58,6 @@ from brushloop.sessions.records import Source
 from brushloop.sessions.terminal import Progress, counted, unseen
 
 FILE, PICTURE, PAGE, TABLE = "written.json", "figure-13.png", "written.html", "written.csv"
-FORMAT = "brushloop-written-2"
-MAX_BYTES = 8 * 1024 * 1024
 Key = tuple[Alignment, Tone, Polarity]
 KEYS: tuple[Key, ...] = tuple(itertools.product(Alignment, Tone, Polarity))
 HEADLINE: Key = (Alignment.MM, Tone.BINARY, Polarity.INK)
@@ -130,10 +127,9 @@ class Table3Row(Frozen):
 class WrittenRecord(Sealed):
     """Written characters as their `written.json` holds them: everything but the images and the single scores."""
 
-    FORMAT: ClassVar[str] = FORMAT
+    FORMAT: ClassVar[str] = "brushloop-written-2"
     MADE_BY: ClassVar[str] = "brushloop write compare"
 
-    format: str = FORMAT
     source: Source
     session: str
     recording_sha256: str
@@ -156,7 +152,7 @@ class WrittenRecord(Sealed):
 
 def read_written(path: Path) -> WrittenRecord:
     """Read `written.json`, or that in a report's folder. Raises `CalibrationError` if it is not one or was edited."""
-    return load_sealed(path / FILE if path.is_dir() else path, WrittenRecord, MAX_BYTES)
+    return load_sealed(path / FILE if path.is_dir() else path, WrittenRecord)
 
 
 @dataclass(frozen=True)
@@ -359,5 +355,9 @@ def draw(written: WritingComparison, path: Path) -> None:
             ("blue: mean of all captured; orange: reference", overlay(reference, character.mean_ink())),
         )
         for axis, (text, image) in zip(axes, parts, strict=True):
-            show_picture(axis, image, text, fontsize=8)
+            axis.set_title(text, fontsize=8, pad=2)
+            axis.set_xticks([])
+            axis.set_yticks([])
+            ink = 1 - image if image.ndim == 2 else image
+            axis.imshow(ink, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
     save_picture(figure, path)
