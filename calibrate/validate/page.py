@@ -140,9 +140,7 @@ def provenance(session: Session) -> tuple[tuple[str, str], ...]:
             f"{len(collected.left_out)} left out, {session.strokes} counted, {session.compared} compared"
         )
     touches = "" if collected is None else ", ".join(collected.touches)
-    used = (("brush fit", session.fit), ("strokes", counts), ("zero touch", touches))
-    facts = recording_facts(session.header, session.recording, session.recording_sha256, session.calibration)
-    return [*facts, *((name, text) for name, text in used if text)]
+    return ("brush fit", session.fit), ("strokes", counts), ("zero touch", touches)
 
 
 def read_curve(text: str) -> Curve:
