@@ -70,6 +70,8 @@ class DemoRequest:
     brush: Annotated[Path, Option(help="The rig's brush: `paper`, `loopback`, or one described in a brush.toml.")] = (
         Path("paper")
     )
+    show: Annotated[bool, Option("--open", help="Open the report in the browser at the end.")] = False
+    verbose: Annotated[bool, Option("--verbose", help="Show all that the steps print, instead of in demo.log.")] = False
 
 
 def on_screen(tui: bool | None) -> bool:

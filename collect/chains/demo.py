@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import socket
 import time
+import webbrowser
 from collections.abc import Generator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -111,13 +112,13 @@ class Demo:
 
     def __init__(self, request: DemoRequest, size: Size) -> None:
         self._out, self._repeats, self._seed = request.out, request.repeats, request.seed
-        self._size = size
+        self._size, self._verbose = size, request.verbose
         self._protocol, self._sessions = self._out / "protocol.toml", self._out / "sessions"
         self._rig = DemoRig(request)
         self._session: Path
         """What the first step collects, for every later step."""
         self._left_out = 0
-        self._validated: ValidationOutput
+        self._validated: ValidationOutput | None = None
 
     def run(self) -> None:
         """Run every step, and print how well the models predict the strokes, and where report and recording lie.
@@ -147,7 +148,7 @@ class Demo:
         for number, (title, run) in enumerate(steps, 1):
             say(f"[{number}/{len(steps)}] {title} ...")
             step_began_s = time.monotonic()
-            with _logged(self._out / LOG):
+            with nullcontext() if self._verbose else _logged(self._out / LOG):
                 run()
             say(f"  ✓   {time.monotonic() - step_began_s:.0f} s")
         self._rig.end()
@@ -162,12 +163,18 @@ class Demo:
         """Print how much of the ink is predicted, and what follows."""
         from brushloop.calibrate.validate.findings import headline, verdict  # slow to import
 
-        if (report := self._validated.report) is None:
+        report = None if self._validated is None else self._validated.report
+        if report is None:
             return
         say("", f"How much of the ink is predicted (average CSIM; {report.label}):")
         for label, percent in headline(report):
             say(f"  {label:30} {'█' * round(percent / 100 * BAR):{BAR}} {percent:.1f} %")
         say(*verdict(report))
+
+    @property
+    def report(self) -> Path | None:
+        """The report's page, once it is written."""
+        return None if self._validated is None else _report(self._session)
 
     def _collect(self) -> None:
         if self._sessions.is_dir() and not self._rig.config.exists():
@@ -237,5 +244,10 @@ def _report(session: Path) -> Path:
 
 
 def demo(request: DemoRequest) -> None:
-    """Run the demo, as `Demo.run` does."""
-    Demo(request, FULL if request.full else QUICK).run()
+    """Run the demo, as `Demo.run` does, and open its report if that is asked."""
+    run = Demo(request, FULL if request.full else QUICK)
+    try:
+        run.run()
+    finally:
+        if request.show and run.report is not None:
+            webbrowser.open(run.report.resolve().as_uri())

@@ -28,7 +28,7 @@ from rich.text import Text
 
 from brushloop.calibrate.board.pix2len import see_board
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.config import PREFIX, RigConfig
 from brushloop.collect.rig.devices import make_robot
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, RobotMode, survey
 from brushloop.drivers.arcs.telemetry import rtde_answers
@@ -223,7 +223,9 @@ class Scrubber:
 
     def __init__(self, known: Mapping[str, str]) -> None:
         """`known` are names of this rig, and what stands for each."""
-        names = dict(known) | {
+        names = {value: "<environment>" for name, value in os.environ.items() if name.upper().startswith(PREFIX)}
+        names |= known
+        names |= {
             socket.gethostname(): "<host>",
             socket.getfqdn(): "<host>",
             _user(): "<user>",
