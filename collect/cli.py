@@ -60,6 +60,10 @@ def collect(
         typer.Option(min=1, help="Confirm that sheet N of the session is in. Repeating it is safe."),
     ] = None,
     arm: Arm = False,
+    dry_run: Annotated[
+        float | None,
+        typer.Option(help="Only move, lifted by this many mm: nothing is pressed, dipped or kept."),
+    ] = None,
     tui: Tui = None,
     set_up: Annotated[
         bool, typer.Option("--set-up", help="On the screen: accept what each set-up step measured, or measure again.")
@@ -83,8 +87,11 @@ def collect(
         on_screen=screen,
         guided=set_up and screen,
         live=LiveView(live_port) if live else None,
+        dry_run_mm=dry_run,
     )
-    if left_out := start.collect(request).left_out:
+    if dry_run is not None:
+        start.dry_run(request)
+    elif left_out := start.collect(request).left_out:
         raise StrokesLeftOut(left_out)
 
 

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import contextlib
 import json
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -50,15 +52,11 @@ def engine_for(opening: Opening) -> Engine:
 def collect(request: CollectRequest) -> Collected:
     """Run to the end and print where the recording lies and what comes next. Raises the error that ended the run."""
     opening = Opening.load(request)
-
-    def resumed(session_id: str) -> Engine:
-        return engine_for(replace(opening, request=replace(request, new=False, resume=session_id)))
-
     engine = engine_for(opening)
     with contextlib.nullcontext() if request.live is None else contextlib.closing(request.live):
         if request.live is not None:
             request.live.start()
-        now = _run(engine, resumed, on_screen=request.on_screen).snapshot()
+        now = _run(engine, partial(_resumed, opening), on_screen=request.on_screen).snapshot()
     folder = Path(now.folder)
     say(*ending(folder, opening.protocol.kind))
     return Collected(folder, now.given_up)
@@ -75,6 +73,15 @@ def collect_session(
     return collect(CollectRequest(Path(config), Path(protocol), Path(out), sheet=sheet, armed=armed)).folder
 
 
+def dry_run(request: CollectRequest) -> None:
+    """Move through the protocol in the air; the recording is thrown away, so that no patch counts as used."""
+    with tempfile.TemporaryDirectory(prefix="brushloop-dry-") as folder:
+        in_the_air = replace(request, out=Path(folder), new=False, sheet=None, guided=False, live=None)
+        opening = Opening.load(in_the_air)
+        _run(engine_for(opening), partial(_resumed, opening), on_screen=request.on_screen)
+    say("dry run done; nothing was kept")
+
+
 def ending(folder: Path, kind: str) -> list[str]:
     """Lines that name the recording of a finished session and the next command; `kind` is its protocol's kind."""
     lines = [f"recorded: {folder / folder.name}.mcap"]
@@ -83,6 +90,11 @@ def ending(folder: Path, kind: str) -> list[str]:
         command = "validate" if (folder / "calibration").is_dir() else "calibrate"
         lines.append(f"next:     brushloop {command} {folder}")
     return lines
+
+
+def _resumed(opening: Opening, session_id: str) -> Engine:
+    """An engine that resumes a session of the same files."""
+    return engine_for(replace(opening, request=replace(opening.request, new=False, resume=session_id)))
 
 
 def _run(engine: Engine, again: Callable[[str], Engine], *, on_screen: bool) -> Engine:

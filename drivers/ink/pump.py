@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import asyncio
 import struct
+import time
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -82,6 +83,8 @@ MAX_RPM = 600.0
 REPLY_S = 0.5
 ECHO_S = 0.15
 """How long `connect` waits for an echo: longer than eight characters and the adapter's own delay."""
+MAX_OVERRUN_S = 0.5
+"""A stop that is later than this is reported: the well got more than was asked for."""
 
 
 class ModbusPumpConfig(InkTable, frozen=True):
@@ -142,12 +145,14 @@ class ModbusPump(InkDevice):
         async with self._running:
             speed = round(self._rpm * 100)
             await self._write(SPEED_REGISTER, speed, "set speed", "The pump was not started.")
+            planned_s = volume_ml / self._ml_per_s
             if not self._connected:  # closed meanwhile: the stop has been sent, and no start may follow
                 raise NotConnected(DEVICE, "dose", "closed while waiting", condition="The pump was not started.")
             try:
                 self._may_run = True
                 await self._write(RUN_REGISTER, START, "start", "The pump is stopped.")
-                await asyncio.sleep(volume_ml / self._ml_per_s)
+                began_s = time.monotonic()
+                await asyncio.sleep(planned_s)
             except BaseException as error:
                 try:
                     await finished(self._halt())
@@ -156,7 +161,17 @@ class ModbusPump(InkDevice):
                         raise
                     error.add_note(str(failure))
                 raise
+            ran_s = time.monotonic() - began_s
             await finished(self._halt())
+            if ran_s > planned_s + MAX_OVERRUN_S:
+                excess_ml = (ran_s - planned_s) * self._ml_per_s
+                raise DeviceError(
+                    DEVICE,
+                    "dose",
+                    f"ran {ran_s:.2f} s instead of {planned_s:.2f} s",
+                    condition=f"About {excess_ml:.2f} ml too much is in the well; the pump is stopped.",
+                    remedy="Something held the host up.",
+                )
 
     async def replenish(self, dips: int) -> Well:
         """Dose before every `every_dips`-th dip. Raises as `dose` does."""

@@ -22,6 +22,7 @@ from brushloop.drivers.errors import (
 )
 from brushloop.drivers.host import Clock, HostClock
 from brushloop.drivers.ink import port as port_module
+from brushloop.drivers.ink import pump as pump_module
 from brushloop.drivers.ink import station as station_module
 from brushloop.drivers.ink.port import DoseLost, InkRefused
 from brushloop.drivers.ink.pump import ModbusPump, ModbusPumpConfig
@@ -406,3 +407,22 @@ async def test_a_late_reply_does_not_pass_for_the_next(
         await pump.dose(0.01)
     await pump.dose(0.01)
     assert rotor.starts == 1
+
+
+async def test_a_host_that_was_held_up_reports_the_excess(
+    rotor: PumpFirmware, pump: ModbusPump, monkeypatch: pytest.MonkeyPatch
+):
+    sleep, ran = asyncio.sleep, list[bool]()
+
+    async def sleep_and_be_held_up(delay_s: float) -> None:
+        await sleep(delay_s)
+        ran.append(rotor.running)
+        time.sleep(0.25)  # the fault under test
+
+    with monkeypatch.context() as holding_up:
+        holding_up.setattr(pump_module, "MAX_OVERRUN_S", 0.1)
+        holding_up.setattr("brushloop.drivers.ink.pump.asyncio.sleep", sleep_and_be_held_up)
+        with pytest.raises(DeviceError, match=r"instead of 0.10 s\. About .* too much.*is stopped"):
+            await pump.dose(0.01)
+    assert ran == [True]
+    assert not rotor.running
