@@ -192,7 +192,7 @@ def sheet_of(config: RigConfig, protocol: ProtocolConfig) -> Sheet:
 
 def steps_on(config: RigConfig, protocol: ProtocolConfig) -> Protocol:
     """The steps as this rig runs them: balanced over its sheet, with the self-check if it is on."""
-    steps = protocol.steps(sheet_of(config, protocol).layout)
+    steps = protocol.steps(sheet_of(config, protocol))
     return with_self_check(steps) if config.self_check.enabled else steps
 
 

@@ -247,17 +247,17 @@ def fit_sheet(board: Mapping[str, Sequence[Point]], sheet: Mapping[str, Sequence
     sigmas = noise_mm * np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))
     points, origin = np.vstack([b, s]), np.array([sx, sy])
     points[:, :2] = (points[:, :2] - origin) @ _rotation(yaw)
-    plane = fit_plane([(float(x), float(y), float(z)) for x, y, z in points])
+    plane, off_mm = fit_plane([(float(x), float(y), float(z)) for x, y, z in points])
     board_x, board_y = (float(v) for v in (np.array([bx, by]) - origin) @ _rotation(yaw))
     names = [f"board {CORNERS[k]}" for k in bk] + [f"sheet {CORNERS[k]}" for k in sk]
     lengths = [float(v) for v in np.linalg.norm(residuals, axis=1)]
-    above_mm = max(math.sqrt(sum(r * r for r in plane.residuals_mm) / max(len(points) - 3, 1)), HAND_MM)
+    above_mm = max(math.sqrt(sum(r * r for r in off_mm) / max(len(points) - 3, 1)), HAND_MM)
     return SheetFit(
         (sx, sy),
         math.degrees(math.remainder(yaw, math.tau)),
         (width, height),
         (board_x, board_y),
-        plane.plane,
+        plane,
         {f"{name} {number}": length for number, (name, length) in enumerate(zip(names, lengths, strict=True), 1)},
         float(max(sigmas[3:5])),
         math.degrees(float(sigmas[0])),

@@ -68,7 +68,7 @@ class Engine:
         self._request = opening.request
         self._rig_config = opening.rig
         self._resumes = resumes
-        layout = sheet_of(opening.rig, opening.protocol).layout
+        layout = sheet_of(opening.rig, opening.protocol)
         self._progress = Progress(opening.protocol, clock, layout, resumes)
         self._clock = clock
         self._asker = Asker(watched=self._request.on_screen, waiting=self._waiting)

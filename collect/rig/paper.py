@@ -14,7 +14,7 @@ from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import Quaternion, brush_pose, of_angles, product, turned, unit
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Layout:
     """How a sheet is divided into patches, filled row by row from the far edge."""
 
@@ -52,7 +52,7 @@ class Patch:
         return self.x_mm, self.y_mm, self.size_x_mm, self.size_y_mm
 
 
-class Sheet:
+class Sheet(Layout):
     """The patches of one sheet, row by row from the far edge, so that the arm never reaches across wet ink."""
 
     def __init__(self, paper: PaperConfig, cell_mm: tuple[float, float] | None = None) -> None:
@@ -60,20 +60,9 @@ class Sheet:
         self.cell_mm = paper.cell_mm if cell_mm is None else cell_mm
         width, height = paper.size_mm
         cell_w, cell_h = self.cell_mm
-        self.columns = int(width // cell_w)
-        self.rows = int(height // cell_h)
+        super().__init__(columns=int(width // cell_w), rows=int(height // cell_h))
         self._left = 0.5 * (width - self.columns * cell_w)
         self._bottom = 0.5 * (height - self.rows * cell_h)
-
-    @property
-    def capacity(self) -> int:
-        """Cells on a sheet."""
-        return self.columns * self.rows
-
-    @property
-    def layout(self) -> Layout:
-        """Its columns and rows."""
-        return Layout(self.columns, self.rows)
 
     @property
     def corners(self) -> list[Patch]:
@@ -182,30 +171,17 @@ def _yaw(paper: PaperConfig) -> Quaternion:
     return of_angles(0.0, 0.0, math.radians(paper.yaw_deg))
 
 
-@dataclass(frozen=True, slots=True)
-class PlaneFit:
-    """A plane through touched points, and how well they lie in it."""
-
-    plane: PaperPlane
-    residuals_mm: tuple[float, ...]
-    """Touched minus fitted height, in the order of the points; zeros for three points, which a plane always fits."""
-
-    @property
-    def worst_mm(self) -> float:
-        """The largest residual."""
-        return max((abs(r) for r in self.residuals_mm), default=0.0)
-
-
-def fit_plane(points_mm: list[tuple[float, float, float]]) -> PlaneFit:
+def fit_plane(points_mm: list[tuple[float, float, float]]) -> tuple[PaperPlane, tuple[float, ...]]:
     """Least squares through touched points (x, y in the paper frame, z in the base frame).
 
-    One or two points give a level plane at their mean height. Raises `StepError` where three or more lie nearly on a
-    line, or the plane leans more than a sheet can.
+    Returns the plane, and touched minus fitted height of each point: zeros for three, which a plane always fits. One
+    or two points give a level plane at their mean height. Raises `StepError` where three or more lie nearly on a line,
+    or the plane leans more than a sheet can.
     """
     at: NDArray[np.float64] = np.asarray(points_mm, np.float64)
     if len(points_mm) < 3:
         level = PaperPlane(float(at[:, 2].mean()))
-        return PlaneFit(level, tuple(float(v) for v in at[:, 2] - level.z0_mm))
+        return level, tuple(float(v) for v in at[:, 2] - level.z0_mm)
     centred = at[:, :2] - at[:, :2].mean(axis=0)
     spread_mm = float(np.linalg.svd(centred, compute_uv=False)[1]) / math.sqrt(len(points_mm)) * 2.0
     if spread_mm < LEAST_SPREAD_MM:
@@ -219,7 +195,7 @@ def fit_plane(points_mm: list[tuple[float, float, float]]) -> PlaneFit:
         raise StepError(
             f"the sheet would lean by {plane.slope_deg:.1f} deg, limit {MAX_SLOPE_DEG:g}: check what was touched"
         )
-    return PlaneFit(plane, tuple(float(z - plane.touch_z_mm(x, y)) for x, y, z in points_mm))
+    return plane, tuple(float(z - plane.touch_z_mm(x, y)) for x, y, z in points_mm)
 
 
 def to_paper(paper: PaperConfig, x_mm: float, y_mm: float) -> tuple[float, float]:

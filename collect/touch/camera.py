@@ -257,4 +257,4 @@ class FirstInkTouch:
 
 
 def _plane(touches: list[Touch]) -> PaperPlane:
-    return fit_plane([(t.x_mm, t.y_mm, t.z_mm) for t in touches]).plane
+    return fit_plane([(t.x_mm, t.y_mm, t.z_mm) for t in touches])[0]

@@ -109,14 +109,14 @@ def taught(paper: PaperConfig, rests_mm: float) -> ZeroTouchResult:
 
 def through(points: list[TouchedPoint], config: TouchConfig) -> ZeroTouchResult:
     """The plane through the points. Raises `StepError` if one lies too far from it, or it leans too much."""
-    fit = fit_plane([(point.x_mm, point.y_mm, point.z_mm) for point in points])
-    if fit.worst_mm > config.residual_mm:
-        listed = ", ".join(f"{r:+.3f}" for r in fit.residuals_mm)
+    plane, residuals_mm = fit_plane([(point.x_mm, point.y_mm, point.z_mm) for point in points])
+    if max(map(abs, residuals_mm)) > config.residual_mm:
+        listed = ", ".join(f"{r:+.3f}" for r in residuals_mm)
         raise StepError(
             f"the touched points do not lie in a plane: residuals {listed} mm, limit {config.residual_mm:g} mm. "
             "Does the sheet lie flat?"
         )
-    return _result(fit.plane, config.method, points, fit.residuals_mm)
+    return _result(plane, config.method, points, residuals_mm)
 
 
 def _result(

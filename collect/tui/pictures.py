@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from rich.segment import Segment
 from rich.style import Style
-from textual.app import ComposeResult
 from textual.containers import Container
 from textual.geometry import Region, Size
 from textual.strip import Strip
@@ -130,14 +129,10 @@ class PixelPicture(Container):
     """textual-image's widget, once `look_for_pixels` has found that this process's terminal has them."""
 
     def __init__(self, id: str | None = None) -> None:  # noqa: A002 - textual's name
-        super().__init__(id=id)
         assert self.drawn_by is not None
         self._inner: Any = self.drawn_by()
         self._image: NDArray[np.uint8] | None = None
-
-    def compose(self) -> ComposeResult:
-        """Lay out textual-image's own widget."""
-        yield self._inner
+        super().__init__(self._inner, id=id)
 
     def show(self, image: NDArray[np.uint8] | None) -> None:
         """Draw this picture, unless it is the same object."""

@@ -27,7 +27,7 @@ from brushloop.drivers.sim.faults import Phase
 from brushloop.drivers.sim.rig import Addresses, rig_toml
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.store import SessionStore
-from tests.collect.tui.fake import FakeEngine, app_of, look, picture
+from tests.collect.tui.fake import FakeEngine, picture, watched
 from tests.rigs import Lab
 from tests.runs import until, wait_for_end
 from tests.waiting import PATIENCE_S, wait_until
@@ -173,18 +173,13 @@ def test_the_snapshot_says_for_how_long_no_pose_has_come(tmp_path: Path) -> None
 
 
 async def test_the_run_screen_is_not_green_without_a_pose() -> None:
-    engine = FakeEngine(picture())
-    app = app_of(engine)
-    async with app.run_test(size=(80, 24)) as pilot:
-        await look(app, pilot)
-        state = app.screen.query_one("#state")
+    async with watched(picture()) as run:
+        state = run.app.screen.query_one("#state")
         green = state.styles.background
-        engine.now = picture(tip_mm=None, no_pose_s=1.44)
-        assert "Tip      no pose for 1.4 s" in await look(app, pilot)
+        assert "Tip      no pose for 1.4 s" in await run.look(picture(tip_mm=None, no_pose_s=1.44))
         assert str(state.render()) == "RUNNING\nno pose for 1.4 s"
         assert state.styles.background != green
-        engine.now = picture()
-        await look(app, pilot)
+        await run.look(picture())
         assert (str(state.render()), state.styles.background) == ("RUNNING", green)
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import math
 import threading
-from dataclasses import replace
+from collections.abc import AsyncGenerator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -308,15 +310,36 @@ def shown(app: App[None]) -> str:
     return "\n".join(lines)
 
 
-async def look(app: OperatorApp, pilot: Pilot[None]) -> str:
-    """The screen after two polls: the first may come before the layout has its sizes."""
-    engine = app.engine
-    assert isinstance(engine, FakeEngine)
-    enough = engine.looks + 2
-    while engine.looks < enough:
-        await pilot.pause(0.02)
-    await pilot.pause()
-    return shown(app)
+@dataclass(frozen=True)
+class Watched:
+    """A run on the screen, and somebody at its keyboard."""
+
+    engine: FakeEngine
+    app: OperatorApp
+    pilot: Pilot[None]
+
+    async def look(self, now: Snapshot | None = None) -> str:
+        """The screen after two polls: the first may come before the layout has its sizes."""
+        self.engine.now = now or self.engine.now
+        enough = self.engine.looks + 2
+        while self.engine.looks < enough:
+            await self.pilot.pause(0.02)
+        await self.pilot.pause()
+        return shown(self.app)
+
+    async def press(self, *keys: str) -> None:
+        await self.pilot.press(*keys)
+
+
+@contextlib.asynccontextmanager
+async def watched(now: Snapshot, size: tuple[int, int] = (80, 24)) -> AsyncGenerator[Watched]:
+    """A run that is shown until the end of the block."""
+    engine = FakeEngine(now)
+    app = app_of(engine)
+    async with app.run_test(size=size) as pilot:
+        run = Watched(engine, app, pilot)
+        await run.look()
+        yield run
 
 
 # A first day that asks one question of each kind

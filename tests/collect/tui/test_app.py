@@ -19,8 +19,7 @@ from brushloop.collect.tui.app import OperatorApp, ScreenCrashed, run_app
 from brushloop.collect.tui.run_screen import COMMAND_GOES_ON, GOES_ON, OVER, STOP_SENT, RunScreen
 from brushloop.collect.tui.terminal import TerminalDriver, _LostWrites
 from brushloop.collect.tui.widgets import SOFTWARE_STOP, AskScreen
-from tests.collect.tui.fake import FAILED, SPLIT, FakeEngine, app_of, look, picture, shown
-from tests.waiting import PATIENCE_S
+from tests.collect.tui.fake import FAILED, SPLIT, FakeEngine, Watched, app_of, picture, watched
 
 AT_WORK = sorted(set(State) - FINAL)
 KEYS = ("space", "r", "k", "n", "j", "b")
@@ -31,9 +30,7 @@ def asks(app: OperatorApp) -> bool:
 
 
 async def test_space_pauses_and_resumes_and_says_which() -> None:
-    engine = FakeEngine(picture())
-    app = app_of(engine)
-    async with app.run_test(size=(80, 24)) as pilot:
+    async with watched(picture()) as run:
         for state, word, calls in (
             (State.RUNNING, "space Pause", ["pause"]),
             (State.PAUSING, "space Resume", ["resume"]),
@@ -41,110 +38,86 @@ async def test_space_pauses_and_resumes_and_says_which() -> None:
             (State.STOPPING, "", []),
             (State.DONE, "", []),
         ):
-            engine.calls.clear()
-            engine.now = picture(state=state)
-            assert word in await look(app, pilot)
-            await pilot.press("space")
-            assert engine.calls == calls
+            run.engine.calls.clear()
+            assert word in await run.look(picture(state=state))
+            await run.press("space")
+            assert run.engine.calls == calls
 
 
 async def test_stop_keys_stop_in_every_state_of_a_run() -> None:
-    engine = FakeEngine(picture())
-    app = app_of(engine)
-    async with app.run_test() as pilot:
+    async with watched(picture()) as run:
         for state in AT_WORK:
-            engine.now = picture(state=state)
-            await look(app, pilot)
-            engine.calls.clear()
-            await pilot.press("s", "ctrl+c")
-            assert engine.calls == ["stop", "stop"], state
+            await run.look(picture(state=state))
+            run.engine.calls.clear()
+            await run.press("s", "ctrl+c")
+            assert run.engine.calls == ["stop", "stop"], state
 
 
 @pytest.mark.parametrize("over", ["q", "question_mark", "prompt"])
 async def test_the_stop_key_stops_over_whatever_lies_on_the_screen(over: str) -> None:
-    engine = FakeEngine(picture())
-    app = app_of(engine)
-    async with app.run_test() as pilot:
-        await look(app, pilot)
+    async with watched(picture()) as run:
         if over == "prompt":
-            engine.now = picture(state=State.ASKING, prompt=SPLIT)
+            await run.look(picture(state=State.ASKING, prompt=SPLIT))
         else:
-            await pilot.press(over)
-        await look(app, pilot)
-        await pilot.press("s")
-        assert engine.calls == ["stop"]
+            await run.press(over)
+        await run.look()
+        await run.press("s")
+        assert run.engine.calls == ["stop"]
 
 
-async def test_a_stop_is_on_the_screen_in_less_than_a_tenth_of_a_second_whatever_the_engine_says() -> None:
-    engine = FakeEngine(picture())
-    app = app_of(engine)
-    async with app.run_test(size=(80, 24)) as pilot:
-        await look(app, pilot)
-        await pilot.press("s")
-        async with asyncio.timeout(PATIENCE_S):
-            while STOP_SENT not in shown(app):
-                await asyncio.sleep(0.001)
-        assert STOP_SENT in await look(app, pilot)  # until the engine says more
-        engine.now = picture(state=State.STOPPED, error="stopped by the operator")
-        text = await look(app, pilot)
+async def test_a_stop_is_on_the_screen_until_the_engine_says_more() -> None:
+    async with watched(picture()) as run:
+        await run.press("s")
+        assert STOP_SENT in await run.look()
+        text = await run.look(picture(state=State.STOPPED, error="stopped by the operator"))
         assert STOP_SENT not in text
         assert "STOPPED" in text
 
 
 async def test_requests_are_passed_on_and_shown_until_they_are_carried_out() -> None:
-    engine = FakeEngine(picture())
-    app = app_of(engine)
-    async with app.run_test(size=(80, 24)) as pilot:
+    async with watched(picture()) as run:
         for key, request in (("r", "RETAKE"), ("k", "SKIP"), ("n", "NEW_SHEET"), ("j", "JOG")):
-            engine.calls.clear()
-            engine.now = picture()
-            assert "asked" not in await look(app, pilot)
-            await pilot.press(key)
-            assert engine.calls == [f"request {request}"]
-            text = await look(app, pilot)
-            assert f"asked: {engine.now.requests[0].short}" in text
+            run.engine.calls.clear()
+            assert "asked" not in await run.look(picture())
+            await run.press(key)
+            assert run.engine.calls == [f"request {request}"]
+            text = await run.look()
+            assert f"asked: {run.engine.now.requests[0].short}" in text
             assert "red button: emergency stop" in text
 
 
 async def test_q_asks_while_the_run_is_on_and_parks_before_it_leaves() -> None:
-    engine = FakeEngine(picture())
-    app = app_of(engine)
-    async with app.run_test() as pilot:
-        await look(app, pilot)
+    async with watched(picture()) as run:
         for quit_key, no_key in (("q", "n"), ("ctrl+q", "escape")):
-            await pilot.press(quit_key, quit_key)
-            assert asks(app)
-            await pilot.press(no_key)
-            assert isinstance(app.screen, RunScreen)
-        assert engine.calls == []
-        await pilot.press("q", "y")
-        assert engine.calls == ["park"]
-        while app.is_running:
-            await asyncio.sleep(0.02)
-    assert app.return_code == 0
+            await run.press(quit_key, quit_key)
+            assert asks(run.app)
+            await run.press(no_key)
+            assert isinstance(run.app.screen, RunScreen)
+        assert run.engine.calls == []
+        await run.press("q", "y")
+        assert run.engine.calls == ["park"]
+        await until_over(run.pilot)
+    assert run.app.return_code == 0
 
 
 async def test_while_the_arm_is_being_stopped_q_asks_nothing_and_the_red_button_is_named() -> None:
-    engine = FakeEngine(picture(state=State.STOPPING))
-    app = app_of(engine)
-    async with app.run_test(size=(80, 24)) as pilot:
-        assert "not seen at rest yet: press the red button" in await look(app, pilot)
-        await pilot.press("q")
-        assert not asks(app)
-        assert engine.calls == []
+    async with watched(picture(state=State.STOPPING)) as run:
+        assert "not seen at rest yet: press the red button" in await run.look()
+        await run.press("q")
+        assert not asks(run.app)
+        assert run.engine.calls == []
 
 
 async def test_an_arm_that_was_not_seen_at_rest_is_never_said_to_rest() -> None:
-    engine = FakeEngine(replace(FAILED, rest_unknown=True, parked=False, target_mm=(0.0, 0.0, 0.0)))
-    app = app_of(engine)
-    async with app.run_test(size=(80, 24)) as pilot:
-        await look(app, pilot)
-        await pilot.press("q")
-        text = await look(app, pilot)
+    unseen = replace(FAILED, rest_unknown=True, parked=False, target_mm=(0.0, 0.0, 0.0))
+    async with watched(unseen) as run:
+        assert SOFTWARE_STOP in await run.look(), "not how to go on"
+        await run.press("q")
+        text = await run.look()
         assert "may still be moving" in text
         assert "it rests where" not in text
-        await pilot.press("y")
-        assert not app.is_running
+        await run.press("y")
+        assert not run.app.is_running
 
 
 @pytest.mark.parametrize("bounce_s", [1e9, 0.0])
@@ -152,79 +125,57 @@ async def test_a_key_that_bounces_after_an_answer_asks_for_nothing(
     bounce_s: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run_screen, "BOUNCE_S", bounce_s)
-    engine = FakeEngine(picture(state=State.ASKING, prompt=SPLIT))
-    app = app_of(engine)
-    async with app.run_test(size=(80, 24)) as pilot:
-        await look(app, pilot)
-        await pilot.press("k")
-        engine.now = picture()
-        await look(app, pilot)
-        await pilot.press("k")
-        assert [call for call in engine.calls if "request" in call] == ([] if bounce_s else ["request SKIP"])
+    async with watched(picture(state=State.ASKING, prompt=SPLIT)) as run:
+        await run.press("k")
+        await run.look(picture())
+        await run.press("k")
+        assert [call for call in run.engine.calls if "request" in call] == ([] if bounce_s else ["request SKIP"])
 
 
 @pytest.mark.parametrize("state", sorted(FINAL))
 async def test_what_is_over_can_only_be_left(state: State) -> None:
-    engine = FakeEngine(picture(state=state, parked=True, target_mm=(0.0, 0.0, 0.0)))
-    app = app_of(engine)
-    async with app.run_test(size=(80, 24)) as pilot:
-        text = await look(app, pilot)
+    async with watched(picture(state=state, parked=True, target_mm=(0.0, 0.0, 0.0))) as run:
+        text = await run.look()
         assert OVER in text
         assert state.upper() in text
         assert (COMMAND_GOES_ON in text) is (state is not State.DONE)
         assert (SOFTWARE_STOP in text) is (state is State.DONE)
         assert "s STOP" not in text
-        await pilot.press(*KEYS)
-        assert engine.calls == []
-        await pilot.press("q")
-        assert not app.is_running
+        await run.press(*KEYS)
+        assert run.engine.calls == []
+        await run.press("q")
+        assert not run.app.is_running
 
 
-@pytest.mark.parametrize("unseen", [False, True])
-async def test_enter_resumes_a_stopped_session_and_leaves_the_question_to_the_engine(unseen: bool) -> None:
-    stopped = FakeEngine(picture(state=State.STOPPED, folder="sessions/2026-11-21-grid-01", rest_unknown=unseen))
+@pytest.mark.parametrize("outcome", ["resumes", "a refusal", "a signal"])
+async def test_enter_resumes_a_stopped_session_and_leaves_the_question_to_the_engine(outcome: str) -> None:
+    stopped = FakeEngine(picture(state=State.STOPPED, folder="sessions/2026-11-21-grid-01"))
     stopped.stop()
     resumed = FakeEngine(picture())
     asked: list[str] = []
 
     def again(session_id: str) -> FakeEngine:
         asked.append(session_id)
+        if outcome == "a refusal":
+            raise ConfigError("rig.toml", "", "goes on with no open session")
+        app.leaving = outcome == "a signal"  # which comes while files are read
         return resumed
 
     app = OperatorApp(again, stopped)
     async with app.run_test(size=(80, 24)) as pilot:
-        text = await look(app, pilot)
+        text = await Watched(stopped, app, pilot).look()
         assert "Resume the session" in text
-        assert (GOES_ON in text) is not unseen
+        assert GOES_ON in text
         await pilot.press("enter")
         await app.workers.wait_for_complete()
         assert asked == ["2026-11-21-grid-01"]
         assert stopped.calls == ["stop", "join"]
-        assert resumed.calls == ["start"]
-        assert "RUNNING" in await look(app, pilot)
-
-
-@pytest.mark.parametrize("why", ["a signal", "a refusal"])
-async def test_a_run_that_cannot_begin_leaves_the_screen_as_it_is(why: str) -> None:
-    stopped = FakeEngine(picture(state=State.STOPPED, folder="sessions/2026-11-21-grid-01"))
-    stopped.stop()
-    resumed = FakeEngine(picture())
-
-    def again(_session_id: str) -> FakeEngine:
-        if why == "a refusal":
-            raise ConfigError("rig.toml", "", "goes on with no open session")
-        app.leaving = True  # the signal comes while files are read
-        return resumed
-
-    app = OperatorApp(again, stopped)
-    async with app.run_test(size=(80, 24)) as pilot:
-        await look(app, pilot)
-        await pilot.press("enter")
-        await app.workers.wait_for_complete()
-        if why == "a refusal":
+        if outcome == "a refusal":
             assert [note.message for note in app._notifications] == ["rig.toml: goes on with no open session"]
-    assert resumed.calls == []
-    assert app.engine is stopped
+        if outcome == "resumes":
+            assert "RUNNING" in await Watched(resumed, app, pilot).look()
+    assert resumed.calls == (["start"] if outcome == "resumes" else [])
+    assert app.engine is (resumed if outcome == "resumes" else stopped)
 
 
 def without_terminal(monkeypatch: pytest.MonkeyPatch, pilot: object) -> None:

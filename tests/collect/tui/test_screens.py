@@ -45,19 +45,18 @@ from tests.collect.tui.fake import (
     capture,
     full_picture,
     has_picture,
-    look,
     picture,
     shown,
+    watched,
 )
 
 
 async def test_what_comes_from_outside_is_shown_as_it_is() -> None:
     markup = "[red]x[/red] [/] [link='"
-    engine = FakeEngine(picture(messages=(markup, "a\x1b[31mb"), step=markup, source=markup, error=markup))
-    app = app_of(engine)
-    async with app.run_test(size=(109, 40)) as pilot:
-        await app.screen.mount(Static("a\x1b]0;owned\x07b \x9b31m \u202eltr", markup=False, id="hostile"))
-        text = await look(app, pilot)
+    now = picture(messages=(markup, "a\x1b[31mb"), step=markup, source=markup, error=markup)
+    async with watched(now, (109, 40)) as run:
+        await run.app.screen.mount(Static("a\x1b]0;owned\x07b \x9b31m \u202eltr", markup=False, id="hostile"))
+        text = await run.look()
         assert text.count(markup) == 4
         assert r"a\u001b[31mb" in text
         assert "a]0;ownedb 31m ltr" in text
@@ -65,10 +64,9 @@ async def test_what_comes_from_outside_is_shown_as_it_is() -> None:
 
 
 async def test_what_did_not_change_is_not_drawn_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    app = app_of(FakeEngine(full_picture()))
-    async with app.run_test(size=(120, 40)) as pilot:
-        for _ in range(3):
-            await look(app, pilot)
+    async with watched(full_picture(), (120, 40)) as run:
+        for _ in range(2):
+            await run.look()
         drawn: list[Widget] = []
         refresh = Widget.refresh
 
@@ -78,7 +76,7 @@ async def test_what_did_not_change_is_not_drawn_again(monkeypatch: pytest.Monkey
 
         monkeypatch.setattr(Widget, "refresh", noted)
         for _ in range(3):
-            await look(app, pilot)
+            await run.look()
         assert drawn == []
 
 
@@ -107,34 +105,27 @@ def test_a_force_is_drawn_to_scale_and_noise_does_not_fill_its_place() -> None:
 
 
 async def test_b_marks_the_last_capture_and_takes_it_back_while_the_run_is_on(tmp_path: Path) -> None:
-    engine = FakeEngine(full_picture(folder=str(tmp_path)))
-    last = engine.now.last
+    now = full_picture(folder=str(tmp_path))
+    last = now.last
     assert last is not None
-    app = app_of(engine)
-    async with app.run_test(size=(120, 40)) as pilot:
-        engine.now = replace(engine.now, last=replace(last, kept=False))
-        await look(app, pilot)
-        await pilot.press("b")
+    async with watched(replace(now, last=replace(last, kept=False)), (120, 40)) as run:
+        await run.press("b")
         assert remarks_of(tmp_path) == {}, "it does not count anyway"
-        engine.now = replace(engine.now, last=last)
-        await look(app, pilot)
-        await pilot.press("b")
+        await run.look(now)
+        await run.press("b")
         remark = remarks_of(tmp_path)[last.still]
         assert (remark.stroke_id, remark.bad) == (last.press.stroke_id, True)
-        await pilot.press("b")
+        await run.press("b")
         assert not remarks_of(tmp_path)[last.still].bad
-        engine.now = replace(engine.now, state=State.DONE)
-        await look(app, pilot)
-        await pilot.press("b")
+        await run.look(replace(now, state=State.DONE))
+        await run.press("b")
         assert not remarks_of(tmp_path)[last.still].bad
 
 
 async def test_a_disk_that_refuses_is_reported(tmp_path: Path) -> None:
-    app = app_of(FakeEngine(full_picture(folder=str(tmp_path / "gone"))))
-    async with app.run_test(size=(120, 40)) as pilot:
-        await pilot.press("b")
-        assert "gone" in " ".join(note.message for note in app._notifications)
-        assert shown(app)
+    async with watched(full_picture(folder=str(tmp_path / "gone")), (120, 40)) as run:
+        await run.press("b")
+        assert "gone" in " ".join(note.message for note in run.app._notifications)
 
 
 PROMPT = Prompt(
@@ -146,20 +137,17 @@ PROMPT = Prompt(
 
 
 async def test_enter_shows_the_last_capture_large_with_the_missed_check_first() -> None:
-    engine = FakeEngine(full_picture(last=capture(kept=False)))
-    app = app_of(engine)
-    async with app.run_test(size=(80, 24)) as pilot:
-        await look(app, pilot)
-        await pilot.press("enter")
-        text = await look(app, pilot)
-        assert isinstance(app.screen, CaptureScreen)
+    async with watched(full_picture(last=capture(kept=False))) as run:
+        await run.press("enter")
+        text = await run.look()
+        assert isinstance(run.app.screen, CaptureScreen)
         assert text.index("! split") < text.index("✓ exposure")
         for part in ("0.42  ≤ 0.30 mm", "The tip is split.", "73.2 % in mm", "predicted only", "s STOP"):
             assert part in text
         assert has_picture(text)
-        await pilot.press("1", "left", "right", "s", "escape")
-        assert isinstance(app.screen, RunScreen)
-        assert engine.calls == ["stop"]
+        await run.press("1", "left", "right", "s", "escape")
+        assert isinstance(run.app.screen, RunScreen)
+        assert run.engine.calls == ["stop"]
 
 
 def test_a_difference_has_four_colours_and_an_overlay_the_line_of_the_prediction() -> None:
@@ -173,30 +161,26 @@ def test_a_difference_has_four_colours_and_an_overlay_the_line_of_the_prediction
 
 
 async def test_a_key_answers_the_question_that_is_shown_and_the_next_one_comes() -> None:
-    engine = FakeEngine(picture(state=State.ASKING, step="wait for an answer", prompt=PROMPT))
-    app = app_of(engine)
-    async with app.run_test(size=(80, 24)) as pilot:
-        assert "Waits until it is answered" in await look(app, pilot)
-        await pilot.press("z", "escape", "g")
-        assert [call for call in engine.calls if call.startswith("answer")] == ["answer 7 g"]
-        engine.now = replace(engine.now, prompt=replace(PROMPT, question="Is there ink?", number=8))
-        assert "Is there ink?" in await look(app, pilot)
-        engine.now = picture()
-        assert "RUNNING" in await look(app, pilot)
-        assert isinstance(app.screen, RunScreen)
+    asking = picture(state=State.ASKING, step="wait for an answer", prompt=PROMPT)
+    async with watched(asking) as run:
+        assert "Waits until it is answered" in await run.look()
+        await run.press("z", "escape", "g")
+        assert [call for call in run.engine.calls if call.startswith("answer")] == ["answer 7 g"]
+        asking = replace(asking, prompt=replace(PROMPT, question="Is there ink?", number=8))
+        assert "Is there ink?" in await run.look(asking)
+        assert "RUNNING" in await run.look(picture())
+        assert isinstance(run.app.screen, RunScreen)
 
 
 async def test_q_over_a_question_leaves_it_unanswered_and_parks() -> None:
-    engine = FakeEngine(picture(state=State.ASKING, prompt=PROMPT))
-    app = app_of(engine)
-    async with app.run_test(size=(80, 24)) as pilot:
-        assert "q Leave: park the arm" in await look(app, pilot)
+    async with watched(picture(state=State.ASKING, prompt=PROMPT)) as run:
+        assert "q Leave: park the arm" in await run.look()
         for answer, calls in (("n", []), ("y", ["park"])):
-            await pilot.press("q")
-            assert isinstance(app.screen, AskScreen)
-            assert app.screen.own
-            await pilot.press(answer)
-            assert engine.calls == calls
+            await run.press("q")
+            assert isinstance(run.app.screen, AskScreen)
+            assert run.app.screen.own
+            await run.press(answer)
+            assert run.engine.calls == calls
 
 
 class Beginning(FakeBrowser):
@@ -238,36 +222,20 @@ async def test_enter_goes_on_with_an_open_session_and_n_asks_for_a_blank_sheet_f
         assert browser.asked[1:] == ["2026-11-21-grid-02"]
         assert isinstance(app.engine, FakeEngine)
         assert app.engine.calls == ["start"]
-        await look(app, pilot)
         await pilot.press("s")
         assert "stop" in app.engine.calls
 
 
-async def test_other_files_can_be_typed_and_letters_of_stop_keys_too() -> None:
-    browser = FakeBrowser()
-    app = OperatorApp(browser.engine, browser=browser)
-    async with app.run_test(size=(80, 24)) as pilot:
-        await ready(app, pilot)
-        await pilot.press("e", "ctrl+u", *"s2.toml", "enter", "ctrl+u", "enter")
-        text = await ready(app, pilot)
-        assert "rig s2.toml   protocol protocol.toml" in text, "an emptied field leaves the file as it was"
-        await pilot.press("e", *"x", "escape", *"s", "enter")
-        assert "rig s2.toml   protocol protocol.tomls" in await ready(app, pilot)
-
-
 async def test_no_note_is_typed_while_a_run_is_in_progress(tmp_path: Path) -> None:
-    engine = FakeEngine(PAUSED)
-    app = app_of(engine)
-    async with app.run_test(size=(120, 40)) as pilot:
-        await look(app, pilot)
-        app.push_screen(review := a_review(tmp_path, app))
-        text = await ready(app, pilot)
+    async with watched(PAUSED, (120, 40)) as run:
+        run.app.push_screen(review := a_review(tmp_path, run.app))
+        text = await ready(run.app, run.pilot)
         for words in ("red button", "s STOP"):
             assert words in text
         assert "o Note" not in text
-        await pilot.press("o", "f", "s")
-        assert engine.calls == ["stop"]
-        assert app.screen is review
+        await run.press("o", "f", "s")
+        assert run.engine.calls == ["stop"]
+        assert run.app.screen is review
 
 
 async def test_after_a_session_the_next_commands_run_in_the_terminal(
