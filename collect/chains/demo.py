@@ -1,12 +1,11 @@
 """`brushloop demo`: the real commands, in order, against a loopback rig in a process of its own.
 
-All files go under one folder. A demo that is killed and started again continues where it stopped: what a step has
-finished is on disk, and the rig's process, which holds the simulated sheet, outlives the demo by some minutes.
+All files go under one folder. A demo that is killed and started again continues where it stopped, on a new rig with a
+blank sheet: what a step has finished is on disk.
 """
 
 from __future__ import annotations
 
-import socket
 import time
 import webbrowser
 from collections.abc import Generator
@@ -25,9 +24,8 @@ from brushloop.collect.chains.writing import PAGE as WRITTEN_PAGE
 from brushloop.collect.chains.writing import write
 from brushloop.collect.engine.open_or_resume import CollectRequest, open_sessions
 from brushloop.collect.errors import StrokesLeftOut
-from brushloop.collect.rig.config import load_rig
 from brushloop.collect.start import calibrated, collected, finished_session, fitted
-from brushloop.drivers.loopback import FaultRefused, LoopbackRig, ask, start
+from brushloop.drivers.loopback import LoopbackRig, start
 from brushloop.model.generator import SHIPPED_GENERATOR
 from brushloop.sessions.terminal import say
 
@@ -38,7 +36,7 @@ CHARACTER = "字"
 LOG, BAR = "demo.log", 40
 """The file that gets what the steps print; length of a full bar, in characters."""
 IDLE_EXIT_S = 180.0
-"""Longer than the evaluation between two collections takes on a busy computer."""
+"""Time after which the rig of a killed demo ends; the evaluation between two collections takes less."""
 FPS = 12
 """Pictures per second: a photograph waits for several. Drawing and decoding more would cost what they save."""
 
@@ -59,66 +57,24 @@ QUICK = Size((11.0, 15.0, 20.0), (0.0, 5.0, 10.0), again=6, writings=0)
 FULL = Size((11.0, 13.0, 15.0, 17.0, 20.0), (0.0, 5.0, 10.0), again=15, writings=4)
 
 
-class DemoRig:
-    """The loopback rig of a demo, started or found in the demo's folder."""
-
-    def __init__(self, request: DemoRequest) -> None:
-        self.config = request.out / "rig.toml"
-        self._folder = request.out
-        options = {"rate": request.rate, "seed": request.seed, "brush": request.brush, "fps": FPS}
-        self._options = [word for name, value in options.items() for word in (f"--{name}", str(value))]
-        self._started: LoopbackRig | None = None
-
-    def start(self) -> None:
-        """Start a rig with a blank sheet, on a new port. Raises `RigDidNotStart`."""
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            port = int(probe.getsockname()[1])
-        self.config.unlink(missing_ok=True)  # the new rig writes its own
-        options = ["--idle-exit", str(IDLE_EXIT_S), "--arcs-port", str(port), "--control", str(self._control(port))]
-        self._started = start(self.config, self._folder / "rig.log", *self._options, *options, detached=True)
-
-    def ready(self) -> None:
-        """Go on with the rig that `rig.toml` names; start one with a blank sheet if it has ended, or there is none.
-
-        Raises `RigDidNotStart` and `ConfigError`.
-        """
-        try:
-            if self.config.exists():
-                self._ask("state")
-                return
-        except FaultRefused:
-            pass
-        self.start()
-
-    def fresh_sheet(self) -> None:
-        """Put a blank sheet in. Raises `FaultRefused`, and `ConfigError` for a bad rig.toml."""
-        self._ask("fresh-sheet")
-
-    def end(self) -> None:
-        """End the rig if this process started it; one that an earlier demo started ends by itself when idle."""
-        if self._started is not None:
-            self._started.end()
-
-    def _ask(self, what: str) -> None:
-        ask(self._control(load_rig(self.config).robot.port), {"do": what})
-
-    def _control(self, arcs_port: int) -> Path:
-        return self._folder / f"rig-{arcs_port}.sock"
-
-
 class Demo:
     """Collect, calibrate, press again, write if asked, and validate, all under `out`."""
 
     def __init__(self, request: DemoRequest, size: Size) -> None:
         self._out, self._repeats, self._seed = request.out, request.repeats, request.seed
         self._size, self._verbose = size, request.verbose
-        self._protocol, self._sessions = self._out / "protocol.toml", self._out / "sessions"
-        self._rig = DemoRig(request)
+        self._config, self._protocol = self._out / "rig.toml", self._out / "protocol.toml"
+        self._sessions = self._out / "sessions"
+        options = {"rate": request.rate, "seed": request.seed, "brush": request.brush, "fps": FPS}
+        options |= {"idle-exit": IDLE_EXIT_S}
+        self._options = [word for name, value in options.items() for word in (f"--{name}", str(value))]
+        self._rig: LoopbackRig | None = None
         self._session: Path
         """What the first step collects, for every later step."""
         self._left_out = 0
-        self._validated: ValidationOutput | None = None
+        self._validated: ValidationOutput
+        self.report: Path | None = None
+        """The report's page, once it is written."""
 
     def run(self) -> None:
         """Run every step, and print how well the models predict the strokes, and where report and recording lie.
@@ -145,13 +101,16 @@ class Demo:
         ]
         say(f"Demo on the loopback rig, all simulated: {len(steps)} steps.")
         began_s = time.monotonic()
-        for number, (title, run) in enumerate(steps, 1):
-            say(f"[{number}/{len(steps)}] {title} ...")
-            step_began_s = time.monotonic()
-            with nullcontext() if self._verbose else _logged(self._out / LOG):
-                run()
-            say(f"  ✓   {time.monotonic() - step_began_s:.0f} s")
-        self._rig.end()
+        try:
+            for number, (title, run) in enumerate(steps, 1):
+                say(f"[{number}/{len(steps)}] {title} ...")
+                step_began_s = time.monotonic()
+                with nullcontext() if self._verbose else _logged(self._out / LOG):
+                    run()
+                say(f"  ✓   {time.monotonic() - step_began_s:.0f} s")
+        finally:
+            if self._rig is not None:
+                self._rig.end()
         self._say_answer()
         session = self._session
         say("", f"Done in {time.monotonic() - began_s:.0f} s, simulated: nothing here is a result on paper.")
@@ -163,32 +122,32 @@ class Demo:
         """Print how much of the ink is predicted, and what follows."""
         from brushloop.calibrate.validate.findings import headline, verdict  # slow to import
 
-        report = None if self._validated is None else self._validated.report
-        if report is None:
+        if (report := self._validated.report) is None:
             return
         say("", f"How much of the ink is predicted (average CSIM; {report.label}):")
         for label, percent in headline(report):
             say(f"  {label:30} {'█' * round(percent / 100 * BAR):{BAR}} {percent:.1f} %")
         say(*verdict(report))
 
-    @property
-    def report(self) -> Path | None:
-        """The report's page, once it is written."""
-        return None if self._validated is None else _report(self._session)
+    def _started(self) -> LoopbackRig:
+        """The rig of this demo; started, with a blank sheet, where it is first needed. Raises `RigDidNotStart`."""
+        if self._rig is None:
+            say("the loopback rig starts in the background; its log is rig.log")
+            self._config.unlink(missing_ok=True)  # the rig writes its own
+            self._rig = start(self._config, self._out / "rig.log", *self._options, detached=True)
+        return self._rig
 
     def _collect(self) -> None:
-        if self._sessions.is_dir() and not self._rig.config.exists():
-            self._rig.start()  # a demo was killed while its rig started
-        session = finished_session(self._sessions, self._rig.config, self._protocol)
+        earlier = self._sessions.is_dir() and any(self._sessions.iterdir()) and not open_sessions(self._sessions)
+        if not self._config.exists():
+            self._started()  # a new demo, or one that was killed while its rig started
+        session = finished_session(self._sessions, self._config, self._protocol)
         if session is not None and not _report(session).is_file():
             say(f"continuing with {session}: its collection is finished")
             self._session = session
             return
-        earlier = self._sessions.is_dir() and any(self._sessions.iterdir()) and not open_sessions(self._sessions)
-        say("the loopback rig starts in the background; its log is rig.log")
-        (self._rig.start if earlier else self._rig.ready)()
         sheet = 1 if earlier else None
-        request = CollectRequest(self._rig.config, self._protocol, self._sessions, sheet=sheet)
+        request = CollectRequest(self._started().config, self._protocol, self._sessions, sheet=sheet)
         self._session, self._left_out = collected(request)
 
     def _fit(self) -> None:
@@ -201,15 +160,15 @@ class Demo:
             return
         self._blank_sheet(folder / REPLAY)
         presses, seed = self._size.again, self._seed
-        run_loop(LoopRequest(self._session, self._rig.config, folder, presses=presses, seed=seed, sheet=1, tui=False))
+        run_loop(LoopRequest(self._session, self._config, folder, presses=presses, seed=seed, sheet=1, tui=False))
 
     def _write(self) -> None:
         folder = self._session / "written"
         if (folder / WRITTEN_PAGE).is_file():
             return
         self._blank_sheet(folder / "plan" / WRITE)
-        config, repeats = self._rig.config, self._size.writings
-        write(WritingRequest(CHARACTER, config, folder, self._sessions, repeats=repeats, sheet=1, tui=False))
+        repeats = self._size.writings
+        write(WritingRequest(CHARACTER, self._config, folder, self._sessions, repeats=repeats, sheet=1, tui=False))
 
     def _validate(self) -> None:
         from brushloop.calibrate.validate.command import validate  # slow to import
@@ -217,15 +176,15 @@ class Demo:
         command = f"brushloop validate {self._session} --generator {SHIPPED_GENERATOR}"
         say(f"$ {command}")
         request = ValidateRequest((str(self._session),), command=command, generators=(SHIPPED_GENERATOR,))
-        self._validated = show_work(validate, request)
+        self._validated, self.report = show_work(validate, request), _report(self._session)
 
     def _blank_sheet(self, protocol: Path) -> None:
-        """Make the rig ready for the session of this protocol, with a blank sheet unless the session has begun."""
-        if protocol.exists() and finished_session(self._sessions, self._rig.config, protocol) is not None:
+        """Put a blank sheet in for the session of this protocol, unless that is finished."""
+        if protocol.exists() and finished_session(self._sessions, self._config, protocol) is not None:
             return
-        self._rig.ready()
-        if not open_sessions(self._sessions):
+        if self._rig is not None:
             self._rig.fresh_sheet()
+        self._started()
 
 
 @contextmanager

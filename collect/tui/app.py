@@ -41,8 +41,6 @@ UNSEEN = yes_or_no(f"{NOT_AT_REST} Leave this screen anyway?", "leave it as it i
 COMMANDS = {"f": ("sessions", "verify"), "c": ("calibrate",), "t": ("fit",), "w": ("validate",)}
 """What can be done with a session on which no run is in progress, in the order in which it is done."""
 LOOK, BACK = Choice("v", "look through the captures"), Choice("q", "back")
-CAN_BEGIN_AGAIN = frozenset({State.STOPPED, State.FAILED})
-"""States in which a run has ended before its session was finished."""
 
 
 class OperatorApp(PlainApp):
@@ -103,7 +101,7 @@ class OperatorApp(PlainApp):
             case "stop":
                 return self.at_work
             case "begin_again":
-                return now is not None and now.state in CAN_BEGIN_AGAIN and bool(now.folder)
+                return now is not None and now.state in (State.STOPPED, State.FAILED) and bool(now.folder)
             case "review":
                 return now is not None and bool(now.folder)
             case _:

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from brushloop.collect.engine.snapshot import LastCapture
     from brushloop.sessions.records import Check
 
-WHITE, BOTH, CAPTURED, PREDICTED = (255, 255, 255), (165, 165, 165), (213, 94, 0), (0, 114, 178)
-"""Colours of a difference, as in the reports: after Okabe and Ito, which colour-blind readers can distinguish."""
+COLOURS = {"both": (166, 166, 166), "captured only": (213, 94, 0), "predicted only": (0, 114, 178)}
+"""Colours of a difference, those of `calibrate.report.overlay`."""
 OVERLAY_PX = 384
 LINE_PX = 3
 
@@ -36,15 +36,18 @@ def over_photograph(photo: NDArray[np.uint8], predicted: NDArray[np.bool_]) -> N
     picture = cv2.cvtColor(cv2.resize(photo, (OVERLAY_PX, OVERLAY_PX)), cv2.COLOR_GRAY2RGB)
     mask = cv2.resize(np.asarray(predicted, np.uint8), (OVERLAY_PX, OVERLAY_PX), interpolation=cv2.INTER_LINEAR)
     edges, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    return np.asarray(cv2.drawContours(picture, edges, -1, PREDICTED, LINE_PX), np.uint8)
+    return np.asarray(cv2.drawContours(picture, edges, -1, COLOURS["predicted only"], LINE_PX), np.uint8)
 
 
 def difference(captured: NDArray[np.bool_], predicted: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Where both have ink, only the capture has it, and only the prediction has it."""
     import numpy as np
 
-    colours = np.array((WHITE, PREDICTED, CAPTURED, BOTH), np.uint8)
-    return colours[2 * np.asarray(captured, np.uint8) + np.asarray(predicted, np.uint8)]
+    from brushloop.calibrate.report import overlay
+
+    return np.rint(255.0 * overlay(np.asarray(captured, np.float32), np.asarray(predicted, np.float32))).astype(
+        np.uint8
+    )
 
 
 def checks_content(checks: Sequence[Check]) -> Content:
@@ -150,6 +153,6 @@ class CaptureScreen(Screen[None], inherit_bindings=False):
         if (csim := self._capture.likeness) is not None:
             lines.append(labelled("CSIM", f"{100.0 * csim:.1f} % in mm"))
         if "difference" in self._images:
-            for colour, what in ((BOTH, "both"), (CAPTURED, "captured only"), (PREDICTED, "predicted only")):
+            for what, colour in COLOURS.items():
                 lines.append(Content.assemble(("██", "rgb({},{},{})".format(*colour)), f" {what}"))
         return Content("\n").join(lines)

@@ -75,27 +75,8 @@ TRACE_PEAKS = 50
 """Peaks of the force that are drawn, of a tenth of a second each."""
 LEAST_SCALE_N = 0.1
 """Smallest full scale of that drawing, so that noise is not stretched: a soft brush pushes with a few tens of mN."""
-CAN_PAUSE = frozenset({State.IDLE, State.RECOVERING, State.RUNNING})
-CAN_RESUME = frozenset({State.PAUSING, State.PAUSED})
 BOUNCE_S = 0.7
 """Time after an answer in which the keys of requests do nothing: pressing an answer's key twice sends no request."""
-RUN_BINDINGS = (
-    STOP,
-    Binding("space,p", "pause", "Pause", tooltip="before the next step"),
-    Binding("space,p", "go_on", "Resume"),
-    Binding("q", "app.quit", "Leave", tooltip="after this step, with the arm parked"),
-    HELP_KEY,
-    Binding("enter", "app.begin_again", "Resume the session"),
-    Binding("enter", "enlarge", "Large", tooltip="the last capture"),
-    Binding("tab", "next_pane", "Pane", tooltip="overview, last capture, camera, where not all fit"),
-    Binding("v", "app.review", "Review", tooltip="look through the captures, mark and compare them"),
-    Binding("r", "request('RETAKE')", "Retake", tooltip="the current stroke, once photographed; r takes it back"),
-    Binding("k", "request('SKIP')", "Skip", tooltip="the current stroke"),
-    Binding("n", "request('NEW_SHEET')", "New sheet", tooltip="before the next stroke"),
-    Binding("j", "request('JOG')", "Jog", tooltip="find the paper again before the next stroke"),
-    Binding("b", "mark_last", "Bad", tooltip="the last capture: pressed again at the end; b takes it back"),
-)
-"""Most important first: a narrow screen shows only as many as fit."""
 
 
 class LogPane(VerticalScroll, inherit_bindings=False):
@@ -161,7 +142,23 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
     RunScreen.-narrow.-capture #camera, RunScreen.-narrow.-camera #capture { display: none; }
     RunScreen #note { height: 1; padding: 0 1; background: $panel; text-wrap: nowrap; text-overflow: ellipsis; }
     """
-    BINDINGS: ClassVar[list[BindingType]] = [*RUN_BINDINGS]
+    # Most important first: a narrow screen shows only as many as fit.
+    BINDINGS: ClassVar[list[BindingType]] = [
+        STOP,
+        Binding("space,p", "pause", "Pause", tooltip="before the next step"),
+        Binding("space,p", "go_on", "Resume"),
+        Binding("q", "app.quit", "Leave", tooltip="after this step, with the arm parked"),
+        HELP_KEY,
+        Binding("enter", "app.begin_again", "Resume the session"),
+        Binding("enter", "enlarge", "Large", tooltip="the last capture"),
+        Binding("tab", "next_pane", "Pane", tooltip="overview, last capture, camera, where not all fit"),
+        Binding("v", "app.review", "Review", tooltip="look through the captures and mark them"),
+        Binding("r", "request('RETAKE')", "Retake", tooltip="the current stroke, once photographed; r takes it back"),
+        Binding("k", "request('SKIP')", "Skip", tooltip="the current stroke"),
+        Binding("n", "request('NEW_SHEET')", "New sheet", tooltip="before the next stroke"),
+        Binding("j", "request('JOG')", "Jog", tooltip="find the paper again before the next stroke"),
+        Binding("b", "mark_last", "Bad", tooltip="the last capture: pressed again at the end; b takes it back"),
+    ]
 
     def __init__(self, engine: Engine) -> None:
         super().__init__()
@@ -227,9 +224,9 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
                 return state not in FINAL
             case "pause":
                 # While the arm is being stopped or a question waits, nothing is to be paused.
-                return state in CAN_PAUSE
+                return state in (State.IDLE, State.RECOVERING, State.RUNNING)
             case "go_on":
-                return state in CAN_RESUME
+                return state in (State.PAUSING, State.PAUSED)
             case "enlarge":
                 # After a stop or a failure, the same key resumes the session.
                 return last is not None and state not in FINAL - {State.DONE}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from typer.testing import CliRunner
@@ -27,7 +28,7 @@ from brushloop.collect.chains.loop import SETTINGS as FILE
 from brushloop.collect.chains.loop import Settings, begun_with, check_recovered, keep_settings
 from brushloop.collect.chains.writing import FOOTPRINT, Writing
 from brushloop.collect.engine.open_or_resume import CollectRequest
-from brushloop.collect.errors import CollectAborted, ConfigError, StrokesLeftOut
+from brushloop.collect.errors import ConfigError, StrokesLeftOut
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.start import Collected, finished_session
@@ -75,20 +76,10 @@ class Chain:
         request.out.mkdir()
         (request.out / "written.html").touch()
 
-    def rig(self, what: str) -> None:
-        self.ran.append(what)
-
-
-class FakeRig:
-    """Stands for the rig's process."""
-
-    def __init__(self, chain: Chain, folder: Path) -> None:
-        self.config = folder / "rig.toml"
-        self.config.write_text(RIG)
-        self.start = lambda: chain.rig("rig starts")
-        self.ready = lambda: chain.rig("rig")
-        self.fresh_sheet = lambda: chain.rig("fresh sheet")
-        self.end = lambda: None
+    def rig(self, config: Path, *_options: object, **_more: object) -> SimpleNamespace:
+        self.ran.append("rig")
+        config.write_text(RIG)
+        return SimpleNamespace(config=config, fresh_sheet=lambda: self.ran.append("fresh sheet"), end=lambda: None)
 
 
 @pytest.fixture
@@ -99,7 +90,7 @@ def chain(monkeypatch: pytest.MonkeyPatch) -> Chain:
     monkeypatch.setattr(demo, "calibrated", lambda _session: made.ran.append("calibrate"))
     monkeypatch.setattr(demo, "fitted", lambda _session: made.ran.append("fit"))
     monkeypatch.setattr(demo, "run_loop", made.loop)
-    monkeypatch.setattr(demo, "DemoRig", lambda request: FakeRig(made, request.out))
+    monkeypatch.setattr(demo, "start", made.rig)
     monkeypatch.setattr(demo, "write", made.write)
     return made
 
@@ -114,7 +105,7 @@ def finished(config: Path, protocol: Path, out: Path, number: int) -> Path:
     return out / f"grid-{number}"
 
 
-EVALUATED = ["calibrate", "fit", "rig", "fresh sheet", "loop 6", "validate"]
+EVALUATED = ["calibrate", "fit", "fresh sheet", "loop 6", "validate"]
 
 
 def run(folder: Path, *more: str) -> None:
@@ -149,29 +140,14 @@ def test_a_demo_that_ended_after_its_collection_goes_on_there_and_begins_no_new_
     assert chain.ran == ["calibrate", "fit", "validate"]
     chain.ran.clear()
     run(tmp_path)
-    assert chain.ran == ["rig starts", "collect", *EVALUATED]
+    assert chain.ran == ["rig", "collect", *EVALUATED]
     assert sorted(path.name for path in (tmp_path / "sessions").iterdir()) == ["grid-1", "grid-2"]
 
 
 def test_the_full_demo_also_writes(chain: Chain, tmp_path: Path) -> None:
     run(tmp_path, "--full")
-    again = ["calibrate", "fit", "rig", "fresh sheet", "loop 15"]
-    assert chain.ran == ["rig", "collect", *again, "rig", "fresh sheet", "write 字 4", "validate"]
-
-
-def test_the_sheet_is_not_changed_under_a_session_that_has_begun(chain: Chain, tmp_path: Path) -> None:
-    def killed(request: LoopRequest) -> None:
-        chain.ran.append("loop is killed")
-        Make().store(tmp_path / "sessions" / "replay-1", session_id="replay-1").release()
-        raise CollectAborted("the power failed")
-
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(demo, "run_loop", killed)
-        with pytest.raises(CollectAborted):
-            run(tmp_path)
-    chain.ran.clear()
-    run(tmp_path)
-    assert chain.ran == ["calibrate", "fit", "rig", "loop 6", "validate"]
+    again = ["calibrate", "fit", "fresh sheet", "loop 15"]
+    assert chain.ran == ["rig", "collect", *again, "fresh sheet", "write 字 4", "validate"]
 
 
 # The loop

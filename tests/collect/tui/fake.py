@@ -284,7 +284,7 @@ class FakeReview(Review):
         return LastCapture(capture.press, capture.result.still, True, None, photo, binary)
 
 
-def app_of(engine: FakeEngine | None = None, browser: FakeBrowser | None = None) -> OperatorApp:
+def app_of(engine: Any = None, browser: FakeBrowser | None = None) -> OperatorApp:
     """The app of one run, or of a day; neither resumes anything."""
     return OperatorApp(engine_for, engine, browser=browser)
 

@@ -8,6 +8,7 @@ import io
 import os
 import signal
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from textual.pilot import Pilot
@@ -149,12 +150,12 @@ async def test_what_is_over_can_only_be_left(state: State) -> None:
 
 @pytest.mark.parametrize("outcome", ["resumes", "a refusal", "a signal"])
 async def test_enter_resumes_a_stopped_session_and_leaves_the_question_to_the_engine(outcome: str) -> None:
-    stopped = FakeEngine(picture(state=State.STOPPED, folder="sessions/2026-11-21-grid-01"))
+    stopped: Any = FakeEngine(picture(state=State.STOPPED, folder="sessions/2026-11-21-grid-01"))
     stopped.stop()
     resumed = FakeEngine(picture())
     asked: list[str] = []
 
-    def again(session_id: str) -> FakeEngine:
+    def again(session_id: str) -> Any:
         asked.append(session_id)
         if outcome == "a refusal":
             raise ConfigError("rig.toml", "", "goes on with no open session")
