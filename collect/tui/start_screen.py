@@ -1,4 +1,4 @@
-"""The start screen: recent sessions and their state, a new session, the rig's health.
+"""The start screen: recent sessions and their state, the rig and protocol files, the rig's health.
 
 Heavy imports wait until they are needed, so that the screen is up first.
 """
@@ -20,6 +20,7 @@ from textual.screen import Screen
 from textual.widgets import Footer, OptionList
 
 from brushloop.collect.errors import ConfigError
+from brushloop.collect.operator import Prompt
 from brushloop.collect.tui.widgets import (
     HELP_KEY,
     YES,
@@ -107,11 +108,13 @@ class StartScreen(Screen[None]):
     StartScreen #sessions { width: 42%; height: 100%; border: none; padding: 0; }
     StartScreen.-empty #sessions { display: none; }
     StartScreen #standing { width: 1fr; height: 100%; padding: 0 1; border-left: solid $foreground 40%; }
+    StartScreen #files { height: 1; padding: 0 1; }
     StartScreen #trouble { height: auto; max-height: 10; padding: 0 1; }
     """
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("n", "new", "New session"),
         Binding("d", "health", "Rig health"),
+        Binding("e", "file('rig')", "Files"),
         Binding("q", "app.quit", "Leave"),
         HELP_KEY,
     ]
@@ -132,16 +135,17 @@ class StartScreen(Screen[None]):
         self._run_command = run_command
         self._rows: list[Summary] = []
         self._title, self._standing = Line("start-title"), Line("standing-text")
-        self._trouble = Line("trouble")
+        self._files, self._trouble = Line("files"), Line("trouble")
         self._options = Rows("sessions")
 
     def compose(self) -> ComposeResult:
-        """Lay out sessions and standing, trouble, keys."""
+        """Lay out sessions and standing, files, trouble, keys."""
         yield self._title
         with Horizontal(id="start-body"):
             yield self._options
             with VerticalScroll(id="standing"):
                 yield self._standing
+        yield self._files
         yield self._trouble
         yield Footer(compact=True)
 
@@ -149,6 +153,7 @@ class StartScreen(Screen[None]):
         """List the sessions, now and whenever a run may have changed them."""
         browser = self._browser
         self._title.show(f"brushloop   folder of the sessions: {one_line(str(browser.root))}")
+        self._files.show(f"rig {one_line(str(browser.config))}   protocol {one_line(str(browser.protocol))}")
         try:
             self._rows = browser.recent()
         except (SessionError, OSError) as error:
@@ -183,6 +188,24 @@ class StartScreen(Screen[None]):
         self.show_trouble("")
         (self._begin if row.state == "open" else self._look)(row.session_id)
 
+    def action_file(self, what: str) -> None:
+        """Ask for the rig's file, then for the protocol's; an empty name, or escape, keeps a file as it is."""
+        browser = self._browser
+
+        def answered(name: str | None) -> None:
+            path = Path(name.strip()) if name and name.strip() else None
+            if what == "rig":
+                browser.config = path or browser.config
+                self.action_file("protocol")
+            else:
+                browser.protocol = path or browser.protocol
+                self.show_trouble("")
+                self.on_screen_resume()
+
+        before = str(browser.config if what == "rig" else browser.protocol)
+        question = Prompt(f"File of the {what}: enter takes it, escape keeps {before}.", default=before, read=str)
+        app_of(self).push_screen(AskScreen(question), answered)
+
     @work(exclusive=True, group="new")
     async def action_new(self) -> None:
         """Ask for a blank sheet, then begin."""
@@ -198,9 +221,8 @@ class StartScreen(Screen[None]):
             if key == YES:
                 self._begin(None)
 
-        protocol = one_line(str(self._browser.protocol))
-        question = f"A new session of {protocol}: is a blank sheet in as its sheet 1?\n\n{planned}"
-        app_of(self).push_screen(AskScreen(yes_or_no(question, "it is in", "back")), answered)
+        question = yes_or_no(f"A new session: is a blank sheet in as its sheet 1?\n\n{planned}", "it is in", "back")
+        app_of(self).push_screen(AskScreen(question), answered)
 
     def action_health(self) -> None:
         """Ask every device for its identity and its faults; powers nothing."""
@@ -218,11 +240,13 @@ An arm: `brushloop rig new` writes it, step by step.
 No arm: `brushloop sim --write-rig rig.toml --rate 20`, in another terminal.
 
 {protocol} 2  What to press: {plain(str(browser.protocol))}
-Copy examples/protocol-quick.toml.
+Copy examples/protocol-quick.toml, or press e and type another path.
 
 · 3  Health: d asks every device; nothing is powered.
 
-· 4  The first session: n""")
+· 4  The first session: n
+It asks for a blank sheet; the set-up looks through the camera, finds the paper, and asks you about each measurement.
+Then the strokes follow.""")
 
 
 def _row_content(row: Summary) -> Content:

@@ -219,6 +219,18 @@ async def test_enter_goes_on_with_an_open_session_and_n_asks_for_a_blank_sheet_f
         assert "stop" in app.engine.calls
 
 
+async def test_other_files_can_be_typed_and_letters_of_stop_keys_too() -> None:
+    browser = FakeBrowser()
+    app = app_of(browser=browser)
+    async with app.run_test(size=(80, 24)) as pilot:
+        await ready(app, pilot)
+        await pilot.press("e", "ctrl+u", *"s2.toml", "enter", "ctrl+u", "enter")
+        text = await ready(app, pilot)
+        assert "rig s2.toml   protocol protocol.toml" in text, "an emptied field leaves the file as it was"
+        await pilot.press("e", *"x", "escape", *"s", "enter")
+        assert "rig s2.toml   protocol protocol.tomls" in await ready(app, pilot)
+
+
 async def test_no_note_is_typed_while_a_run_is_in_progress(tmp_path: Path) -> None:
     async with watched(PAUSED, (120, 40)) as run:
         run.app.push_screen(review := a_review(tmp_path, run.app))
