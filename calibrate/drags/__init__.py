@@ -55,6 +55,8 @@ HOLLOW_SHARE = 0.75
 """Share of its outline that ink covers, below which a stroke is hollow: dry bristles, or glare on wet ink."""
 THUMB_PX = 160
 OUTLINE_GRAY = 128
+LEVEL_DEG = 20.0
+"""Bent strokes along x have a rectangle that is a little tilted: only strokes of another direction are turned."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,7 +217,8 @@ def _read(capture: Capture, command: tuple[float, ...] | None, grid: tuple[Float
     return Drag(
         capture.stroke,
         command,
-        measure(mask),
+        # A start in the table means a commanded path, which runs along x. Scanned strokes have neither.
+        measure(along_axis(mask) if anchor is None else mask),
         touches_edge(whole),
         (*defects(whole), *glare),
         _thumbnail(raster, mask),
@@ -245,6 +248,24 @@ def defects(mask: Mask) -> tuple[str, ...]:
     if covered < HOLLOW_SHARE:
         phrases.append(f"hollow: ink covers {100 * covered:.0f} % of the outline")
     return tuple(phrases)
+
+
+def along_axis(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The mask turned until the stroke's longer axis, that of its smallest enclosing rectangle, is the x axis.
+
+    A mask whose axis is within `LEVEL_DEG` of x is returned as it is.
+    """
+    points = cv2.findNonZero(mask.astype(np.uint8))
+    centre, (width, height), angle = cv2.minAreaRect(points)
+    turn = angle if width >= height else angle - 90.0
+    turn = (turn + 90.0) % 180.0 - 90.0
+    if abs(turn) < LEVEL_DEG:
+        return mask
+    side = int(np.hypot(*mask.shape)) + 2
+    matrix = cv2.getRotationMatrix2D(centre, turn, 1.0)
+    matrix[:, 2] += 0.5 * side - np.array(centre)
+    turned = cv2.warpAffine(255 * mask.astype(np.uint8), matrix, (side, side), flags=cv2.INTER_LINEAR)
+    return np.asarray(turned > 127, np.bool_)
 
 
 def _thumbnail(raster: Gray, mask: Mask) -> Gray:

@@ -28,6 +28,7 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.stats import farthest_first
 from brushloop.model.drag import DragModel, Drawings, Floats, Indices, Trails, derivatives, fit_to_ink, lagging
 from brushloop.model.similarity import binary_scores
+from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.messages import decode_gray
 from brushloop.sessions.terminal import Progress, counted, unseen
 
@@ -68,6 +69,7 @@ FOLDS, LEAST = 5, 3
 MOST_STROKES, MOST_BYTES = 200, 700_000
 """Of the training strokes that an artefact keeps: number, and size of their images in base64."""
 Masks = NDArray[np.bool_]
+Number = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
 def fit_values(
@@ -118,17 +120,17 @@ def model_of(values: Mapping[str, FittedValue]) -> DragModel:
 class Kept(Frozen):
     """Commands and ink of training strokes: a kernel ridge over them says what the lag misses.
 
-    The images have square pixels of `MM_PER_PX`, rows from the top.
+    The images have square pixels of `MM_PER_PX`, rows from the top. Files come from elsewhere: sizes are checked.
     """
 
-    commands: list[tuple[float, float, float, float, float]]
+    commands: Annotated[list[tuple[Number, Number, Number, Number, Number]], Field(max_length=MOST_STROKES)]
     """`COMMANDS` of each stroke."""
     mm_per_px: float
-    left_mm: float
+    left_mm: Number
     """Centre of the first column; the stroke starts at x = 0."""
-    top_mm: float
+    top_mm: Number
     """Centre of the first row, y upward."""
-    ink: str
+    ink: Annotated[str, Field(max_length=MOST_BYTES)]
     """All images below each other, as a PNG in base64."""
 
     @staticmethod
@@ -148,6 +150,19 @@ class Kept(Frozen):
             ink=data,
         )
 
+    @model_validator(mode="after")
+    def _readable(self) -> Self:
+        try:
+            rows = len(self._picture())
+        except (ValueError, SessionDamaged) as error:
+            raise ValueError(f"ink cannot be read ({error})") from None
+        if not self.commands or rows % len(self.commands):
+            raise ValueError(f"ink of {rows} rows, expected those of {len(self.commands)} strokes")
+        return self
+
+    def _picture(self) -> NDArray[np.uint8]:
+        return decode_gray(base64.b64decode(self.ink, validate=True), "ink")
+
     def missed_mm(self, model: DragModel, commands: Floats, x_mm: Floats, y_mm: Floats) -> Floats:
         """What `model` misses of strokes of (n, 5) commands, to be added to clipped signed distances; 0 outside.
 
@@ -155,7 +170,7 @@ class Kept(Frozen):
         """
         from scipy.interpolate import RBFInterpolator  # slow to import
 
-        known, picture = np.array(self.commands), decode_gray(base64.b64decode(self.ink), "ink")
+        known, picture = np.array(self.commands), self._picture()
         seen = (picture > 127).reshape(len(known), -1, picture.shape[1])
         own_x = np.asarray(self.left_mm + np.arange(seen.shape[2]) * MM_PER_PX, np.float64)
         own_y = np.asarray(self.top_mm - np.arange(seen.shape[1]) * MM_PER_PX, np.float64)

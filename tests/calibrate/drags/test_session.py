@@ -13,10 +13,11 @@ from typer.testing import CliRunner
 
 from brushloop.__main__ import app
 from brushloop.calibrate.artefact import current, load_artefact
-from brushloop.calibrate.drags import commanded_path, read_drags
+from brushloop.calibrate.drags import along_axis, commanded_path, defects, read_drags
 from brushloop.calibrate.drags.fit import FOLDER, LAG, PREDICTED, DragArtefact
 from brushloop.calibrate.drags.report import summary, validate_drags, write_drags
 from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.stroke import measure
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
 from tests.photographed import imported, photograph
 
@@ -104,10 +105,12 @@ def test_a_known_brush_is_adapted_to_few_strokes(session: Path, fitted: tuple[Pa
     assert "allowed 1 to 6" in str(many.exception)
 
 
-def test_an_edited_file_and_presses_are_refused_with_one_line(
+def test_an_edited_file_hostile_ink_and_presses_are_refused_with_one_line(
     session: Path, fitted: tuple[Path, str], tmp_path: Path
 ) -> None:
-    for old, new, words in (('"leash_mm"', '"leash_m"', "leash_mm"), ('"ink": "', '"ink": "a', "was edited")):
+    fit = load_artefact(fitted[0], DragArtefact)
+    assert fit.kept is not None
+    for old, new, words in (('"leash_mm"', '"leash_m"', "leash_mm"), (fit.kept.ink, "aGVsbG8=", "ink cannot be read")):
         edited = tmp_path / fitted[0].name
         edited.write_text(fitted[0].read_text().replace(old, new))
         with pytest.raises(CalibrationError, match=words):
@@ -172,3 +175,12 @@ def test_defects_are_listed_and_the_source_is_told_everywhere(flawed: Path, tmp_
         rows = {row["stroke_id"]: row for row in csv.DictReader(file)}
     assert [name for name, row in rows.items() if row["cut"] == "1"] == ["cut"]
     assert rows["whole"]["source"] == "imported simulation"
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 45.0, 90.0, -60.0])
+def test_the_length_of_a_stroke_is_along_its_own_axis(angle_deg: float) -> None:
+    box = np.rint(cv2.boxPoints(((300.0, 300.0), (400.0, 60.0), angle_deg))).astype(np.int32)
+    bar = cv2.fillPoly(np.zeros((600, 600), np.uint8), [box], 1).astype(bool)
+    size = measure(along_axis(bar))
+    assert (size.length_mm, size.width_mm) == pytest.approx((20.0, 3.0), abs=0.25)
+    assert defects(bar) == ()
