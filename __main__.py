@@ -192,10 +192,10 @@ def sim(
         rate=rate,
         arcs_port=arcs_port,
         camera_port=camera_port,
-        brush=pressed.spec,
+        brush=pressed.brush,
         brush_name=pressed.name,
-        head=pressed.head,
-        view=View(fps=fps) if pressed.noise_gray is None else View(fps=fps, noise=pressed.noise_gray),
+        head=pressed.quality,
+        view=View(fps=fps) if pressed.camera is None else View(fps=fps, noise=pressed.camera.noise),
     )
     serve(config, write_rig, idle_exit, say, control)
 

@@ -318,7 +318,7 @@ def paper_brush(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     """
     repeats = rounds_of(n, 10)
     with tempfile.TemporaryDirectory() as scratch:
-        session = press_session(Path(scratch) / "paper", load_brush(Path(PAPER)).spec, repeats * CELLS, seed)
+        session = press_session(Path(scratch) / "paper", load_brush(Path(PAPER)).brush, repeats * CELLS, seed)
         brushloop("validate", session, "--no-held-out", "--generator", SHIPPED_GENERATOR)
         rows = _table(session / "validation" / "summary.csv")
     shown = [

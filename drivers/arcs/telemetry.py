@@ -36,6 +36,7 @@ from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout,
 from brushloop.drivers.geometry import from_wire
 from brushloop.drivers.host import Clock
 
+STREAM = "robot telemetry"
 SET_RECIPE = 100
 PING = b"__ping__\0"
 GREETING_END = b"}\n\n"
@@ -48,17 +49,17 @@ def _refuse(*_: object) -> NoReturn:
     raise ValueError("a tagged value")
 
 
-def outputs_of(greeting: bytes, device: str) -> dict[str, int]:
+def outputs_of(greeting: bytes) -> dict[str, int]:
     """The names that can be subscribed to, with their ids. Raises `ProtocolViolation`."""
     try:
         hello: Any = json.loads(greeting)
     except (ValueError, RecursionError):
-        raise ProtocolViolation(device, "greeting", f"not JSON: {greeting[:40]!r}") from None
+        raise ProtocolViolation(STREAM, "greeting", f"not JSON: {greeting[:40]!r}") from None
     match hello:
         case {"protocol": "rtde", "output": dict(outputs)}:  # pyright: ignore[reportUnknownVariableType]
             return {str(name): ident for name, ident in outputs.items() if isinstance(ident, int)}  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]
         case _:
-            raise ProtocolViolation(device, "greeting", f"not a greeting of RTDE: {greeting[:40]!r}")
+            raise ProtocolViolation(STREAM, "greeting", f"not a greeting of RTDE: {greeting[:40]!r}")
 
 
 def encode_topic(chanel: int, segments: Sequence[str], frequency_hz: float) -> bytes:
@@ -78,7 +79,7 @@ def encode_sample(chanel: int, values: Sequence[object]) -> bytes:
     return encode_short(cbor2.dumps([chanel, *values]))
 
 
-def decode_message(payload: bytes, device: str) -> tuple[int, list[Any]]:
+def decode_message(payload: bytes) -> tuple[int, list[Any]]:
     """(channel or command, what follows it). Raises `ProtocolViolation`."""
     try:
         if payload.startswith(b"["):
@@ -90,15 +91,14 @@ def decode_message(payload: bytes, device: str) -> tuple[int, list[Any]]:
                 payload, semantic_decoders=no_tags, tag_hook=_refuse, max_depth=MAX_DEPTH, strict_hashable_types=True
             )
     except Exception as error:  # the decoders may raise anything
-        raise ProtocolViolation(device, "decode", f"neither CBOR nor JSON: {error}") from None
+        raise ProtocolViolation(STREAM, "decode", f"neither CBOR nor JSON: {error}") from None
     match message:
         case [int(head), *rest] if not isinstance(head, bool):
             return head, rest  # pyright: ignore[reportUnknownVariableType]
         case _:
-            raise ProtocolViolation(device, "decode", f"not an array with a channel: {payload[:20]!r}")
+            raise ProtocolViolation(STREAM, "decode", f"not an array with a channel: {payload[:20]!r}")
 
 
-STREAM = "robot telemetry"
 CHANNEL = 0
 SEGMENTS = ("R1_actual_TCP_pose", "R1_actual_q")
 SILENCE_S = 0.5
@@ -112,7 +112,7 @@ class RtdeStream:
         self.port = port
         self.offered: dict[str, int] = {}
         """Names in the greeting that can be subscribed to, with their ids."""
-        self._decoder = FrameDecoder(STREAM, skip=PING, max_bytes=MAX_MESSAGE_BYTES)
+        self._decoder = FrameDecoder(skip=PING, max_bytes=MAX_MESSAGE_BYTES)
         self._stream: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
         self._segments: Sequence[str] = ()
 
@@ -124,7 +124,7 @@ class RtdeStream:
                 greeting = await self._stream[0].readuntil(GREETING_END)
         except asyncio.LimitOverrunError:
             raise ProtocolViolation(STREAM, "connect", "a greeting without an end") from None
-        self.offered = outputs_of(greeting, STREAM)
+        self.offered = outputs_of(greeting)
         if missing := set(segments) - set(self.offered):
             raise ProtocolViolation(STREAM, "subscribe", f"the controller does not offer {sorted(missing)}")
         self._segments = segments
@@ -144,7 +144,7 @@ class RtdeStream:
                 data = await self._stream[0].read(MAX_MESSAGE_BYTES)
                 if not data:
                     raise EOFError("the controller closed the connection")
-                messages = [decode_message(payload, STREAM) for payload in self._decoder.feed(data)]
+                messages = [decode_message(payload) for payload in self._decoder.feed(data)]
                 samples += [values for head, values in messages if head == CHANNEL]
         for values in samples:
             if len(values) != len(self._segments):

@@ -36,6 +36,7 @@ from brushloop.drivers.errors import (
     WrongGeneration,
 )
 
+DEVICE = "robot"
 MAGIC = b"SOF"
 HEADERS = {0x01: struct.Struct(">4xI"), 0x00: struct.Struct(">4xH")}
 """The length behind magic and flag, by the flag."""
@@ -56,8 +57,7 @@ def encode(payload: bytes) -> bytes:
 class _Decoder(abc.ABC):
     """Turns a byte stream, split at any point, into what `_next` finds at its beginning."""
 
-    def __init__(self, device: str, max_bytes: int) -> None:
-        self._device = device
+    def __init__(self, max_bytes: int) -> None:
         self._max_bytes = max_bytes
         self._buffer = bytearray()
         self._broken: str | None = None
@@ -83,15 +83,15 @@ class _Decoder(abc.ABC):
     def _violation(self, what: str) -> ProtocolViolation:
         self._broken = what
         self._buffer.clear()
-        return ProtocolViolation(self._device, "decode", what)
+        return ProtocolViolation(DEVICE, "decode", what)
 
 
 class FrameDecoder(_Decoder):
     """Turns a byte stream, split at any point, into the payloads of SOF frames."""
 
-    def __init__(self, device: str = "arcs", *, skip: bytes = b"", max_bytes: int = MAX_PAYLOAD_BYTES) -> None:
+    def __init__(self, *, skip: bytes = b"", max_bytes: int = MAX_PAYLOAD_BYTES) -> None:
         """`skip` holds bytes that may appear between frames and are ignored."""
-        super().__init__(device, max_bytes)
+        super().__init__(max_bytes)
         self._skip = skip
 
     def _next(self) -> bytes | None:
@@ -133,8 +133,8 @@ _CLOSES = {ord("}"): ord("{"), ord("]"): ord("[")}
 class BareDecoder(_Decoder):
     """Turns a byte stream, split at any point, into JSON documents by their brackets, bounded in size and depth."""
 
-    def __init__(self, device: str = "arcs", *, max_bytes: int = MAX_DOCUMENT_BYTES) -> None:
-        super().__init__(device, max_bytes)
+    def __init__(self, *, max_bytes: int = MAX_DOCUMENT_BYTES) -> None:
+        super().__init__(max_bytes)
         self._at = 0
         self._open: list[int] = []
         self._in_string = False
@@ -220,7 +220,6 @@ def parameters(method: str) -> tuple[str, ...]:
     return PARAMETERS.get(".".join(method.split(".")[-2:]), ())
 
 
-DEVICE = "robot"
 Framing = Literal["sof", "bare"]
 AUBOPE_PORT = 8899
 """Where a cabinet of the generation before ARCS listens."""
@@ -267,7 +266,7 @@ class RpcConnection:
         self._last_id = 0
         self._lock = asyncio.Lock()
         self._stream: Stream | None = None
-        self._decoder: FrameDecoder | BareDecoder = FrameDecoder(DEVICE)
+        self._decoder: FrameDecoder | BareDecoder = FrameDecoder()
         self._lost: str | None = None
         """Why nothing more is read from the connection."""
 
@@ -288,7 +287,7 @@ class RpcConnection:
         await self.close()
         try:
             self._stream = await self._connected()
-            self._decoder = BareDecoder(DEVICE) if self._framing == "bare" else FrameDecoder(DEVICE)
+            self._decoder = BareDecoder() if self._framing == "bare" else FrameDecoder()
             if login and self._framing == "sof":
                 token = f"__login__\naubo\n{FACTORY_LOGIN_TOKEN}\n{SDK_INTERFACE_VERSION}\n"
                 await self._exchange("", "login", encode(token.encode()))

@@ -141,8 +141,6 @@ class ForceTable(BaseModel, frozen=True, extra="forbid"):
     host: str | None = None
     """Address of a CAN gateway, for the interface socketcand."""
     port: Annotated[int, Field(ge=1, le=65535)] | None = None
-    rate_hz: Annotated[float, Field(gt=0.0, le=2000.0)] = 200.0
-    """Rate set on the sensor's board, from which gaps are counted."""
     max_n: Annotated[float, Field(gt=0.0, le=1e6)] = 5.0
     """Ceiling while the brush is down: above it the arm is stopped and the press is void."""
     stale_ms: Annotated[float, Field(ge=20.0)] = 100.0

@@ -237,7 +237,7 @@ def topic_of(payload: bytes) -> tuple[int, float, list[str]]:
 
     Raises `ProtocolViolation`.
     """
-    match decode_message(payload, "rtde"):
+    match decode_message(payload):
         case (100, [{"chanel": int(chanel), "frequency": float() | int() as hz, "segments": list(names)}]):  # pyright: ignore[reportUnknownVariableType]
             return chanel, hz, [str(name) for name in cast("list[Any]", names)]
         case other:

@@ -145,11 +145,6 @@ class Fault(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
         """True if it begins without a request."""
         return self.device is Device.INK or (self.kind in STOPS and self.on is None)
 
-    @property
-    def most_strikes(self) -> int:
-        """After this many it is over, if not before."""
-        return self.count or (1 if self.for_s is None else ALWAYS)
-
     def matches(self, op: str) -> bool:
         """Whether the fault waits for `op`, a method's full name."""
         return self.on is None or op == self.on or op.endswith(f".{self.on}")
@@ -273,7 +268,7 @@ class FaultBoard:
     def _strike(self, hung: Hung) -> None:
         self.strikes += 1
         hung.struck += 1
-        if hung.struck >= hung.fault.most_strikes:
+        if hung.struck >= (hung.fault.count or (1 if hung.fault.for_s is None else ALWAYS)):
             self.take(hung.ident)
 
     def _holds(self, fault: Fault) -> bool:

@@ -47,15 +47,7 @@ from brushloop.drivers.sim.scene import Held, MjpegServer
 
 HAND_MM, BY_EYE_MM = 0.3, 1.0
 """Standard deviation of a tip that touches a thing, and of one that is brought near it by eye, along each axis."""
-SEEN_SIGMAS = 2.5
-"""Errors beyond this many standard deviations are seen and corrected by the person."""
-UPRIGHT_DEG = 1.0
-"""Standard deviation of a brush that is held upright by eye, about either axis."""
-SQUARE_DEG = 0.15
-"""The same for a brush that is held upright against a set square."""
 DIP_ABOVE_BOTTOM_MM = 2.5
-UPRIGHT_ABOVE_MM = 70.0
-SPEED_RAD_S, ACC_RAD_S2 = 0.35, 1.0
 LOOK_S = 0.005
 PUSH_N, PUSH_S = 2.0, 1.0
 PUSHES = ((0.0, 0.0, -PUSH_N), (PUSH_N, 0.0, 0.0), (0.0, PUSH_N, 0.0))
@@ -78,7 +70,6 @@ and down, in shares of the picture's width and height.
 """
 ARCS_PORT, RTDE_PORT, CAN_PORT = 30004, 30010, 29536
 CAMERA_PORTS = (8080, 8081)
-ROOM_FPS = 5.0
 MOST_ROUNDS = 3.0
 """The sensor's rounds come faster with simulated time, up to this many times: what one process can send and read."""
 THINGS = (
@@ -87,7 +78,6 @@ THINGS = (
 )
 TOUCHED = ("pin", "board-corner", "sheet-corner", "well-rim", "wash-rim")
 """Things that the tip touches; it is brought to the others by eye."""
-WALL_GRAY, WALL_NOISE = 185, 2.0
 
 
 class UnknownLab(LoopbackRig):
@@ -120,7 +110,7 @@ class UnknownLab(LoopbackRig):
         self.arcs.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
         self.arcs.cabinet.payload = [self.facts.payload_kg, [0.0] * 3, [0.0] * 3, [0.0] * 6]
         self._noise = np.random.default_rng([seed, 17])
-        room = MjpegServer(self.world, self._wall, View(fps=ROOM_FPS))
+        room = MjpegServer(self.world, self._wall, View(fps=5.0))
         self.servers[room] = CAMERA_PORTS[1 - self.facts.sheet_camera]
         self._older = LoopbackServer()
         """The software before ARCS: its port takes connections, and answers nothing that ARCS would."""
@@ -135,7 +125,7 @@ class UnknownLab(LoopbackRig):
 
     def _wall(self, _tool: Pose) -> NDArray[np.uint8]:
         """What the second camera sees: a wall, and no sheet."""
-        return self._noise.normal(WALL_GRAY, WALL_NOISE, (480, 640)).astype(np.uint8)
+        return self._noise.normal(185.0, 2.0, (480, 640)).astype(np.uint8)
 
     def labels(self) -> list[str]:
         """What a person can read in the lab now: on labels, plugs, the print and the pendant."""
@@ -231,7 +221,8 @@ class UnknownLab(LoopbackRig):
         error_mm = _error_mm(rng, HAND_MM if to in TOUCHED else BY_EYE_MM)
         x, y, z = (a + b for a, b in zip(place, error_mm, strict=True))
         aimed = held((x, y, z), wrist_deg=wrist_deg, tilt_deg=tilt_deg, toward_deg=toward_deg)
-        about_x, about_y = np.radians(rng.normal(0.0, SQUARE_DEG if to == "upright" else UPRIGHT_DEG, 2)).tolist()
+        upright_deg = 0.15 if to == "upright" else 1.0  # against a set square, or by eye
+        about_x, about_y = np.radians(rng.normal(0.0, upright_deg, 2)).tolist()
         return Pose(x, y, z, *product(of_vector((about_x, about_y, 0.0)), aimed.quaternion))
 
     def _grip(self, index: int) -> Held:
@@ -273,7 +264,7 @@ class UnknownLab(LoopbackRig):
         in_picture = facts.trap is Trap.PARK_IN_PICTURE
         return {
             "pin": facts.pin_mm,
-            "upright": over_sheet(table, UPRIGHT_ABOVE_MM),
+            "upright": over_sheet(table, 70.0),
             "well": table.to_base(x, y, DIP_ABOVE_BOTTOM_MM),
             "well-rim": table.to_base(x, y + table.well_radius_mm, table.well_depth_mm),
             "wash-pot": table.to_base(wash_x, wash_y, DIP_ABOVE_BOTTOM_MM),
@@ -325,7 +316,8 @@ class UnknownLab(LoopbackRig):
         self.world.hand_guided = True
         try:
             for joints in way:
-                self.world.motion.add_joints(joints, SPEED_RAD_S, ACC_RAD_S2, self.world.clock.now_s())
+                now_s = self.world.clock.now_s()
+                self.world.motion.add_joints(joints, speed_rad_s=0.35, acc_rad_s2=1.0, now_s=now_s)
             while self.world.target() is not None:
                 await asyncio.sleep(LOOK_S)
         finally:
@@ -334,10 +326,10 @@ class UnknownLab(LoopbackRig):
 
 
 def _error_mm(rng: np.random.Generator, spread_mm: float) -> list[float]:
-    """Normal error along each axis; drawn again while it is larger than what a person would see and correct."""
+    """Normal error along each axis; one beyond 2.5 standard deviations is seen, and corrected: it is drawn again."""
     while True:
         error_mm = rng.normal(0.0, spread_mm, 3)
-        if np.abs(error_mm).max() <= SEEN_SIGMAS * spread_mm:
+        if np.abs(error_mm).max() <= 2.5 * spread_mm:
             return error_mm.tolist()
 
 

@@ -29,11 +29,6 @@ from brushloop.drivers.sim.world import World
 TEMPLATE = Path(__file__).with_name("rig.toml.j2")
 """Of the `rig.toml`, as an operator would have taught it."""
 LOOPBACK_HEAD = "# The loopback rig"
-TAUGHT_TOUCH_ERROR_MM = 0.03
-"""Error of a taught touch height."""
-SEEN_S = 0.05
-"""Real time within which a pose is seen by polling."""
-PUMP_RESERVOIR_ML = 100.0
 PUMP_ML = 0.1
 """Delivery of the loopback pump, ml per revolution."""
 
@@ -62,8 +57,6 @@ def rig_toml(config: SimConfig, at: Addresses) -> str:
         config=config,
         table=config.table,
         at=at,
-        touch_error_mm=TAUGHT_TOUCH_ERROR_MM,
-        seen_s=SEEN_S,
         pump_ml=PUMP_ML,
         bus=LOOPBACK_CHANNEL,
     )
@@ -187,7 +180,7 @@ def _ink(world: World) -> PtyLine | None:
             return PtyLine(StationFirmware(world.well))
         case "pump":
             pumped = world.well.add
-            return PtyLine(PumpFirmware(ml_per_revolution=PUMP_ML, reservoir_ml=PUMP_RESERVOIR_ML, on_pumped=pumped))
+            return PtyLine(PumpFirmware(ml_per_revolution=PUMP_ML, reservoir_ml=100.0, on_pumped=pumped))
         case "none":
             return None
 

@@ -30,8 +30,6 @@ from brushloop.drivers.sim.faults import Device, FaultBoard
 from brushloop.drivers.sim.world import World
 
 Floats = NDArray[np.float64]
-SHADOW_SOFTNESS = 0.02
-"""Width of the shadow's edge, as a share of the image."""
 
 
 class Optics:
@@ -109,7 +107,7 @@ def _light(view: View, rng: np.random.Generator) -> NDArray[np.float32]:
     slope = 1.0 - view.shade * (0.6 * x + 0.4 * y) ** 2
     across = math.cos(angle := rng.uniform(0.0, 2.0 * math.pi)) * (x - 0.5) + math.sin(angle) * (y - 0.5)
     edge = rng.uniform(-0.1, 0.1)
-    in_shadow = 1.0 / (1.0 + np.exp(-(across - edge) / SHADOW_SOFTNESS))
+    in_shadow = 1.0 / (1.0 + np.exp(-(across - edge) / 0.02))  # its edge is soft over 2 % of the image
     return (slope * (1.0 - view.shadow * in_shadow)).astype(np.float32)
 
 
@@ -144,7 +142,6 @@ INK_REFLECTANCE = 0.06
 TOOL_GRAY = 70
 TOOL_CLEAR_MM = 60.0
 """Radius of the disc that the arm hides when it is over the sheet."""
-FAR_WIDTHS = 2.5
 NOISE_FIELDS = 4
 MARGIN_MM = 15.0
 """Width of the strip of table drawn around the board."""
@@ -173,6 +170,7 @@ class Scene:
         self._frames: dict[int, NDArray[np.uint8]] = {}
         """`_lit` with each field of noise: a moving tool only hides a part of it."""
         self._count = 0
+        self._disc_radius_px = round(TOOL_CLEAR_MM * view.px_per_mm)
         self.held: Held | None = None
         """The board that a person holds before the camera; it hides everything else."""
 
@@ -237,15 +235,11 @@ class Scene:
         blurred = cv2.GaussianBlur(self.optics.distort(np.asarray(flat, np.uint8)), (0, 0), view.blur_px)
         return blurred.astype(np.float32) * self.optics.light
 
-    @property
-    def _disc_radius_px(self) -> int:
-        return round(TOOL_CLEAR_MM * self._world.config.view.px_per_mm)
-
     def _tool_disc(self, tool: Pose) -> tuple[int, int] | None:
         """Pixel at the centre of the disc that the arm hides; None if all of it lies outside the image."""
         view = self._world.config.view
         at_mm = np.array([self._world.to_paper(tool.x_mm, tool.y_mm)])
-        if np.abs(mapped(self.optics.homography, at_mm)).max() > FAR_WIDTHS * view.width_px:
+        if np.abs(mapped(self.optics.homography, at_mm)).max() > 2.5 * view.width_px:
             return None  # so far outside, the formula of the distortion leads back into the image
         [[u, v]] = self.optics.image_of(at_mm)
         u_px, v_px = round(float(u)), round(float(v))
@@ -297,15 +291,12 @@ def _draw(
     return raster, [rng.normal(0.0, noise, shape).astype(np.float32) for _ in range(NOISE_FIELDS)]
 
 
-NOISE_LEVELS = 6
-"""Number of gray levels of a covered sensor, which is not quite black."""
-
-
 def black(jpeg: bytes) -> bytes:
     """A picture of the same size as taken with the lens cap on, other than the one before."""
     image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
     assert image is not None
-    return cv2.imencode(".jpg", np.random.default_rng().integers(0, NOISE_LEVELS, image.shape, np.uint8))[1].tobytes()
+    covered = np.random.default_rng().integers(0, 6, image.shape, np.uint8)  # not quite black
+    return cv2.imencode(".jpg", covered)[1].tobytes()
 
 
 def renumbered(jpeg: bytes, number: int) -> bytes:
@@ -324,8 +315,6 @@ SPOILED: dict[str, Callable[[bytes], bytes]] = {"black": black, "torn": torn}
 """Faults of a single picture: JPEG in, JPEG out."""
 BOUNDARY = "brushloop"
 JPEG_QUALITY = 95
-NEXT_S = 1e-6
-"""Time between two pictures that are due at once, because timers with the same time run in any order."""
 BACKLOG = 64
 """Images that a stalled stream keeps, as the buffers of a real one do."""
 
@@ -385,7 +374,7 @@ class MjpegServer(LoopbackServer):
             while held and kind != "stale":
                 jpeg = held.popleft()
                 head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
-                sent_s = max(sent_s + NEXT_S, exposed_s + delay_s)
+                sent_s = max(sent_s + 1e-6, exposed_s + delay_s)  # timers with the same time run in any order
                 loop.call_at(sent_s, _write, writer, head.encode() + jpeg + b"\r\n")
             await writer.drain()  # of earlier pictures: else a slow client would fall farther and farther behind
             due_s = max(due_s + 1.0 / self._view.fps, loop.time())

@@ -85,15 +85,6 @@ def matrix(pose: Pose) -> np.ndarray:
     return Rotation.from_quat(pose.quaternion).as_matrix()
 
 
-def by_hand(rx: float, ry: float, rz: float) -> np.ndarray:
-    """R = Rz(rz) Ry(ry) Rx(rx), written out."""
-    (cx, sx), (cy, sy), (cz, sz) = ((math.cos(a), math.sin(a)) for a in (rx, ry, rz))
-    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
-    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-    about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-    return about_z @ about_y @ about_x
-
-
 def turned_deg(a: float, b: float) -> float:
     return abs((a - b + 180.0) % 360.0 - 180.0)
 
@@ -104,7 +95,8 @@ def test_a_wire_pose_survives_us(x: float, y: float, z: float, rx: float, ry: fl
     wire = [x / 1e3, y / 1e3, z / 1e3, rx, ry, rz]
     back = to_wire(from_wire(wire))
     assert back[:3] == pytest.approx(wire[:3])
-    assert by_hand(*back[3:]) == pytest.approx(by_hand(*wire[3:]), abs=1e-9)
+    turns = [Rotation.from_euler("ZYX", angles[::-1]).as_matrix() for angles in (back[3:], wire[3:])]
+    assert turns[0] == pytest.approx(turns[1], abs=1e-9)
 
 
 @pytest.mark.parametrize("wire", [[0.0] * 5, [0.0] * 7, [], [0.0] * 5 + [math.nan], [math.inf] + [0.0] * 5])
@@ -191,13 +183,6 @@ def test_an_orientation_that_is_none_is_refused_like_a_tilt(quaternion: tuple[fl
 def test_a_tilt_at_the_limit_stays_inside_after_a_trip_over_the_wire(heading: float):
     pose = brush_pose(400.0, 0.0, 200.0, heading_deg=heading, tilt_deg=15.0)
     LIMITS.check("robot", from_wire(to_wire(pose)), speed_mm_s=100.0, acc_mm_s2=500.0)
-
-
-def test_a_tool_that_points_up_is_far_outside_the_tilt_cone():
-    up = from_wire([0.4, 0.0, 0.2, 0.0, 0.0, 0.0])
-    with pytest.raises(LimitExceeded) as caught:
-        LIMITS.check("robot", up, speed_mm_s=100.0, acc_mm_s2=500.0)
-    assert caught.value.value == pytest.approx(180.0)
 
 
 def leaning(tilt_deg: float, toward_deg: float, wrist_deg: float, z_mm: float = 200.0) -> Pose:

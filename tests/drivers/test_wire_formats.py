@@ -193,13 +193,13 @@ async def explained(said: bytes) -> object:
 
 
 async def pushed(payload: bytes) -> object:
-    head, values = decode_message(payload, "rtde")
+    head, values = decode_message(payload)
     assert (type(head), type(values)) == (int, list)
     return head, values
 
 
 async def greeted(said: bytes) -> object:
-    outputs = outputs_of(said, "rtde")
+    outputs = outputs_of(said)
     assert all(type(name) is str and isinstance(ident, int) for name, ident in outputs.items())
     return outputs
 
@@ -269,7 +269,7 @@ def test_no_tag_is_decoded():
     """A tagged regular expression of 64 KiB would take half a minute to compile, with the arm's poses waiting."""
     for payload in (*TAGGED, SHARED, b"\xc6" * 60_000):
         with pytest.raises(ProtocolViolation):
-            decode_message(payload, "rtde")
+            decode_message(payload)
 
 
 Feed = Callable[[bytes], list[bytes]]

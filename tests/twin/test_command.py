@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 import brushloop.__main__
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.heldout import HeldOut
-from brushloop.drivers.sim.brush.spec import BrushSpec, SoundHead, load_brush
+from brushloop.drivers.sim.brush.spec import BrushSpec, CameraNoise, SoundHead, load_brush
 from brushloop.twin.brush import SHAPE
 from brushloop.twin.run import PARTS, Estimate, Twin, TwinStopped, noise_of, twin_toml, workers
 from brushloop.twin.search import Solution
@@ -89,7 +89,7 @@ def test_a_twin_is_read_back_and_what_is_not_determined_has_no_interval(tmp_path
     path = tmp_path / "twin.toml"
     path.write_text(twin_toml(fitted, 'session "1"\n', 1.234))
     found = load_brush(path)
-    assert (found.spec, found.noise_gray, found.head) == (spec, 1.23, SoundHead(2.2, 4.0))
+    assert (found.brush, found.camera, found.quality) == (spec, CameraNoise(noise=1.23), SoundHead(2.2, 4.0))
     assert found.name == "simulated bristle bundle (twin of session ?1??, simulated)"
     lines = {line.split(" = ")[0]: line for line in path.read_text().splitlines()}
     assert lines["friction"].endswith("# 0.1 to 0.4; default 0.22")

@@ -78,7 +78,7 @@ def test_a_mark_has_the_area_and_the_place_of_the_press_that_it_stands_for() -> 
 
 def test_the_quality_limits_hold_for_other_presses_of_the_brush() -> None:
     grid, cells = field_grid(), [(11.0, 0.0), (20.0, 0.0), (11.0, 10.0), (20.0, 10.0)]
-    brush = Brush(load_brush(Path(PAPER)).spec)
+    brush = Brush(load_brush(Path(PAPER)).brush)
     head = sound_head(brush.spec, cells, grid)
     assert head is not None
     for depth_mm, tilt_deg in cells:

@@ -139,7 +139,6 @@ def _plain(text: str) -> str:
 
 
 MAX_BYTES = 256 * 1024
-MAX_NOISE_GRAY = 30.0
 LOOPBACK = "loopback"
 """Name of the brush whose constants are the defaults of `BrushSpec`."""
 PAPER = "paper"
@@ -148,47 +147,38 @@ PAPER_FILE = Path(__file__).with_name("paper_brush.toml")
 """The brush made to agree with the paper's Table 2 (`python -m bench paper-brush`)."""
 
 
-@dataclass(frozen=True, slots=True)
-class NamedBrush:
+class CameraNoise(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
+    """What the camera added to the photographs of a brush."""
+
+    noise: Annotated[float, Field(ge=0.0, le=30.0)]
+    """Standard deviation, in gray levels."""
+
+
+class BrushFile(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     """A brush, and the name under which it is recorded."""
 
-    spec: BrushSpec
-    name: str
-    noise_gray: float | None = None
-    """Standard deviation of the camera's noise that was measured with it; None for the rig's default."""
-    head: SoundHead | None = None
+    name: Annotated[str, Field(min_length=1, max_length=120, pattern=r'^[^\x00-\x1f\x7f"\\]+$')]
+    brush: BrushSpec
+    camera: CameraNoise | None = None
+    """As it was measured with this brush; None for the rig's default."""
+    quality: SoundHead | None = None
     """Where its sound marks begin; None for the default of `rig.toml`."""
 
 
-class _Camera(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
-    noise: Annotated[float, Field(ge=0.0, le=MAX_NOISE_GRAY)]
-
-
-class _File(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
-    name: Annotated[str, Field(min_length=1, max_length=120, pattern=r'^[^\x00-\x1f\x7f"\\]+$')]
-    brush: BrushSpec
-    camera: _Camera | None = None
-    quality: SoundHead | None = None
-
-
-def load_brush(path: Path, seed: int = BrushSpec().seed) -> NamedBrush:
+def load_brush(path: Path, seed: int = BrushSpec().seed) -> BrushFile:
     """Read the file, or take one of the shipped brushes if `path` is just `paper` or `loopback`.
 
     `seed` is that of the individual for `loopback`; any other brush has its own. Raises `SimFileError`.
     """
     if str(path) == LOOPBACK:
-        return NamedBrush(BrushSpec(seed=seed), "")
-    file = _read(PAPER_FILE if str(path) == PAPER else path)
-    return NamedBrush(file.brush, file.name, None if file.camera is None else file.camera.noise, file.quality)
-
-
-def _read(path: Path) -> _File:
+        return BrushFile(name=f"simulated bristle bundle, seed {seed}", brush=BrushSpec(seed=seed))
+    path = PAPER_FILE if str(path) == PAPER else path
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
         if len(data) > MAX_BYTES:
             raise SimFileError(path, "", f"is larger than {MAX_BYTES} bytes")
-        return _File.model_validate(tomllib.loads(data.decode("utf-8")))
+        return BrushFile.model_validate(tomllib.loads(data.decode("utf-8")))
     except FileNotFoundError:
         shipped = f"{LOOPBACK} and {PAPER} are shipped, any other is a brush.toml"
         raise SimFileError(path, "", f"no such file: {shipped}") from None

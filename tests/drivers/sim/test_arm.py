@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose, distance, from_wire
-from brushloop.drivers.sim.kinematics import HOME, LIMITS_DEG, forward, inverse, matrix_of, pose_of
+from brushloop.drivers.sim.kinematics import HOME, LIMITS_DEG, forward, inverse, pose_of
 from brushloop.drivers.sim.motion import MotionQueue
 
 joints = st.tuples(*(st.floats(-2.8, 2.8) for _ in range(6)))
@@ -37,17 +37,6 @@ def test_what_the_inverse_finds_is_right(q: tuple[float, ...], off: tuple[float,
     if solution is not None:  # near a singular position it may give up
         assert np.allclose(forward(solution), forward(q), atol=1e-6)
         assert all(abs(v) <= math.radians(limit) for v, limit in zip(solution, LIMITS_DEG, strict=True))
-
-
-def test_every_place_over_the_sheet_is_within_reach_and_some_places_are_not():
-    tool = np.eye(4)
-    tool[2, 3] = 0.18
-    places = itertools.product((200.0, 420.0, 600.0), (-260.0, 0.0, 260.0), (95.0, 240.0), (-170.0, 90.0), (0.0, 15.0))
-    for x, y, z, heading, tilt in places:
-        flange = matrix_of(brush_pose(x, y, z, heading_deg=heading, tilt_deg=tilt)) @ np.linalg.inv(tool)
-        assert inverse(flange, HOME) is not None, (x, y, z, heading)
-    for place in ((900.0, 0.0, 250.0), (0.0, 0.0, 1500.0), (20.0, 0.0, 300.0)):
-        assert inverse(matrix_of(brush_pose(*place)), HOME) is None
 
 
 V, A = 100.0, 1000.0
@@ -114,21 +103,6 @@ def test_a_turn_on_the_spot_reads_metres_as_radians(queue: MotionQueue):
     assert queue.exec_id(16.0) == -1
 
 
-@pytest.mark.parametrize("asked_s", [1.05, 5.0])
-def test_a_stop_decelerates_and_drops_the_rest_and_the_next_line_starts_there(
-    queue: MotionQueue, travelled: Stretches, asked_s: float
-):
-    queue.add(at(100.0), 50.0, 1000.0, now_s=0.0)
-    queue.add(at(200.0), 50.0, 1000.0, now_s=0.0)
-    before_mm = queue.pose(1.0).x_mm
-    queue.stop(250.0, 10.0, now_s=1.0)
-    queue.add(at(0.0), 50.0, 1000.0, now_s=asked_s)
-    rest_mm = before_mm + 50.0**2 / (2 * 250.0)
-    walk = walked(queue, 9.0, begin_s=asked_s)
-    assert [b.x_mm for _, b in travelled] == pytest.approx([rest_mm, 0.0])
-    assert speeds(walk).max() <= 50.0 + 1e-6
-
-
 def test_a_corner_is_rounded_within_its_radius_and_taken_without_a_rest(cornered: MotionQueue):
     walk = walked(cornered, 2.5)
     near_mm = np.linalg.norm(walk - CORNER.position_mm, axis=1)
@@ -163,25 +137,6 @@ def test_no_way_is_taken_faster_or_harder_than_allowed_and_all_of_them_arrive(
     assert np.linalg.norm(walk[-1, :2] - (x, y)) < 1e-3
 
 
-@settings(deadline=None, max_examples=20)
-@given(st.floats(0.0, 0.9), st.lists(st.floats(0.0, 3.0), max_size=8))
-def test_the_path_depends_neither_on_who_looks_nor_on_when_the_next_move_came(second_s: float, looks: list[float]):
-    def stretches_of(second_s: float, looks: list[float]) -> Stretches:
-        travelled: Stretches = []
-        queue = MotionQueue(START, lambda a, b: travelled.append((a, b)))
-        queue.add(CORNER, V, A, 0.0, blend_mm=5.0)
-        for t in (t for t in looks if t < second_s):
-            queue.pose(t)
-        queue.add(BEYOND, V, A, second_s)  # before the arm has to slow down for a halt
-        for t in (t for t in looks if t >= second_s):
-            queue.pose(t)
-        queue.advance(10.0)
-        return travelled
-
-    for (a, b), (c, d) in zip(stretches_of(second_s, sorted(looks)), stretches_of(0.0, []), strict=True):
-        assert max(*distance(a, c), *distance(b, d)) < 1e-6
-
-
 @pytest.mark.parametrize(("stop_s", "acc"), [(0.3, 50.0), (0.87, 50.0), (0.87, 5000.0)])
 def test_a_stop_follows_the_path_through_the_corner(cornered: MotionQueue, stop_s: float, acc: float):
     cornered.pose(stop_s)
@@ -209,24 +164,6 @@ def test_a_path_held_anywhere_goes_on_along_itself(
     assert (cornered.exec_id(20.0), cornered.size) == (-1, 0)
     for (_, a), (b, _) in itertools.pairwise(travelled):
         assert distance(a, b)[0] < 1e-6
-
-
-@pytest.mark.parametrize("blend_mm", [0.0, 20.0])
-def test_a_duration_is_the_least_that_a_move_takes_rounded_or_not(queue: MotionQueue, blend_mm: float):
-    for pose in (at(100.0), at(200.0), at(300.0)):
-        queue.add(pose, V, A, 0.0, 3.0, blend_mm=blend_mm)
-    seen = [queue.exec_id(t) for t in np.arange(0.0, 12.0, 0.01)]
-    # a corner is counted with the move that it leads into; each move takes a little longer where it halts
-    assert 3.0 <= 0.01 * seen.count(1) + 0.011 < 3.1
-    assert 9.0 <= 0.01 * (len(seen) - seen.count(-1)) + 0.031 < 9.2
-
-
-def test_a_move_in_joints_is_not_rounded(queue: MotionQueue):
-    first, second = (0.4, *HOME[1:]), (0.8, *HOME[1:])
-    queue.add_joints(first, 0.5, 2.0, 0.0)
-    queue.add_joints(second, 0.5, 2.0, 0.0)
-    queue.advance(9.0)
-    assert [rest.pose for rest in queue.rests] == [pose_of(forward(first)), pose_of(forward(second))]
 
 
 # ---------------------------------------------------------------- the cabinet
