@@ -11,7 +11,7 @@ import sys
 import threading
 from collections.abc import AsyncGenerator, Callable, Iterator
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -33,7 +33,7 @@ from brushloop.drivers.host import Clock
 from brushloop.drivers.sim.brush.footprint import Flaw
 from brushloop.drivers.sim.config import SimConfig, Table, View
 from brushloop.drivers.sim.faults import Device
-from brushloop.drivers.sim.rig import Addresses, LoopbackRig, rig_toml
+from brushloop.drivers.sim.rig import LoopbackRig, rig_toml
 from brushloop.drivers.sim.world import SimClock
 from brushloop.sessions.journal import JOURNAL_NAME, RunState, replay
 from tests.command import brushloop
@@ -235,10 +235,7 @@ class WirelessRig(LoopbackRig):
         self.world.clock = self.clock
 
     def toml(self) -> str:
-        ink_path = None if self.ink is None else "in memory"
-        force_port = None if self.force is None else PORTS["force_port"]
-        ports = PORTS["arcs_port"], PORTS["rtde_port"], PORTS["camera_port"]
-        return rig_toml(self.config, Addresses(self.address, *ports, force_port, ink_path))
+        return rig_toml(replace(self.config, **PORTS), self.address, "in memory")
 
     @contextlib.asynccontextmanager
     async def connected(self, config: RigConfig, clock: Clock, on_notice: Callable[[str], None]) -> AsyncGenerator[Rig]:

@@ -31,7 +31,7 @@ from brushloop.drivers.ink.simulator import Well
 from brushloop.drivers.sim import scene
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.faults import ALWAYS, KINDS, Device, Fault
-from brushloop.drivers.sim.rig import Addresses, LoopbackRig, rig_toml
+from brushloop.drivers.sim.rig import LoopbackRig, rig_toml
 from brushloop.model import strokes
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.raster import coverage
@@ -80,13 +80,7 @@ def test_a_protocol_kind_is_one_class() -> None:
     steps = [
         walked.step
         for walked in walk(
-            RigConfig(
-                **tomllib.loads(
-                    rig_toml(
-                        SimConfig(force_sensor=False, ink_device="none"), Addresses("127.0.0.1", 1, 2, 3, None, None)
-                    )
-                )
-            ),
+            RigConfig(**tomllib.loads(rig_toml(SimConfig(force_sensor=False, ink_device="none")))),
             stairs,
         )
     ]

@@ -17,7 +17,6 @@ import itertools
 import math
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from brushloop.drivers.arcs.controller import Controller, ReturnCode
 from brushloop.drivers.arcs.wire import DEVICE
@@ -109,44 +108,6 @@ def _not_arrived(what: str) -> MotionFailed:
         remedy="Look at the pendant for a message, and for another client that stops the arm. "
         "`brushloop collect plan --ask` tells whether a pose is out of reach.",
     )
-
-
-PLANNING_FAILED = {30047: "pose out of reach", 30048: "planning failed"}
-BRING_NEARER = "Bring the target within reach: move the sheet or turn the brush, then teach again."
-NEWEST = 20
-
-
-class Messages:
-    """The controller's messages, as far as they were not seen before."""
-
-    def __init__(self, controller: Controller) -> None:
-        self._controller = controller
-        self._seen = 0
-        """Newest timestamp of the controller seen so far; its unit is unknown, but it increases."""
-
-    async def codes(self) -> list[int]:
-        """Codes of the messages since the last call; none where the controller's answer cannot be read."""
-        try:
-            messages: Any = await self._controller.ask("Trace.peek", num=NEWEST, last_time=self._seen)
-        except DeviceError:
-            return []
-        fresh: list[tuple[int, int]] = []
-        for message in messages if isinstance(messages, list) else []:  # pyright: ignore[reportUnknownVariableType]
-            match message:
-                case {"code": int(code), "timestamp": int(stamp)} if stamp > self._seen:
-                    fresh.append((stamp, code))
-                case _:  # pyright: ignore[reportUnknownVariableType]
-                    pass
-        self._seen = max((stamp for stamp, _ in fresh), default=self._seen)
-        return [code for _, code in fresh]
-
-    async def explain(self, error: MotionFailed) -> MotionFailed:
-        """The failure that a new message reports, if the controller could not plan a path, else the error itself."""
-        for code in await self.codes():
-            if code in PLANNING_FAILED:
-                what = f"the controller reports {code} ({PLANNING_FAILED[code]})"
-                return MotionFailed(DEVICE, error.op, what, remedy=BRING_NEARER)
-        return error
 
 
 MOST_QUEUED = 16

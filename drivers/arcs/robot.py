@@ -9,7 +9,6 @@ from collections.abc import AsyncGenerator, Callable, Sequence
 from brushloop.drivers.arcs.controller import LOOPBACK_CONTROL_BOX, Controller
 from brushloop.drivers.arcs.motion import (
     Leg,
-    Messages,
     OwnPath,
     arrived,
     feed,
@@ -57,7 +56,6 @@ class AuboArcs:
         self._connected = False
         self._enabled = False
         self._telemetry = Telemetry(self._state, table, clock, on_notice)
-        self._messages = Messages(self._motion)
         self._departure: Departure | None = None
         """Of the arm since it was enabled."""
         self._motion.on_pose = self._telemetry.lag.asked
@@ -104,7 +102,6 @@ class AuboArcs:
         self._held = True  # a process that was killed may have left it so
         await self._ready()
         self._departure = Departure(self._motion, settings, await self._motion.pose())
-        await self._messages.codes()  # those that are there concern earlier motion
         await self._telemetry.read()
 
     async def modes(self) -> tuple[str, str]:
@@ -172,16 +169,10 @@ class AuboArcs:
         try:
             yield lambda: self._stops != stops
         except BaseException as error:
-            note = ""
             try:
                 await finished(self.stop())
             except DeviceError as failure:
-                note = str(failure)
-                error.add_note(note)
-            if isinstance(error, MotionFailed) and (cause := await self._messages.explain(error)) is not error:
-                if note:
-                    cause.add_note(note)
-                raise cause from error
+                error.add_note(str(failure))
             raise
         departure.left = legs[-1].target
 

@@ -60,15 +60,9 @@ class PtyLine:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close."""
-        self.close()
-
-    def close(self) -> None:
-        """Close the pty; harmless where it was never opened."""
+        """Close the pty."""
         self.unplug()
-        if self.path:
-            Path(self.path).parent.rmdir()
-            self.path = ""
+        Path(self.path).parent.rmdir()
 
     def unplug(self) -> None:
         """Pull the cable: the port is gone."""

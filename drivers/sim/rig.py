@@ -10,7 +10,7 @@ import math
 import os
 import signal
 from collections.abc import AsyncGenerator, Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self, cast
 
@@ -33,20 +33,12 @@ PUMP_ML = 0.1
 """Delivery of the loopback pump, ml per revolution."""
 
 
-@dataclass(frozen=True, slots=True)
-class Addresses:
-    """Where the devices of one rig are served."""
-
-    host: str
-    arcs_port: int
-    rtde_port: int
-    camera_port: int
-    force_port: int | None
-    ink_path: str | None
+HOST = "127.0.0.1"
+"""Not configurable: no other machine may drive or watch a simulated arm by mistake."""
 
 
-def rig_toml(config: SimConfig, at: Addresses) -> str:
-    """TOML text; addresses as served."""
+def rig_toml(config: SimConfig, host: str = HOST, ink_path: str = "/dev/ttyUSB0") -> str:
+    """TOML text for devices at these addresses; a port that the configuration leaves to the system is a real one's."""
     from jinja2 import Environment, StrictUndefined  # slow to import
 
     environment = Environment(
@@ -56,14 +48,11 @@ def rig_toml(config: SimConfig, at: Addresses) -> str:
         head=LOOPBACK_HEAD,
         config=config,
         table=config.table,
-        at=at,
+        host=host,
+        ink_path=ink_path,
         pump_ml=PUMP_ML,
         bus=LOOPBACK_CHANNEL,
     )
-
-
-HOST = "127.0.0.1"
-"""Not configurable: no other machine may drive or watch a simulated arm by mistake."""
 
 
 class LoopbackRig:
@@ -134,10 +123,11 @@ class LoopbackRig:
 
     def toml(self) -> str:
         """A `rig.toml` for this rig, as an operator would have taught it."""
-        force_port = None if self.force is None else self.force.port
-        ink_path = None if self.ink is None else self.ink.path
-        ports = self.arcs.port, self.rtde.port, self.camera.port
-        return rig_toml(self.config, Addresses(self._host, *ports, force_port, ink_path))
+        arcs, rtde, camera = self.arcs.port, self.rtde.port, self.camera.port
+        served = replace(self.config, arcs_port=arcs, rtde_port=rtde, camera_port=camera)
+        if self.force is not None:
+            served = replace(served, force_port=self.force.port)
+        return rig_toml(served, self._host, "" if self.ink is None else self.ink.path)
 
     def state(self) -> dict[str, Any]:
         """Current state of the world, as JSON."""
@@ -198,7 +188,7 @@ class ControlServer(LoopbackServer):
         super().__init__()
         self._rig = rig
 
-    async def open(self, path: Path) -> None:
+    async def listen(self, path: Path) -> None:
         """Listen at `path` for its owner alone; a socket of a rig that has ended is replaced. Raises `SimFileError`."""
         if path.exists() and not path.is_socket():
             raise SimFileError(path, "", "exists and is not a socket; it is not overwritten")
@@ -256,7 +246,7 @@ class ControlServer(LoopbackServer):
 async def live_control(rig: LoopbackRig, path: Path) -> AsyncGenerator[None]:
     """A control socket at `path` until the block ends. Raises `SimFileError`."""
     server = ControlServer(rig)
-    await server.open(path)
+    await server.listen(path)
     try:
         yield
     finally:

@@ -238,7 +238,7 @@ class Scene:
     def _tool_disc(self, tool: Pose) -> tuple[int, int] | None:
         """Pixel at the centre of the disc that the arm hides; None if all of it lies outside the image."""
         view = self._world.config.view
-        at_mm = np.array([self._world.to_paper(tool.x_mm, tool.y_mm)])
+        at_mm = np.array([self._world.config.table.to_paper(tool.x_mm, tool.y_mm)])
         if np.abs(mapped(self.optics.homography, at_mm)).max() > 2.5 * view.width_px:
             return None  # so far outside, the formula of the distortion leads back into the image
         [[u, v]] = self.optics.image_of(at_mm)

@@ -189,10 +189,6 @@ class World:
         fx, fy, fz = (x * force_n[0] + y * force_n[1] + z * force_n[2] for x, y, z in columns(unit(tip.quaternion)))
         return fx, fy, fz, -arm_m * fy, arm_m * fx, 0.0
 
-    def to_paper(self, x_mm: float, y_mm: float) -> tuple[float, float]:
-        """Convert x and y from the base frame to the paper frame."""
-        return self.config.table.to_paper(x_mm, y_mm)
-
     def _travelled(self, start: Pose, end: Pose) -> None:
         """Follow one finished straight stretch of the path: dips into the well, and a contact until the brush lifts."""
         if self.hand_guided:
@@ -266,13 +262,13 @@ class World:
 
     def on_sheet(self, pose: Pose) -> tuple[float, float, float]:
         """x and y in the paper frame of the point of the sheet nearest to the tip, and the tip's depth below it."""
-        x_mm, y_mm = self.to_paper(pose.x_mm, pose.y_mm)
+        x_mm, y_mm = self.config.table.to_paper(pose.x_mm, pose.y_mm)
         depth_mm = -self._above_mm(pose)
         nx, ny, _ = self.config.table.normal
         return x_mm + depth_mm * nx, y_mm + depth_mm * ny, depth_mm
 
     def _above_mm(self, pose: Pose) -> float:
-        return self.config.table.above_mm(*self.to_paper(pose.x_mm, pose.y_mm), pose.z_mm)
+        return self.config.table.above_mm(*self.config.table.to_paper(pose.x_mm, pose.y_mm), pose.z_mm)
 
     @property
     def _normal(self) -> tuple[float, float, float]:
@@ -287,7 +283,7 @@ class World:
 
     def _is_in_ink(self, tip: Pose) -> bool:
         surface_z_mm = self.config.table.surface_z_mm(*self.config.table.well_mm) + self.well.level_mm
-        return self.is_over_well(*self.to_paper(tip.x_mm, tip.y_mm)) and tip.z_mm < surface_z_mm
+        return self.is_over_well(*self.config.table.to_paper(tip.x_mm, tip.y_mm)) and tip.z_mm < surface_z_mm
 
     def is_over_sheet(self, x_mm: float, y_mm: float) -> bool:
         """Whether a point of the paper frame lies on the sheet."""

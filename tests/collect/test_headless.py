@@ -24,7 +24,7 @@ from brushloop.drivers.devices import Identity
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.faults import Phase
-from brushloop.drivers.sim.rig import Addresses, rig_toml
+from brushloop.drivers.sim.rig import rig_toml
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.store import SessionStore
 from tests.collect.tui.fake import FakeEngine, picture, watched
@@ -148,7 +148,7 @@ class HandClock:
 
 
 def test_the_snapshot_says_for_how_long_no_pose_has_come(tmp_path: Path) -> None:
-    (tmp_path / "rig.toml").write_text(rig_toml(SimConfig(), Addresses("127.0.0.1", 1, 1, 1, 1, None)))
+    (tmp_path / "rig.toml").write_text(rig_toml(SimConfig()))
     config, clock = load_rig(tmp_path / "rig.toml"), HandClock()
     robot = make_robot(config, clock, print)
     devices: Any = robot

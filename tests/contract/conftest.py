@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -22,7 +23,7 @@ from brushloop.drivers.geometry import distance
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.rig import HOST, Addresses, rig_toml
+from brushloop.drivers.sim.rig import HOST, rig_toml
 from brushloop.drivers.sim.world import SimClock, World
 from tests.contract.asking import ACC_MM_S2, LIFT_MM, SAME_PLACE_MM, SPEED_MM_S, Enabled, permission_refused, raised
 from tests.simulated_time import SimulatedTimeLoop
@@ -94,7 +95,7 @@ async def rig(request: pytest.FixtureRequest) -> AsyncIterator[RigConfig]:
     await pushing.start(HOST, 0)
     try:
         path = request.getfixturevalue("tmp_path") / "rig.toml"
-        path.write_text(rig_toml(config, Addresses(HOST, server.port, pushing.port, 1, None, None)), encoding="utf-8")
+        path.write_text(rig_toml(replace(config, arcs_port=server.port, rtde_port=pushing.port)), encoding="utf-8")
         loopback = load_rig(path)
         how = {"framing": framing, "rtde_port": pushing.port if rtde else None}
         yield loopback.model_copy(update={"robot": loopback.robot.model_copy(update=how)})

@@ -15,15 +15,12 @@ from typing import Any
 import cbor2
 import pytest
 
-from brushloop.drivers.arcs.controller import Controller
-from brushloop.drivers.arcs.motion import Messages
 from brushloop.drivers.arcs.telemetry import PING, RtdeStream, decode_message, encode_sample, outputs_of
 from brushloop.drivers.arcs.wire import (
     FACTORY_LOGIN_TOKEN,
     MAX_DEPTH,
     BareDecoder,
     FrameDecoder,
-    RpcConnection,
     answer_in,
     encode,
     encode_bare_request,
@@ -31,7 +28,7 @@ from brushloop.drivers.arcs.wire import (
     encode_short,
     numbers,
 )
-from brushloop.drivers.errors import DeviceError, MotionFailed, ProtocolViolation
+from brushloop.drivers.errors import DeviceError, ProtocolViolation
 from brushloop.drivers.force.sri_m8123 import Wrench, command, encode_round
 from brushloop.drivers.ink import pump, station
 from brushloop.drivers.ink.port import crc16
@@ -169,29 +166,6 @@ async def answered(payload: bytes) -> object:
     return answer_in(payload, "a", "getTcpPose")
 
 
-class Cabinet(Controller):
-    """Answers each question with its answer."""
-
-    def __init__(self, answer: Any) -> None:
-        super().__init__(RpcConnection("127.0.0.1", 1))
-        self.answer = answer
-
-    async def ask(self, method: str, **params: object) -> Any:
-        return self.answer
-
-
-async def explained(said: bytes) -> object:
-    """Whether the messages of a controller explain a failure, and then only once: old ones are about old motion."""
-    try:
-        messages = Messages(Cabinet(json.loads(said)))
-    except ValueError:
-        return None
-    failure = MotionFailed("robot", "moveLine", "rests elsewhere")
-    first = await messages.explain(failure)
-    assert await messages.explain(failure) is failure
-    return None if first is failure else first
-
-
 async def pushed(payload: bytes) -> object:
     head, values = decode_message(payload)
     assert (type(head), type(values)) == (int, list)
@@ -240,13 +214,8 @@ TAGGED = [cbor2.dumps([0, cbor2.CBORTag(tag, body)]) for tag in range(300) for b
 SHARED = b"\x82\x00\xd8\x1c\x82\x01\xd8\x1d\x00"
 """A value that holds itself."""
 GREETING = b'{"protocol":"rtde","version":1,"input":{"set_recipe":100},"output":{"R1_actual_TCP_pose":1021}}\n\n'
-SAID = [
-    b'[{"code":30047,"level":"ERROR","source":"rob1","args":["x"],"timestamp":17}]',
-    b'[{"code":1,"timestamp":2},{"code":30048,"timestamp":900000000000},{"code":"30047","timestamp":[]},7,null]',
-]
 READERS: dict[str, tuple[Read, list[bytes], int]] = {
     "a reply": (answered, REPLIES, 8000),
-    "messages of the controller": (explained, SAID, 5000),
     "a push": (pushed, PUSHES, 10_000),
     "a greeting": (greeted, [GREETING, b'{"protocol":"rtde","output":{}}\n\n'], 8000),
     "a stream of pushes": (streamed, [encode_short(PUSHES[0]) * 3, encode_short(PUSHES[4])], 2000),

@@ -33,14 +33,14 @@ from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.start import Collected, finished_session
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.rig import Addresses, rig_toml
+from brushloop.drivers.sim.rig import rig_toml
 from brushloop.sessions.journal import JOURNAL_NAME
 from tests.sessions.conftest import Make
 
 # The demo
 
 
-RIG = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))
+RIG = rig_toml(SimConfig())
 
 
 class Chain:

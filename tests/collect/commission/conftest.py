@@ -231,7 +231,7 @@ def errors(rig_path: Path, lab: UnknownLab) -> Errors:
     paper = rig.paper
     x, y = to_base(paper, *paper.touch_point_mm)
     table = lab.facts.config.table
-    paper_x, paper_y = lab.world.to_paper(x, y)
+    paper_x, paper_y = lab.world.config.table.to_paper(x, y)
     # A brush held upright with a tool that is taken for too long stands that much higher.
     true_tip_z_mm = paper.touch_z_mm + float(tcp_error @ tool[:3, 2])
     delay_s = lab.facts.config.view.delay_s + 0.5 * lab.facts.config.view.delay_jitter_s

@@ -31,7 +31,7 @@ from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.rig import Addresses, rig_toml
+from brushloop.drivers.sim.rig import rig_toml
 from brushloop.drivers.sim.world import tool_of
 from tests.collect.commission.conftest import Person, in_lab, visit_of
 
@@ -134,7 +134,7 @@ async def test_every_pose_of_the_proof_is_checked_before_the_arm_is_connected(
     def no_engine(*_: object, **__: object) -> None:
         raise AssertionError("the arm would have moved")
 
-    text = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))
+    text = rig_toml(SimConfig())
     low = re.sub(r"(?m)^z_mm = \[.*", "z_mm = [98.0, 170.0]", text, count=1)  # travel height is 180
     (tmp_path / "rig.toml").write_text(low)
     monkeypatch.setattr(proof, "Engine", no_engine)
@@ -146,7 +146,7 @@ async def test_every_pose_of_the_proof_is_checked_before_the_arm_is_connected(
 
 def test_every_move_of_the_proof_is_slower_than_50_mm_s(tmp_path: Path) -> None:
     path = tmp_path / "rig.toml"
-    path.write_text(rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0")))
+    path.write_text(rig_toml(SimConfig()))
     rig = load_rig(path)
     slow = slowly(rig)
     assert rig.motion.travel_speed_mm_s > 50.0, "otherwise faster"

@@ -23,14 +23,14 @@ from brushloop.collect.tui.start_screen import SessionBrowser
 from brushloop.collect.walk import walk
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.rig import Addresses, rig_toml
+from brushloop.drivers.sim.rig import rig_toml
 from brushloop.sessions.events import CaptureResult, Condition, Done, Press, PressResult
 from brushloop.sessions.journal import RunState
 from brushloop.sessions.records import Header, Source
 from brushloop.sessions.store import SessionStore
 from tests.collect.tui.fake import FakeEngine, picture
 
-RIG = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))
+RIG = rig_toml(SimConfig())
 GRID = 'kind = "grid"\ndepths_mm = [11.0, 20.0]\ntilts_deg = [0.0]\nrepeats = 2\n'
 WAY_OUT = (
     "Go on as it was begun: --config sessions/grid-01/rig.toml --protocol sessions/grid-01/protocol.toml, beside the "

@@ -29,7 +29,7 @@ from brushloop.collect.walk import all_poses, check_poses, check_protocol, moves
 from brushloop.drivers.devices import Identity, Pose, QueuedLine
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.rig import Addresses, rig_toml
+from brushloop.drivers.sim.rig import rig_toml
 from brushloop.sessions.events import StepResult
 from brushloop.sessions.records import Condition
 from tests.collect.sent import not_checked, not_sent, noting
@@ -37,8 +37,8 @@ from tests.rigs import Lab
 from tests.runs import answered_alike
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
-RIG = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))
-PUMP = rig_toml(SimConfig(ink_device="pump"), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))
+RIG = rig_toml(SimConfig())
+PUMP = rig_toml(SimConfig(ink_device="pump"))
 
 
 def rig(folder: Path, old: str = "", new: str = "", text: str = RIG) -> RigConfig:

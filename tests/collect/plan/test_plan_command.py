@@ -23,7 +23,7 @@ from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.rig import Addresses, rig_toml
+from brushloop.drivers.sim.rig import rig_toml
 from brushloop.drivers.sim.world import World
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
@@ -33,7 +33,7 @@ HERE = "127.0.0.1"
 @pytest.fixture
 def rig_path(tmp_path: Path) -> Path:
     path = tmp_path / "rig.toml"
-    path.write_text(rig_toml(SimConfig(), Addresses(HERE, 1, 2, 3, 4, "/dev/ttyUSB0")))
+    path.write_text(rig_toml(SimConfig()))
     return path
 
 

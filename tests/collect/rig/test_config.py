@@ -13,10 +13,10 @@ from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.check import check_rig, places_of
 from brushloop.collect.rig.config import load_rig
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.rig import Addresses, rig_toml
+from brushloop.drivers.sim.rig import rig_toml
 from tests.command import brushloop
 
-RIG = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))
+RIG = rig_toml(SimConfig())
 PROTOCOL = 'kind = "grid"\ndepths_mm = [11.0, 20.0]\ntilts_deg = [0.0, 10.0]\nrepeats = 2\n'
 
 

@@ -16,7 +16,7 @@ from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.faults import Device, Fault
-from brushloop.drivers.sim.rig import Addresses, rig_toml
+from brushloop.drivers.sim.rig import rig_toml
 from tests.command import brushloop
 from tests.drivers.arcs.transcript import Archive
 
@@ -73,7 +73,7 @@ def test_a_cabinet_that_does_not_answer_ends_with_code_4(lab: Lab) -> None:
 @pytest.fixture
 def rig(tmp_path: Path) -> Path:
     path = tmp_path / "rig.toml"
-    path.write_text(rig_toml(SimConfig(), Addresses("127.0.0.1", 9, 9, 9, 9, "/dev/serial/by-id/usb-lab-7")))
+    path.write_text(rig_toml(SimConfig(arcs_port=9, rtde_port=9), ink_path="/dev/serial/by-id/usb-lab-7"))
     return path
 
 

@@ -15,7 +15,7 @@ from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.rig.devices import sole_driver
 from brushloop.drivers import host as sole
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.rig import Addresses, rig_toml
+from brushloop.drivers.sim.rig import rig_toml
 
 HOLD = """
 import encodings.idna, os, sys, time
@@ -36,7 +36,7 @@ NOBODY = 65534
 def path(tmp_path: Path) -> Path:
     # No other test has this address; nothing connects to it.
     path = tmp_path / "rig.toml"
-    path.write_text(rig_toml(SimConfig(), Addresses("127.0.0.1", 1 + os.getpid() % 60_000, 1, 1, 1, None)))
+    path.write_text(rig_toml(SimConfig(arcs_port=1 + os.getpid() % 60_000)))
     return path
 
 

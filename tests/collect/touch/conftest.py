@@ -19,7 +19,7 @@ from brushloop.collect.touch.force import ForceTap
 from brushloop.drivers.devices import ForceSample, Frame, Identity, Pose, PoseSample, QueuedLine, Stamp
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.config import SimConfig, View
-from brushloop.drivers.sim.rig import Addresses, rig_toml
+from brushloop.drivers.sim.rig import rig_toml
 from brushloop.drivers.sim.scene import Scene
 from brushloop.drivers.sim.world import World
 from tests.rigs import SMALL_TABLE
@@ -64,7 +64,7 @@ class Bench:
         self.target = brush_pose(*self.sim.home_mm)
         self.on_sample: Callable[[ForceSample], None] | None = None
 
-        text = rig_toml(self.sim, Addresses("127.0.0.1", 1, 1, 1, 1, None))
+        text = rig_toml(self.sim)
         text = re.sub(r"touch_z_mm = .*", "touch_z_mm = 120.0", text)
         (self.folder / "rig.toml").write_text(text)
         config = load_rig(self.folder / "rig.toml")

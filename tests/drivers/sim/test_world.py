@@ -23,7 +23,7 @@ from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Flaw, Waypoint
 from brushloop.drivers.sim.brush.paper import PX_PER_MM, Footprint, Paper
 from brushloop.drivers.sim.brush.spec import PAPER, SimFileError, load_brush
 from brushloop.drivers.sim.config import SimConfig, Table
-from brushloop.drivers.sim.rig import Addresses, rig_toml
+from brushloop.drivers.sim.rig import rig_toml
 from brushloop.drivers.sim.world import INK_PER_PRESS, Press, World, bent_toward
 
 PRESSED = (
@@ -139,10 +139,9 @@ def test_the_rig_toml_of_the_paper_s_brush_says_where_its_marks_begin() -> None:
     assert max(abs(at - paper.quality.head_mm) for at in heads_mm) < paper.quality.misplaced_mm - 0.5
     assert max(abs(at - QualityConfig().head_mm) for at in heads_mm) > QualityConfig().misplaced_mm
 
-    at = Addresses("127.0.0.1", 1, 2, 3, None, None)
-    quality = tomllib.loads(rig_toml(SimConfig(brush=paper.brush, head=paper.quality), at))["quality"]
+    quality = tomllib.loads(rig_toml(SimConfig(brush=paper.brush, head=paper.quality)))["quality"]
     assert quality == {"head_mm": paper.quality.head_mm, "misplaced_mm": paper.quality.misplaced_mm}
-    assert "quality" not in tomllib.loads(rig_toml(SimConfig(), at))
+    assert "quality" not in tomllib.loads(rig_toml(SimConfig()))
 
 
 def test_the_rig_is_served_with_the_brush_and_records_its_name(tmp_path: Path) -> None:
