@@ -64,10 +64,6 @@ async def finished(work: Coroutine[Any, Any, T]) -> T:
     return result
 
 
-WAITING = 64
-"""Length of the backlog: refused processes connect to learn who holds the name, and are never served."""
-
-
 class Claimed(Exception):
     """Another process holds the name: its `pid` and `uid`, where they are known."""
 
@@ -95,7 +91,7 @@ def _named_socket(name: str) -> Generator[None]:
             if error.errno != errno.EADDRINUSE:
                 raise
             raise Claimed(*_holder(address)) from None
-        claim.listen(WAITING)
+        claim.listen(64)  # refused processes connect to learn who holds the name, and are never served
         yield
 
 
