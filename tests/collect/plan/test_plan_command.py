@@ -46,7 +46,7 @@ async def cabinet() -> AsyncIterator[ArcsServer]:
 
 
 def at(rig_path: Path, port: int) -> RigConfig:
-    rig_path.write_text(rig_path.read_text().replace("port = 1\n", f"port = {port}\n"))
+    rig_path.write_text(rig_path.read_text().replace("port = 30004\n", f"port = {port}\n"))
     return load_rig(rig_path)
 
 

@@ -133,7 +133,7 @@ async def test_a_bump_under_the_sheet_is_refused(make_bench: MakeBench) -> None:
     four = [*THREE["points_mm"], (104.0, 76.0)]
 
     def lower_over_the_bump(pose: Pose) -> Pose:
-        away_mm = math.dist(bench.world.to_paper(pose.x_mm, pose.y_mm), four[-1])
+        away_mm = math.dist(bench.world.config.table.to_paper(pose.x_mm, pose.y_mm), four[-1])
         return replace(pose, z_mm=pose.z_mm - 1.5) if away_mm < 10.0 else pose
 
     bench.bent = lower_over_the_bump
@@ -188,7 +188,7 @@ class Operator(Asker):
         if self._keys:
             return self._keys.pop(0)
         table, tip = self._bench.sim.table, self._bench.target
-        gap_mm = table.above_mm(*self._bench.world.to_paper(tip.x_mm, tip.y_mm), tip.z_mm)
+        gap_mm = table.above_mm(*self._bench.world.config.table.to_paper(tip.x_mm, tip.y_mm), tip.z_mm)
         return next((key for key, step in (("1", 1.0), ("2", 0.1), ("3", 0.02)) if gap_mm > step), "t")
 
 

@@ -109,7 +109,7 @@ def in_paper(bench: Bench, change: Any) -> Any:
     """An arm that goes to `change(x, y)` of the paper frame when (x, y) is asked for, over the sheet only."""
 
     def bent(pose: Pose) -> Pose:
-        x, y = bench.world.to_paper(pose.x_mm, pose.y_mm)
+        x, y = bench.world.config.table.to_paper(pose.x_mm, pose.y_mm)
         if not (0.0 <= x <= 110.0 and 0.0 <= y <= 80.0):
             return pose
         base_x, base_y = to_base(bench.rig.config.paper, *change(x, y))
