@@ -141,6 +141,7 @@ class Backlog:
 
 # ---------------------------------------------------------------- the driver
 
+POLL_S = 0.005
 REOPEN_AFTER_S = 0.5
 JOIN_S = 5.0
 
@@ -174,13 +175,13 @@ class OpenCvCamera:
         """
         if self._grabber is None:
             raise NotConnected(DEVICE, "fresh", "not connected")
-        return await asyncio.to_thread(self._grabber.wait_for, after.host_ns)
+        return await self._grabber.fresh(after.host_ns)
 
     async def close(self) -> None:
         """End the grabber and wait for it; a read that hangs is left to the daemon thread."""
         grabber = self._grabber
         if grabber is not None:
-            grabber.end()
+            grabber.closing.set()
             await asyncio.to_thread(grabber.thread.join, JOIN_S)
             self._grabber = None
 
@@ -201,49 +202,41 @@ class _Grabber:
         self._table = table
         self._clock = clock
         self._on_notice = on_notice
-        self._condition = threading.Condition()
         self._newest: _Arrival | None = None
         self._skipped: Counter[FrameFault] = Counter()
+        """Frames that the thread has passed over."""
         self._lost_ns: int | None = None
         """Since when a live source has been gone."""
         self._ended: DeviceError | None = None
-        self._closing = threading.Event()
+        self.closing = threading.Event()
+        """Ends the thread after its current read."""
         self.thread = threading.Thread(target=self._grab, name="camera grabber", daemon=True)
         self.settings: dict[str, float] = {}
         self.simulated = False
 
-    def end(self) -> None:
-        """Wake up whoever waits for a frame, and let the thread end after its current read."""
-        self._closing.set()
-        with self._condition:
-            self._condition.notify_all()
-
-    def wait_for(self, after_ns: int) -> Frame:
-        """The first valid frame exposed after `after_ns`; blocks. Raises `DeviceTimeout`, `ConnectionLost`."""
+    async def fresh(self, after_ns: int) -> Frame:
+        """The first valid frame exposed after `after_ns`. Raises `DeviceTimeout`, `ConnectionLost`."""
         until_s, skipped_before = time.monotonic() + self._table.timeout_s, self._skipped.copy()
-        while True:
-            arrival = self._arrived(after_ns, until_s, skipped_before)
-            image = looked_at(arrival.picture)
-            if not isinstance(image, FrameFault):
-                return Frame(arrival.stamp, arrival.exposed_after_ns, image)
-            self._skip(image)
-            after_ns = arrival.exposed_after_ns + 1
-
-    def _arrived(self, after_ns: int, until_s: float, skipped_before: Counter[FrameFault]) -> _Arrival:
-        with self._condition:
-            while (left_s := until_s - time.monotonic()) >= 0.0:
-                if self._closing.is_set():
-                    raise ConnectionLost(DEVICE, "fresh", "closed while waiting")
-                if self._newest is not None and self._newest.exposed_after_ns >= after_ns:
-                    return self._newest
-                if self._ended is not None:
-                    raise self._ended
-                self._condition.wait(left_s)
+        faulty: Counter[FrameFault] = Counter()
+        while time.monotonic() < until_s:
+            newest = self._newest
+            if self.closing.is_set():
+                raise ConnectionLost(DEVICE, "fresh", "closed while waiting")
+            if newest is not None and newest.exposed_after_ns >= after_ns:
+                image = await asyncio.to_thread(looked_at, newest.picture)
+                if not isinstance(image, FrameFault):
+                    return Frame(newest.stamp, newest.exposed_after_ns, image)
+                faulty[image] += 1
+                after_ns = newest.exposed_after_ns + 1
+            elif self._ended is not None:
+                raise self._ended
+            else:
+                await asyncio.sleep(POLL_S)
         raise DeviceTimeout(
             DEVICE,
             "fresh",
             f"no valid new frame from {self._table.source} in {self._table.timeout_s:g} s"
-            + self._why(self._skipped - skipped_before),
+            + self._why(self._skipped - skipped_before + faulty),
             remedy="Check cable, light and stream; the arm does not move meanwhile.",
         )
 
@@ -257,20 +250,16 @@ class _Grabber:
         counts = ", ".join(f"{count} {fault}" for fault, count in sorted(skipped.items()))
         return f" ({causes}frames skipped: {counts})"
 
-    def _skip(self, fault: FrameFault) -> None:
-        with self._condition:
-            self._skipped[fault] += 1
-
     def _grab(self) -> None:
         try:
-            while not self._closing.is_set():
+            while not self.closing.is_set():
                 opening_ns = self._clock.now_ns()
                 try:
                     source = open_source(self._table)
                 except ConnectionLost:
                     if self._lost_ns is None:
                         raise
-                    self._closing.wait(REOPEN_AFTER_S)
+                    self.closing.wait(REOPEN_AFTER_S)
                     continue
                 try:
                     if self._lost_ns is not None:
@@ -279,17 +268,17 @@ class _Grabber:
                     self._read_all(source, opening_ns)
                 finally:
                     source.release()
-                if self._closing.is_set():
+                if self.closing.is_set():
                     return
                 if not source.live:
                     raise ConnectionLost(DEVICE, "read", f"{self._table.source} ended")
                 self._lost_ns = self._clock.now_ns()
                 self._on_notice("camera: the stream ended and is opened again")
-                self._closing.wait(REOPEN_AFTER_S)
+                self.closing.wait(REOPEN_AFTER_S)
         except DeviceError as error:
-            self._fail(error)
+            self._ended = error
         except BaseException as error:
-            self._fail(DeviceError(DEVICE, "read", f"the grabber failed: {error!r}"))
+            self._ended = DeviceError(DEVICE, "read", f"the grabber failed: {error!r}")
             raise
 
     def _read_all(self, source: JpegStream | Capture, opening_ns: int) -> None:
@@ -297,7 +286,7 @@ class _Grabber:
         self.settings, self.simulated = source.settings, source.simulated
         latency_ns = round(self._table.latency_ms * 1e6)
         backlog, before = Backlog(latency_ns), None
-        while not self._closing.is_set():
+        while not self.closing.is_set():
             picture = source.read()
             arrival_ns = self._clock.now_ns()
             if picture is None:
@@ -308,17 +297,9 @@ class _Grabber:
             torn = source.patches and not repeated and is_patched(picture, before)
             before = picture
             if source.live and (late or repeated):
-                self._skip(FrameFault.LATE if late else FrameFault.FROZEN)
-                continue
-            if torn:
-                self._skip(FrameFault.TORN)
-                continue
-            with self._condition:
+                self._skipped[FrameFault.LATE if late else FrameFault.FROZEN] += 1
+            elif torn:
+                self._skipped[FrameFault.TORN] += 1
+            else:
                 seq = self._newest.stamp.seq + 1 if self._newest is not None else 0
                 self._newest = _Arrival(Stamp(arrival_ns, None, seq), exposed_ns, picture)
-                self._condition.notify_all()
-
-    def _fail(self, error: DeviceError) -> None:
-        with self._condition:
-            self._ended = error
-            self._condition.notify_all()

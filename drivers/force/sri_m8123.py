@@ -168,8 +168,8 @@ Round = tuple[Stamp, Wrench]
 class RoundStream:
     """Starts the sensor, reads it until `stop`, and stops it again. Use one for each connection."""
 
-    def __init__(self, table: ForceTable, clock: Clock, on_round: Callable[[Round | None], None]) -> None:
-        """`on_round` gets each round, and None once the stream has ended by itself; in the reader's thread."""
+    def __init__(self, table: ForceTable, clock: Clock, on_round: Callable[[Round], None]) -> None:
+        """`on_round` gets each round, in the reader's thread."""
         self._table = table
         self._name = f"{table.interface} {table.channel}"
         self.assembler = RoundAssembler()
@@ -277,7 +277,6 @@ class RoundStream:
 
     def _lose(self, what: str, remedy: str) -> None:
         self.loss = (what, remedy)
-        self._on_round(None)
 
 
 def command(data: bytes) -> can.Message:
@@ -305,25 +304,24 @@ class SriM8123:
         After a failure the board is stopped and nothing is left open. A bias does not survive.
         """
         await self.close()
-        loop, begun = asyncio.get_running_loop(), asyncio.Event()
+        loop = asyncio.get_running_loop()
         self.bias_wrench = NO_BIAS
 
-        def on_round(latest: Round | None) -> None:
-            if latest is None or not begun.is_set() or self._listener is not None:
+        def on_round(latest: Round) -> None:
+            if self._listener is not None:
                 with contextlib.suppress(RuntimeError):  # the loop ended before the stream was closed
                     loop.call_soon_threadsafe(deliver, latest)
 
-        def deliver(latest: Round | None) -> None:
-            begun.set()
-            if latest is not None and self._stream is stream and self._listener is not None:
+        def deliver(latest: Round) -> None:
+            if self._stream is stream and self._listener is not None:
                 self._listener(self._sample(*latest))
 
-        stream = RoundStream(self._table, self._clock, on_round)
-        self._stream = stream
+        stream = self._stream = RoundStream(self._table, self._clock, on_round)
         try:
             async with asyncio.timeout(CONNECT_S):
-                await begun.wait()
-            self._require("connect")
+                while stream.newest is None:
+                    self._require("connect")
+                    await asyncio.sleep(RECEIVE_S)
         except TimeoutError:
             await self.close()
             dropped = stream.assembler

@@ -96,7 +96,7 @@ class LoopbackRig:
             for server, port in self.servers.items():
                 await server.start(self._host, port)
             if self.force is not None:
-                await asyncio.to_thread(self.world.reaction.prepare)  # takes some tenths of a second
+                await asyncio.to_thread(self.world.reaction.push_n, 1.0, 0.0)  # the first is slow
             if self.ink is not None:
                 opening.enter_context(self.ink)
             watching = asyncio.create_task(self.faults.watch(self.arcs.cabinet.safety_stop), name="faults")

@@ -46,12 +46,8 @@ class Reaction:
     def __init__(self, spec: BrushSpec) -> None:
         self._spec = spec
 
-    def prepare(self) -> None:
-        """Solve the spines; takes some tenths of a second, so call it outside the event loop. Once is enough."""
-        _pushes(self._spec)
-
     def push_n(self, depth_mm: float, tilt_deg: float) -> float:
-        """Normal force of the paper on the bundle; 0 in the air."""
+        """Normal force of the paper on the bundle; 0 in the air. The first call takes some tenths of a second."""
         if depth_mm <= 0.0:
             return 0.0
         steps_mm, rows = _pushes(self._spec)

@@ -120,7 +120,6 @@ class Felt:
 @pytest.fixture(scope="module")
 def reaction() -> Reaction:
     made = Reaction(SimConfig().brush)
-    made.prepare()
     return made
 
 

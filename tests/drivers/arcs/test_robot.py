@@ -19,7 +19,6 @@ from brushloop.drivers.errors import (
     DeviceTimeout,
     MotionError,
     NotConnected,
-    ProtocolViolation,
     RobotNotSafe,
     RpcError,
     WrongGeneration,
@@ -105,35 +104,6 @@ def to_go_mm(cabinet: ArcsServer) -> float:
 
 def at_rest(cabinet: ArcsServer) -> bool:
     return cabinet.cabinet.motion.exec_id(cabinet.cabinet.now_s()) == -1
-
-
-ENDS: list[tuple[str, type[DeviceError], str]] = [
-    ("mute", DeviceTimeout, "no reply"),
-    ("late", DeviceTimeout, "no reply"),
-    ("wrong-id", DeviceTimeout, "no reply"),
-    ("malformed", ProtocolViolation, "reply is not JSON"),
-    ("garbage", ConnectionLost, "expected SOF"),
-    ("drop", ConnectionLost, "closed the connection"),
-]
-
-
-@pytest.mark.parametrize("on", ["moveLine", "getSafetyModeType"])
-@pytest.mark.parametrize(("kind", "error", "words"), ENDS)
-async def test_one_bad_reply_ends_the_move_with_its_name_and_the_arm_rests_on_its_way(
-    arm: AuboArcs, cabinet: ArcsServer, kind: str, error: type[DeviceError], words: str, on: str
-):
-    more = {"late_s": 1.5} if kind == "late" else {}
-    nth = 1 if on == "moveLine" else 5  # a move asks for the safety mode while it waits, and telemetry does not
-    cabinet.faults.hang(Fault.model_validate({"device": "robot", "kind": kind, "on": on, "nth": nth, **more}))
-    with pytest.raises(error, match=words) as caught:
-        await arm.move(FAR, **SLOW)
-    assert on in caught.value.op
-    assert not getattr(caught.value, "__notes__", []), "the arm was seen at rest"
-    assert at_rest(cabinet)
-    left_mm = to_go_mm(cabinet)
-    assert 50.0 < left_mm < 200.0
-    await asyncio.sleep(2.0)  # the late reply comes, and nothing comes of it
-    assert to_go_mm(cabinet) == left_mm
 
 
 @pytest.mark.parametrize("kind", ["mute", "deaf"])
