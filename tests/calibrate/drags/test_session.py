@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from pathlib import Path
 
 import cv2
@@ -19,7 +20,10 @@ from brushloop.calibrate.drags.report import summary, validate_drags, write_drag
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.stroke import measure
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
+from tests.command import brushloop
 from tests.photographed import imported, photograph
+
+DATA = Path(__file__).parents[4] / "shared" / "data"
 
 STROKES = [
     (30.0, 0.0, 4.0),
@@ -82,6 +86,7 @@ def test_another_session_is_predicted_stroke_by_stroke(session: Path, fitted: tu
     page = (out / "report.html").read_text()
     for words in ("bristle lag alone", "In sample", "No command was repeated", "captured and predicted ink"):
         assert words in page
+    assert re.findall(r'<script|(?:src|href)="(?!data:image/)', page) == [], "it fetches nothing"
     assert "in sample" in " ".join(ran.output.split())
     said = json.loads((out / "report.json").read_text())
     assert said["source"] == "imported photographs"
@@ -184,3 +189,33 @@ def test_the_length_of_a_stroke_is_along_its_own_axis(angle_deg: float) -> None:
     size = measure(along_axis(bar))
     assert (size.length_mm, size.width_mm) == pytest.approx((20.0, 3.0), abs=0.25)
     assert defects(bar) == ()
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="the folders of real photographs are not here")
+@pytest.mark.parametrize(
+    ("name", "strokes", "least"),
+    [
+        # One of these photographs is blank, and some strokes are bent.
+        ("frida_bigbrush_tilt_16x20", 31, {"length_mm": 0.95, "depth_mid_mm_nominal": 0.8}),
+        # Specks and neighbours: their bounding box follows the command with r = .12 only.
+        ("frida_ink_10x8", 24, {"length_mm": 0.9}),
+    ],
+)
+def test_real_dragged_strokes_are_all_found_and_follow_their_commands(
+    tmp_path: Path, name: str, strokes: int, least: dict[str, float]
+) -> None:
+    """Every sixth photograph of each set, by the correlation of what was commanded and measured."""
+    table = tmp_path / "strokes.csv"
+    head, *lines = (DATA / name / "strokes.csv").read_text().splitlines()
+    table.write_text("\n".join([head, *lines[::6]]) + "\n")
+    imported = brushloop("sessions", "import", DATA / name, "--csv", table, "--kind", "drag", cwd=tmp_path)
+    assert imported.returncode == 0, imported.stderr
+    ran = brushloop("validate", tmp_path / "sessions" / name, cwd=tmp_path)
+    assert ran.returncode == 0, ran.stderr
+    with (tmp_path / "sessions" / name / "validation" / "measured.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == strokes
+    for command, correlation in least.items():
+        size = {"length_mm": "measured_length_mm"}.get(command, "measured_mid_width_mm")
+        pairs = np.array([(float(row[f"commanded_{command}"]), float(row[size])) for row in rows])
+        assert np.corrcoef(pairs.T)[0, 1] > correlation
