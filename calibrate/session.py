@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import AliasPath, BaseModel, Field, ValidationError
 
-from brushloop.calibrate.artefact import Artefact, current, load_artefact
+from brushloop.calibrate.artefact import Artefact, current, load_artefact, made_by
 from brushloop.calibrate.board.lens import Lens
 from brushloop.calibrate.board.pix2len import Plane
 from brushloop.calibrate.board.spec import BoardSpec
@@ -66,6 +66,13 @@ class OpenSession:
     def calibration_digest(self) -> str:
         """Digest of the calibration; empty for an import."""
         return "" if self.calibration is None else self.calibration.digest
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """The fields of a `SessionFit` that say what it was fitted to, and by which software."""
+        header = self.header
+        origin = {"session_id": header.session_id, "source": str(header.source), "recording_sha256": self.sha256}
+        return origin | {"calibration": self.calibration_digest, "software": made_by()}
 
 
 def open_session(path: Path, kind: Kind | None = None) -> OpenSession:

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from brushloop.calibrate.artefact import FittedValue, Frozen, SessionFit, made_by
+from brushloop.calibrate.artefact import FittedValue, Frozen, SessionFit
 from brushloop.calibrate.drags import COMMANDS, MM_PER_PX, Drags, commanded_path
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.stats import farthest_first
@@ -300,11 +300,7 @@ def _coarse(drags: Drags, images: Indices) -> Drawings:
 
 def _artefact(drags: Drags, images: Indices, values: dict[str, FittedValue], **more: Any) -> DragArtefact:
     return DragArtefact(
-        session_id=drags.session.header.session_id,
-        source=drags.session.header.source,
-        recording_sha256=drags.session.sha256,
-        calibration="",
-        software=made_by(),
+        **drags.session.provenance,
         mm_per_px=MM_PER_PX,
         parameters=values,
         fitted_strokes=tuple(drags.placed[int(k)].stroke.stroke_id for k in images),

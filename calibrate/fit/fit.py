@@ -232,11 +232,7 @@ def fit_presses(request: FitRequest, progress: Progress = unseen) -> FitResult:
     press = fit_parameters(presses)
     held_out = leave_cell_out(presses, press, progress=progress, store=session.store)
     fit = BrushFit(
-        session_id=session.header.session_id,
-        source=session.header.source,
-        recording_sha256=session.sha256,
-        calibration=session.calibration_digest,
-        software=made_by(),
+        **session.provenance,
         radius_mm=presses.radius_mm,
         length_mm=presses.length_mm,
         strokes=len(presses),

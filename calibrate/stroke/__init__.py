@@ -273,7 +273,9 @@ def components(
     areas = np.asarray(stats[1:, cv2.CC_STAT_AREA], np.int64)
     candidates = np.arange(1, count)
     if anchor_px is not None:
-        near = _within(labels.astype(np.int32), anchor_px, join_mm * PX_PER_MM)
+        y, x = np.ogrid[: ink.shape[0], : ink.shape[1]]
+        away_px2 = (x + 0.5 - anchor_px[0]) ** 2 + (y + 0.5 - anchor_px[1]) ** 2
+        near = np.setdiff1d(np.asarray(labels)[away_px2 <= (join_mm * PX_PER_MM) ** 2], [0])
         near = near[areas[near - 1] >= speck_share * areas.max()]
         candidates = near if near.size else candidates
     main = int(candidates[np.argmax(areas[candidates - 1])])
@@ -289,17 +291,6 @@ def parts_near(labels: cv2.typing.MatLike, main: int, others: list[int], reach_p
         return []
     away_px = np.asarray(cv2.distanceTransform((labels != main).astype(np.uint8), cv2.DIST_L2, 5), np.float32)
     return [label for label in others if float(away_px[labels == label].min()) <= reach_px]
-
-
-def _within(labels: NDArray[np.int32], point: tuple[float, float], radius: float) -> NDArray[np.int64]:
-    height, width = labels.shape
-    reach = int(radius) + 1
-    rows = slice(max(int(point[1]) - reach, 0), min(int(point[1]) + reach + 1, height))
-    columns = slice(max(int(point[0]) - reach, 0), min(int(point[0]) + reach + 1, width))
-    ys, xs = np.ogrid[rows, columns]
-    close = (xs + 0.5 - point[0]) ** 2 + (ys + 0.5 - point[1]) ** 2 <= radius**2
-    found = np.unique(labels[rows, columns][close]).astype(np.int64)
-    return found[found > 0]
 
 
 @dataclass(frozen=True, slots=True)

@@ -110,11 +110,7 @@ def fit(request: FitFootprintRequest, progress: Progress = unseen) -> Written:
         raise CalibrationError(str(request.session), f"holds {count} usable strokes, at least {LEAST} are needed")
     footprint, csim_percent = fitted(drawings_of(strokes, ink, cell_mm[2]))
     artefact = FootprintArtefact(
-        session_id=opened.header.session_id,
-        source=str(opened.header.source),
-        recording_sha256=opened.sha256,
-        calibration=opened.calibration_digest,
-        software=made_by(),
+        **opened.provenance,
         values=dict(zip(NAMES, footprint.values, strict=True)),
         images=len(ink),
         strokes=count,

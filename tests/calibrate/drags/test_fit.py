@@ -11,6 +11,7 @@ from scipy import stats
 from brushloop.calibrate.drags import MM_PER_PX, Drag, Drags, commanded_path
 from brushloop.calibrate.drags import fit as drags
 from brushloop.calibrate.drags.fit import LAG, PREDICTED, Kept, different, fit_values, model_of, predicted
+from brushloop.calibrate.session import OpenSession
 from brushloop.calibrate.stats import fit_line
 from brushloop.calibrate.stroke import Measured
 from brushloop.model.drag import DragModel, Drawings, ink, lagging
@@ -47,7 +48,8 @@ def repeated(conditions: int, repeats: int, mm_up: list[int] | None = None, flaw
         ink = np.roll(image, round(by / MM_PER_PX), axis=0).astype(np.float32)
         strokes.append(Drag(stroke, command, Measured(1.0, 1.0, 1.0, 1.0, 1.0), False, flags, np.zeros((1, 1)), ink))
     header = Header(session_id="s", source=Source.IMPORT, software="test", protocol="")
-    return Drags(SimpleNamespace(header=header, sha256=""), strokes, [], (X_MM, Y_MM), "")
+    session = OpenSession(SimpleNamespace(header=header), "", (), None, None)
+    return Drags(session, strokes, [], (X_MM, Y_MM), "")
 
 
 def test_lag_and_width_are_found_again() -> None:
