@@ -91,7 +91,6 @@ def test_repeats_of_a_command_and_strokes_with_a_defect_are_not_fitted(monkeypat
 def test_a_brush_is_adapted_to_strokes_that_differ_most() -> None:
     commands = np.array([[20.0, 5.0, 2.0, 2.0, 0.0]] * 6 + [[40.0, -5.0, 4.0, 4.0, 0.0], [20.0, -5.0, 4.0, 4.0, 0.0]])
     assert sorted(different(commands, 3)) == [0, 6, 7]
-    assert drags.session_change(commands)["leash_per_mm"] == pytest.approx(0.5)
 
 
 def test_the_commanded_path_is_the_curve_of_its_four_control_points() -> None:
