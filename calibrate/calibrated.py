@@ -21,15 +21,7 @@ from brushloop.calibrate.board.spec import BoardView, describe, named_board
 from brushloop.calibrate.commands import CalibrateRequest, LensRequest
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written, read_gray
-from brushloop.calibrate.report import (
-    Point,
-    about,
-    framed,
-    photograph_uri,
-    round_values,
-    source_point,
-    write_page,
-)
+from brushloop.calibrate.report import Point, about, framed, photograph_uri, round_values, source_point, write_page
 from brushloop.calibrate.session import Calibration, rig_of
 from brushloop.sessions.disk import file_sha256
 from brushloop.sessions.messages import decode_gray

@@ -11,34 +11,12 @@ import pytest
 from brushloop.calibrate.commands import PracticeRequest
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.writing import Figure, FootprintArtefact, Plan, PlannedBy, as_points
-from brushloop.calibrate.writing.compare import (
-    Character,
-    WritingComparison,
-    as_ink,
-    round_of,
-    write_written,
-)
-from brushloop.calibrate.writing.learn import (
-    FIGURES,
-    MARGIN,
-    fitted,
-    learned,
-    practice,
-    practice_strokes,
-)
+from brushloop.calibrate.writing.compare import Character, WritingComparison, as_ink, round_of, write_written
+from brushloop.calibrate.writing.learn import FIGURES, MARGIN, fitted, learned, practice, practice_strokes
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.kinds import WriteConfig
 from brushloop.model.characters.glyph import swept
-from brushloop.model.characters.plan import (
-    Reach,
-    StrokePath,
-    covered,
-    drawn,
-    first_lead,
-    grid,
-    lead,
-    without_tilt,
-)
+from brushloop.model.characters.plan import Reach, StrokePath, covered, drawn, first_lead, grid, lead, without_tilt
 from brushloop.model.drag import NAMES, START, Drawings, Footprint, inked
 from brushloop.sessions.records import Header, Source
 from tests.calibrate.given import CALIBRATION
