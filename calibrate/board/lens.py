@@ -6,7 +6,6 @@ A fit says what each photograph contributes, which ones do not fit, and what els
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast
 
@@ -119,20 +118,12 @@ def homography(pixels: Floats, paper_mm: Floats, where: str) -> Floats:
     return np.asarray(found, np.float64)
 
 
-@dataclass(frozen=True, slots=True)
-class Solved:
-    """A lens, and how each board was held in front of it."""
+def solve(views: Sequence[BoardView], where: str) -> tuple[Lens, float, Floats, Floats]:
+    """Fit a lens by `cv2.calibrateCamera` (k1, k2, p1, p2, k3).
 
-    lens: Lens
-    rms_px: float
-    residuals_px: Floats
-    """(views,) root mean square of each."""
-    normals: Floats
-    """(views, 3) unit normals of the boards, toward the camera."""
-
-
-def solve(views: Sequence[BoardView], where: str) -> Solved:
-    """Fit a lens by `cv2.calibrateCamera` (k1, k2, p1, p2, k3). Raises `CalibrationError` if none fits the views."""
+    Returns the lens, the root mean square of all residuals and that of each view, (views,) px, and the (views, 3) unit
+    normals of the boards, toward the camera. Raises `CalibrationError` if no lens fits the views.
+    """
     size = views[0].size_px
     objects = [np.column_stack([view.board_mm, np.zeros(len(view.board_mm))]).astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32).reshape(-1, 1, 2) for view in views]
@@ -147,7 +138,7 @@ def solve(views: Sequence[BoardView], where: str) -> Solved:
     fx, fy, cx, cy = matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     k1, k2, p1, p2, k3 = np.ravel(distortion)[:5].tolist()
     lens = Lens(size_px=size, matrix=(fx, fy, cx, cy), distortion=(k1, k2, p1, p2, k3))
-    return Solved(lens, float(rms), np.ravel(per_view).astype(np.float64), normals)
+    return lens, float(rms), np.ravel(per_view).astype(np.float64), normals
 
 
 class LensFile(Artefact):
@@ -222,8 +213,7 @@ def fit_lens(
             out = f", dropped: {', '.join(sorted(dropped))}" if dropped else ""
             problem = f"{len(kept)} usable views of the board, at least {LEAST_VIEWS} needed{out}"
             raise CalibrationError(where, "; ".join([problem, *useless]))
-        solved = solve(kept, where)
-        residuals = solved.residuals_px
+        lens, rms_px, residuals, normals = solve(kept, where)
         worst = int(np.argmax(residuals))
         # The median of the others: one bad view of four would raise the median of all and be kept.
         others = float(np.median(np.delete(residuals, worst)))
@@ -231,20 +221,20 @@ def fit_lens(
             break
         dropped[kept[worst].name] = float(residuals[worst])
         del kept[worst]
-    ways = held(solved.normals)
+    ways = held(normals)
     fewest = min(int(ways.max()), int(held(nominal_normals(kept)).max())) + 1
     if fewest < LEAST_VIEWS:
         problem = f"{len(kept)} usable views, but the board is held in {fewest} ways, at least {LEAST_VIEWS} needed"
         raise CalibrationError(where, "; ".join([f"{problem}: slant it to other sides", *useless]))
-    slants = {v.name: float(s) for v, s in zip(kept, np.degrees(np.arccos(solved.normals[:, 2])), strict=True)}
+    slants = {v.name: float(s) for v, s in zip(kept, np.degrees(np.arccos(normals[:, 2])), strict=True)}
     warnings = [f"{view.name}: {flag}" for view in kept for flag in view.flags]
-    if solved.rms_px > RMS_LIMIT_PX:
-        exceeds = f"residual {solved.rms_px:.2f} px exceeds {RMS_LIMIT_PX:g} px"
+    if rms_px > RMS_LIMIT_PX:
+        exceeds = f"residual {rms_px:.2f} px exceeds {RMS_LIMIT_PX:g} px"
         warnings.insert(0, f"{exceeds}: is the board flat, sharp and still, and every photograph of one camera?")
     return LensFile(
-        lens=solved.lens,
+        lens=lens,
         ways=int(ways.max()) + 1,
-        rms_px=solved.rms_px,
+        rms_px=rms_px,
         residuals_px={view.name: float(r) for view, r in zip(kept, residuals, strict=True)},
         dropped=dropped,
         unusable=dict(unusable),

@@ -106,12 +106,9 @@ def test_a_session_that_was_collected_with_a_lens_needs_no_other(tmp_path: Path,
             calibrate_session(session, given)
 
 
-def test_the_quick_look_at_a_board_knows_a_lens_too(tmp_path: Path, shot: Shot, lens: Path) -> None:
+def test_the_quick_look_at_a_board_knows_a_lens_too(shot: Shot, lens: Path) -> None:
     with pytest.raises(CalibrationError, match="the lens bends straight lines: calibrate it with `brushloop camera"):
         see_board(shot.image, shot.board)
-    wrong = read_lens(rig_lens(tmp_path, 0.08))
-    with pytest.raises(CalibrationError, match="of another camera, or of another focus"):
-        see_board(shot.image, shot.board, lens=wrong)
     known = read_lens(lens)
     plane = see_board(shot.image, shot.board, lens=known)
     again = see_board(known.undistort(shot.image), shot.board)
@@ -121,7 +118,9 @@ def test_the_quick_look_at_a_board_knows_a_lens_too(tmp_path: Path, shot: Shot, 
         see_board(np.ascontiguousarray(shot.image[:, :-8]), shot.board, lens=known)
 
 
-def test_the_review_looks_through_the_lens_that_the_session_recorded(tmp_path: Path, shot: Shot, lens: Path) -> None:
+def test_the_review_looks_through_the_recorded_lens_or_says_why_it_compares_nothing(
+    tmp_path: Path, shot: Shot, lens: Path
+) -> None:
     session = collected(tmp_path / "own", shot, read_lens(lens))
     review = Review(session)
     assert review.not_compared == ""
@@ -135,10 +134,6 @@ def test_the_review_looks_through_the_lens_that_the_session_recorded(tmp_path: P
     alike = review.repeatability(Condition(13.0, 5.0))
     assert alike is not None
     assert alike[1] == 2
-
-
-def test_the_review_says_why_it_compares_nothing(tmp_path: Path, shot: Shot) -> None:
-    session = collected(tmp_path / "damaged", shot)
     (session / "rig.effective.json").write_text('{"board": 7}')
     review = Review(session)
     assert "rig.effective.json: board: Input should be" in review.not_compared
