@@ -25,12 +25,11 @@ from brushloop.calibrate.stroke import Measured
 from brushloop.calibrate.validate.page import pages_beside
 from brushloop.calibrate.writing import Figure, Plan, PlannedBy, as_points
 from brushloop.calibrate.writing.compare import Character, WritingComparison, write_written
-from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 from brushloop.sessions.records import Header, Source, Stroke
 from tests.browser import BROWSER, content_widths_px
 from tests.calibrate.given import CALIBRATION, photographed
 from tests.calibrate.records import loop_record
-from tests.photographed import imported, photograph
+from tests.photographed import imported_presses
 
 SPEC = BoardSpec(squares=(9, 7), square_mm=20.0, marker_mm=15.0, dictionary="DICT_5X5_100", origin_mm=(0.0, 0.0))
 TWIN = "simulated bristle bundle (twin of 2026-03-02-grid-01)"
@@ -60,12 +59,15 @@ def run(*arguments: object) -> str:
 def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """A page of every command but `train` (tests/model/test_train.py), by the command's name."""
     folder = tmp_path_factory.mktemp("pages")
+    (folder / "photos").mkdir()
+    cells = [(11.0, 0.0), (15.0, 0.0)]
+    presses = imported_presses(folder / "photos", folder / "presses", cells, (300, 480), (380, 150))
     session = photographed(folder / "2026-03-02-board-01", SPEC, [board()], sheet_mm=(100.0, 80.0))
     return {
         "calibrate": run("calibrate", session),
         "loop": _loop(folder),
         "write": _written(folder),
-        "fit": run("fit", _pressed(folder)),
+        "fit": run("fit", presses),
     }
 
 
@@ -114,16 +116,6 @@ def _written(folder: Path) -> str:
     plan = Plan(model="CCD-BSM", planned_by=PlannedBy(), cell_mm=60.0, software="test", figures=(figure,))
     written = WritingComparison(session, plan, [character])
     return write_written(written, folder / "written", "brushloop write").read_text(encoding="utf-8")
-
-
-def _pressed(folder: Path) -> Path:
-    """An imported session of two presses at two depths."""
-    lines = ["file,depth_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
-    for number, depth_mm in enumerate((11.0, 15.0)):
-        mark = Brush(BrushSpec()).press(depth_mm, 0.0, ink_load=1.0, press_seed=number)
-        photograph(folder / f"{number}.png", mark, (300, 480), (380, 150))
-        lines.append(f"{number}.png,{depth_mm},0.0,10.0,380.0,150.0")
-    return imported(folder, lines, folder / "presses", "press")
 
 
 def test_a_page_is_one_labelled_file_without_scripts_that_fetches_nothing(pages: dict[str, str]) -> None:
