@@ -1,8 +1,10 @@
-"""The review of a session: captures by condition, with their pictures, marks and notes."""
+"""The review of a session: captures by condition, their pictures, marks and notes, and how alike the presses are."""
 
 from __future__ import annotations
 
 import asyncio
+import itertools
+import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -24,6 +26,7 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.fit import FOLDER as FITS
 from brushloop.calibrate.fit.fit import BrushFit
 from brushloop.calibrate.session import rig_of
+from brushloop.calibrate.stats import odd_waits, waits_of
 from brushloop.collect.engine.capture import mark_of, pictures_of
 from brushloop.collect.engine.snapshot import LastCapture
 from brushloop.collect.operator import Prompt
@@ -45,6 +48,7 @@ from brushloop.collect.tui.widgets import (
     plain,
     trouble,
 )
+from brushloop.model.similarity import csim
 from brushloop.sessions.disk import check_folder
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError
 from brushloop.sessions.events import CaptureResult, Press, Remark
@@ -52,7 +56,7 @@ from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.messages import decode_gray, decode_still
 from brushloop.sessions.recording import add_remark, merged_file, remarks_of
-from brushloop.sessions.records import Quality, Stroke, Topic
+from brushloop.sessions.records import Condition, Quality, Stroke, Topic
 
 if TYPE_CHECKING:
     from brushloop.calibrate.board.lens import Lens
@@ -70,6 +74,8 @@ class ReviewCapture:
     """Whether a person marked it bad."""
     note: str = ""
     """What a person wrote about it."""
+    unlike: str = ""
+    """How its time from dip to touch differs from that of the session's other strokes; empty if it does not differ."""
 
     @property
     def press(self) -> Press:
@@ -86,7 +92,7 @@ class Review:
     """One session's folder, open or closed; reads it and writes nothing."""
 
     shown_whole: str = ""
-    """Why no photograph is rectified; empty where board and lens are known."""
+    """Why no photograph is rectified and no presses are compared; empty where board and lens are known."""
 
     def __init__(self, folder: Path) -> None:
         """Raises `SessionDamaged`, and `InputError` if the session was not collected here or holds links."""
@@ -110,10 +116,10 @@ class Review:
         """Read the journal and the remarks again."""
         state, remarks = replay(self.folder / JOURNAL_NAME), remarks_of(self.folder)
         self.open = state.is_open
-        captures: list[ReviewCapture] = []
+        odd, captures = odd_waits(waits_of(state)), list[ReviewCapture]()
         for step in state.files.values():
             if isinstance(result := step.result, CaptureResult):
-                capture = ReviewCapture(result, step.file)
+                capture = ReviewCapture(result, step.file, unlike=odd.get(result.still, ""))
                 if (remark := remarks.get(result.still)) is not None:
                     capture = replace(capture, marked_bad=remark.bad, note=remark.note)
                 captures.append(capture)
@@ -129,6 +135,22 @@ class Review:
         if still not in self._pictures:
             self._pictures[still] = self._make_pictures(capture)
         return self._pictures[still]
+
+    def repeatability(self, condition: Condition) -> str:
+        """How alike the counted presses of one condition are, in words.
+
+        CSIM is that of the validation, on the binarised 128 x 128 images in the millimetre alignment.
+        """
+        binaries = [
+            pictures.binary.astype("float32")
+            for capture in self.captures
+            if capture.press.condition == condition and capture.counts
+            if (pictures := self.pictures(capture)).binary is not None
+        ]
+        if len(binaries) < 2:
+            return "one press only"
+        alike = statistics.fmean(csim(a, b) for a, b in itertools.combinations(binaries, 2))
+        return f"mean CSIM {alike:.3f} of every pair of {len(binaries)} presses"
 
     def predicted(self, capture: ReviewCapture) -> tuple[LastCapture, str]:
         """A capture with the mark that the session's fitted brush predicts, and which fit that is.
@@ -203,6 +225,7 @@ class ReviewScreen(Screen[None]):
         self._review = review
         self._finish, self._at_work = finish, at_work
         self._capture: ReviewCapture | None = None
+        self._alike: dict[Condition, str] = {}
         self._title, self._words = Line("review-title"), Line("words")
         self._options = Rows("captures")
         self._photo, self._binary = picture_widget("review-photo"), picture_widget("review-binary")
@@ -281,6 +304,7 @@ class ReviewScreen(Screen[None]):
         except SessionError as error:
             self.notify(plain(str(error)), severity="error")
             return
+        self._alike.pop(capture.press.condition, None)
         at = self._options.highlighted or 0
         self._capture = self._review.captures[at]
         self._list(at)
@@ -296,14 +320,17 @@ class ReviewScreen(Screen[None]):
 
     @work(exclusive=True, group="look")
     async def _load(self, capture: ReviewCapture) -> None:
-        """Show its pictures, which are made off the screen's loop."""
+        """Show its pictures, then how alike the presses of its condition are; both are made off the screen's loop."""
+        condition = capture.press.condition
         try:
             pictures = await asyncio.to_thread(self._review.pictures, capture)
+            self._photo.show(pictures.photo)
+            self._binary.show(binary_picture(pictures.binary))
+            if condition not in self._alike and not self._review.shown_whole:
+                self._alike[condition] = await asyncio.to_thread(self._review.repeatability, condition)
+                self._show_words(self._capture or capture)
         except SessionError as error:
             self._words.show(trouble(error))
-            return
-        self._photo.show(pictures.photo)
-        self._binary.show(binary_picture(pictures.binary))
 
     def _show_words(self, capture: ReviewCapture) -> None:
         result, press, folder = capture.result, capture.press, self._review.folder
@@ -315,7 +342,11 @@ class ReviewScreen(Screen[None]):
             Content.assemble((press.stroke_id, "bold"), f"  {condition_text(press.condition)}", (why, "bold")),
             labelled("MCAP", f"{file}  still {result.still}"),
         ]
-        if press.dip_to_touch_s is not None:
+        if (alike := self._alike.get(press.condition)) is not None:
+            lines.append(labelled("Repeats", alike))
+        if capture.unlike:
+            lines.append(labelled("Waited", Content.styled(f"! {capture.unlike}", "bold $text-warning")))
+        elif press.dip_to_touch_s is not None:
             lines.append(labelled("Waited", f"{press.dip_to_touch_s:.1f} s from dip to touch"))
         if self._review.shown_whole:
             lines.append(labelled("Whole", plain(self._review.shown_whole)))
@@ -326,5 +357,6 @@ class ReviewScreen(Screen[None]):
 
 def _row_content(capture: ReviewCapture) -> Content:
     sign, style = ("✓", "") if capture.counts else ("!", "bold $text-warning")
-    noted = " ✎" if capture.note else ""
-    return Content.assemble((sign, style), f" {one_line(capture.press.stroke_id)}{noted}")
+    noted, waited = " ✎" if capture.note else "", " dip?" if capture.unlike else ""
+    name = f" {one_line(capture.press.stroke_id)}{noted}"
+    return Content.assemble((sign, style), name, (waited, "bold $text-warning"))
