@@ -24,6 +24,21 @@ if TYPE_CHECKING:
 
 COLOURS = {"both": (166, 166, 166), "captured only": (213, 94, 0), "predicted only": (0, 114, 178)}
 """Colours of a difference, those of `calibrate.report.overlay`."""
+PASSED = {
+    "exposure": "well lit",
+    "blurred": "sharp",
+    "cut": "in frame",
+    "glare": "no glare",
+    "neighbour": "alone",
+    "blank": "inked",
+    "dry": "wet",
+    "smeared": "clean",
+    "misplaced": "in place",
+    "faint": "dark",
+    "split": "whole",
+    "bent": "straight",
+}
+"""What a capture is that passed a check; the check itself has the name of the failure."""
 OVERLAY_PX = 384
 LINE_PX = 3
 
@@ -55,7 +70,8 @@ def checks_content(checks: Sequence[Check]) -> Content:
     lines: list[Content] = []
     for check in sorted(checks, key=lambda check: check.passed):
         sign, style = ("✓", "") if check.passed else ("!", "bold $text-warning")
-        value = f"{sign} {check.name:<10}{_number(check.score):>6}"
+        name = PASSED.get(check.name, check.name) if check.passed else check.name
+        value = f"{sign} {name:<10}{_number(check.score):>6}"
         lines.append(Content.assemble((value, style), (f"  {_limit(check)}", "dim")))
         if check.reason:
             lines.append(Content(plain(check.reason)))
