@@ -37,14 +37,6 @@ MARKS = {
 """Marker and colour of each kind of place; the sheet is drawn as an area."""
 Verdict = Literal["plausible", "contradicts", "not measured"]
 COLOURS: dict[Verdict, str] = {"plausible": "green", "contradicts": "red", "not measured": "yellow"}
-TOOL_MM = (40.0, 500.0)
-"""Lengths from flange to tip that a holder and a brush have, with or without a force sensor."""
-METRES = 1.5
-"""An offset or a square shorter than this was probably typed in metres, as the pendant shows it."""
-LOOSE_MM = 250.0
-"""Room beyond the outermost place, in mm, from which on the box no longer protects anything."""
-PARK_CLEAR_MM = 40.0
-"""Half the width of a holder and a part of the wrist, which must be out of the picture."""
 
 
 def places_of(config: RigConfig) -> dict[str, tuple[float, float, float]]:
@@ -206,7 +198,7 @@ def check_rig(config: RigConfig) -> list[Check]:
 def _tool_and_sheet(config: RigConfig) -> Iterator[Check]:
     robot, brush, camera, board, force = config.robot, config.brush, config.camera, config.board, config.force
     tool_mm = math.hypot(*robot.tcp_offset_mm)
-    yield within("tool length", tool_mm, *TOOL_MM, "mm", _metres(tool_mm) or "brushloop rig teach tip.")
+    yield within("tool length", tool_mm, 40.0, 500.0, "mm", _metres(tool_mm) or "brushloop rig teach tip.")
     yield brush_square(robot.tcp_rotation_deg)
     yield brush_shorter_than_tool(robot.tcp_offset_mm, brush.length_mm)
     yield deepest_press(brush.max_depth_mm, brush.length_mm)
@@ -236,7 +228,7 @@ def _tool_and_sheet(config: RigConfig) -> Iterator[Check]:
 def _metres(length: float) -> str:
     """What to say of a length that was probably typed in metres; empty for any other."""
     looks = f"This looks like metres: {length:g} m are {1e3 * length:.0f} mm. Type millimetres."
-    return looks if 0.0 < length < METRES else ""
+    return looks if 0.0 < length < 1.5 else ""
 
 
 def _places(config: RigConfig) -> Iterator[Check]:
@@ -258,11 +250,12 @@ def _places(config: RigConfig) -> Iterator[Check]:
         yield within(f"inside the box, {list(places)[at]}", float(margins_mm[at]), 0.0, math.inf, "mm", remedy)
     room_mm = np.maximum(lowest_mm.min(axis=0) - box_low, box_high - highest_mm.max(axis=0)).max()
     remedy = "The box should enclose what was taught and little more: brushloop rig teach limits."
-    yield within("room in the box", float(room_mm), 0.0, LOOSE_MM, "mm", remedy)
+    yield within("room in the box", float(room_mm), 0.0, 250.0, "mm", remedy)
     sides = zip(to_paper(config.paper, *motion.park_mm[:2]), board.origin_mm, size_mm(board), strict=True)
     outside_mm = math.hypot(*(max(low - at, at - low - size, 0.0) for at, low, size in sides))
+    # Half the width of a holder and a part of the wrist must be out of the picture.
     remedy = "The parked arm stands over the board, in the picture: brushloop rig teach places."
-    yield within("park beside the board", outside_mm, PARK_CLEAR_MM, math.inf, "mm", remedy)
+    yield within("park beside the board", outside_mm, 40.0, math.inf, "mm", remedy)
 
 
 def _not_measured(config: RigConfig) -> Iterator[Check]:

@@ -20,6 +20,7 @@ import time
 import zipfile
 from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -42,9 +43,6 @@ from brushloop.drivers.ink.port import InkTable
 
 T = TypeVar("T")
 CALLS = 20
-FRAMES = 5
-LISTEN_S = 0.5
-"""How long a force sensor is listened to: a hundred rounds give the rate."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,26 +82,22 @@ class Finding:
 
 async def examine(config: RigConfig, clock: Clock) -> list[Finding]:
     """One finding for each configured device, in the order in which a session connects them."""
-    camera = Finding("camera", config.camera.source)
-    findings = [await _asked(camera, _camera(camera, config, clock))]
+    camera, robot = config.camera.source, f"{config.robot.host}:{config.robot.port}"
+    answers = [(Finding("camera", camera), partial(_camera, config))]
     if (force := config.force) is not None:
         gateway = "" if force.host is None else f" at {force.host}:{force.port}"
-        sensor = Finding("force", f"{force.interface} {force.channel}{gateway}")
-        findings.append(await _asked(sensor, _force(sensor, force, clock)))
+        answers.append((Finding("force", f"{force.interface} {force.channel}{gateway}"), partial(_force, force)))
     if (ink := config.ink.device) is not None:
-        station = Finding("ink", ink.port)
-        findings.append(await _asked(station, _ink(station, ink, clock)))
-    robot = Finding("robot", f"{config.robot.host}:{config.robot.port}")
-    findings.append(await _asked(robot, _robot(robot, config, clock)))
+        answers.append((Finding("ink", ink.port), partial(_ink, ink)))
+    answers.append((Finding("robot", robot), partial(_robot, config)))
+    findings: list[Finding] = []
+    for silent, ask in answers:
+        try:
+            findings.append(await ask(silent, clock))
+        except DeviceError as error:
+            remedy = error.remedy or "Check power, cable and address."
+            findings.append(silent.trouble(f"{error.op}: {error.what}", remedy))
     return findings
-
-
-async def _asked(silent: Finding, answer: Awaitable[Finding]) -> Finding:
-    """The answer of a device, or why there is none."""
-    try:
-        return await answer
-    except DeviceError as error:
-        return silent.trouble(f"{error.op}: {error.what}", error.remedy or "Check power, cable and address.")
 
 
 @contextlib.asynccontextmanager
@@ -126,12 +120,12 @@ async def _timed(calls: int, ask: Callable[[], Awaitable[T]]) -> tuple[T, float]
             return answer, statistics.median(waits_ms)
 
 
-async def _camera(finding: Finding, config: RigConfig, clock: Clock) -> Finding:
+async def _camera(config: RigConfig, finding: Finding, clock: Clock) -> Finding:
     notices: list[str] = []
     camera = OpenCvCamera(config.camera, clock, notices.append)
     async with _connected(camera) as identity:
         await camera.fresh(Stamp(clock.now_ns()))
-        frame, latency_ms = await _timed(FRAMES, lambda: camera.fresh(Stamp(clock.now_ns())))
+        frame, latency_ms = await _timed(5, lambda: camera.fresh(Stamp(clock.now_ns())))
     try:
         plane = await asyncio.to_thread(see_board, frame.image, config.board, lens=config.camera.optics)
     except CalibrationError as error:
@@ -141,10 +135,10 @@ async def _camera(finding: Finding, config: RigConfig, clock: Clock) -> Finding:
     return finding.answered(identity, latency_ms, "; ".join([board, *notices]))
 
 
-async def _force(finding: Finding, config: ForceTable, clock: Clock) -> Finding:
+async def _force(config: ForceTable, finding: Finding, clock: Clock) -> Finding:
     sensor = SriM8123(config, clock)
     async with _connected(sensor) as identity:
-        await asyncio.sleep(LISTEN_S)
+        await asyncio.sleep(0.5)  # a hundred rounds give the rate
         age_ms = (clock.now_ns() - sensor.latest().stamp.host_ns) / 1e6
         force_n, stream = math.hypot(*sensor.latest().force_n), sensor.stream
     dropped = stream.assembler
@@ -159,7 +153,7 @@ async def _force(finding: Finding, config: ForceTable, clock: Clock) -> Finding:
     return answer
 
 
-async def _ink(finding: Finding, config: InkTable, clock: Clock) -> Finding:
+async def _ink(config: InkTable, finding: Finding, clock: Clock) -> Finding:
     device = config.device(clock)
     async with _connected(device) as identity:
         level, latency_ms = await _timed(CALLS, device.level)
@@ -168,7 +162,7 @@ async def _ink(finding: Finding, config: InkTable, clock: Clock) -> Finding:
     return finding.answered(identity, latency_ms, f"well {level:.0%} full")
 
 
-async def _robot(finding: Finding, config: RigConfig, clock: Clock) -> Finding:
+async def _robot(config: RigConfig, finding: Finding, clock: Clock) -> Finding:
     notices: list[str] = []
     robot = make_robot(config, clock, notices.append)
     async with _connected(robot) as identity:
@@ -194,7 +188,6 @@ def doctor_table(findings: list[Finding]) -> Table:
     return table
 
 
-FORMAT = 1
 ABOUT = """\
 Made by `brushloop doctor --report`. Read it before you send it: it is meant to hold no secret.
 report.json  versions, platform, what each device answered, the numbers of rig.toml
@@ -306,7 +299,7 @@ async def transcript(host: str, port: int, framing: Framing, scrubber: Scrubber)
 def write_archive(path: Path, known: dict[str, Any], files: dict[str, str]) -> None:
     """Write `report.json` with what is `known`, a README and these files. Raises OSError."""
     report = {
-        "format": FORMAT,
+        "format": 1,
         "versions": _versions(),
         "platform": {
             "system": platform.platform(),

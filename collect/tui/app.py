@@ -227,18 +227,14 @@ class OperatorApp(PlainApp):
             over = self._now.state in FINAL | {State.STOPPING}
             if over and isinstance(self.screen, AskScreen) and self.screen.own:
                 self.pop_screen()  # what it asks about is over
-            if self._now.state is State.DONE:
-                self._show_end(self._now)
+            busy = self.screen is not self._main or self._leave_when_over
+            if self._now.state is State.DONE and self._now.folder and not busy:
+                self._finish(Path(self._now.folder))
         if self._leave_when_over and self._now.state in FINAL:
             if self._now.rest_unknown:
                 self._leave_when_over = False  # the operator has to read that first
             else:
                 self._away()
-
-    def _show_end(self, now: Snapshot) -> None:
-        """Show what can be done with a finished session, unless the operator is looking at something else."""
-        if now.folder and self.screen is self._main and not self._leave_when_over:
-            self._finish(Path(now.folder))
 
     def _finish(self, folder: Path) -> None:
         """Offer the next commands of a session, one after the other."""

@@ -39,8 +39,6 @@ PASSED = {
     "bent": "straight",
 }
 """What a capture is that passed a check; the check itself has the name of the failure."""
-OVERLAY_PX = 384
-LINE_PX = 3
 
 
 def over_photograph(photo: NDArray[np.uint8], predicted: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -48,10 +46,10 @@ def over_photograph(photo: NDArray[np.uint8], predicted: NDArray[np.bool_]) -> N
     import cv2
     import numpy as np
 
-    picture = cv2.cvtColor(cv2.resize(photo, (OVERLAY_PX, OVERLAY_PX)), cv2.COLOR_GRAY2RGB)
-    mask = cv2.resize(np.asarray(predicted, np.uint8), (OVERLAY_PX, OVERLAY_PX), interpolation=cv2.INTER_LINEAR)
+    picture = cv2.cvtColor(cv2.resize(photo, (384, 384)), cv2.COLOR_GRAY2RGB)
+    mask = cv2.resize(np.asarray(predicted, np.uint8), (384, 384), interpolation=cv2.INTER_LINEAR)
     edges, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    return np.asarray(cv2.drawContours(picture, edges, -1, COLOURS["predicted only"], LINE_PX), np.uint8)
+    return np.asarray(cv2.drawContours(picture, edges, -1, COLOURS["predicted only"], thickness=3), np.uint8)
 
 
 def difference(captured: NDArray[np.bool_], predicted: NDArray[np.bool_]) -> NDArray[np.uint8]:

@@ -28,14 +28,13 @@ BITS = (0x01, 0x08, 0x02, 0x10, 0x04, 0x20, 0x40, 0x80)
 """The bit of each dot, row by row."""
 LEVELS = 32
 """Steps of red, green and blue: fewer colours make longer runs, less to send over a slow line."""
-COLOURS = LEVELS**3
 FLAT = 24
 """Sum over three colours by which the pixels of a cell may differ without being drawn as dots: noise of the camera."""
 
 
-def braille(image: NDArray[np.uint8], size: Size) -> NDArray[np.int64]:
-    """Fit a gray (h, w) or RGB (h, w, 3) picture into cells, its shape kept: (lines, columns) of
-    `(colour of the dots * COLOURS + colour of the ground) * 256 + dots`."""
+def braille(image: NDArray[np.uint8], size: Size) -> NDArray[np.uint8]:
+    """Fit a gray (h, w) or RGB (h, w, 3) picture into cells, its shape kept: (lines, columns, 7) of the dots, their
+    colour, and the colour of their ground."""
     import cv2
     import numpy as np
 
@@ -53,29 +52,22 @@ def braille(image: NDArray[np.uint8], size: Size) -> NDArray[np.int64]:
     dark_mean = (blocks * dark[..., None]).sum(2) // np.maximum(count, 1)  # nowhere drawn where there are none
     mostly_dark = count > ROWS * COLUMNS // 2
     dots = (dark ^ mostly_dark) @ np.array(BITS)
-    places = np.array((LEVELS * LEVELS, LEVELS, 1))
-    dark_number, bright_number = dark_mean * LEVELS // 256 @ places, bright_mean * LEVELS // 256 @ places
-    dark_ground = mostly_dark[..., 0]
-    ground = np.asarray(np.where(dark_ground, dark_number, bright_number), np.int64)
-    other = np.asarray(np.where(dark_ground, bright_number, dark_number), np.int64)
-    return (other * COLOURS + ground) * 256 + dots
+    pairs = np.where(mostly_dark, (bright_mean, dark_mean), (dark_mean, bright_mean))
+    dot_colour, ground = pairs * LEVELS // 256 * 255 // (LEVELS - 1)
+    return np.concatenate((dots[..., None], dot_colour, ground), axis=2).astype(np.uint8)
 
 
-def strip_of(line: NDArray[np.int64]) -> Strip:
+def strip_of(line: NDArray[np.uint8]) -> Strip:
     """One line of cells as text."""
     segments: list[Segment] = []
-    for pair, cells in groupby(line.tolist(), lambda cell: cell // 256):
-        segments.append(Segment("".join(chr(EMPTY + cell % 256) for cell in cells), _style(pair)))
+    for colours, cells in groupby(line.tolist(), lambda cell: tuple(cell[1:])):
+        segments.append(Segment("".join(chr(EMPTY + cell[0]) for cell in cells), _style(colours)))
     return Strip(segments, len(line))
 
 
 @lru_cache(maxsize=4096)
-def _style(pair: int) -> Style:
-    def rgb(number: int) -> str:
-        parts = number // (LEVELS * LEVELS), number // LEVELS % LEVELS, number % LEVELS
-        return "rgb({},{},{})".format(*(255 * part // (LEVELS - 1) for part in parts))
-
-    return Style.parse(f"{rgb(pair // COLOURS)} on {rgb(pair % COLOURS)}")
+def _style(colours: tuple[int, ...]) -> Style:
+    return Style.parse("rgb({},{},{}) on rgb({},{},{})".format(*colours))
 
 
 class CellPicture(Widget):
@@ -88,7 +80,7 @@ class CellPicture(Widget):
     def __init__(self, id: str | None = None) -> None:  # noqa: A002 - textual's name
         super().__init__(id=id)
         self._image: NDArray[np.uint8] | None = None
-        self._cells: NDArray[np.int64] | None = None
+        self._cells: NDArray[np.uint8] | None = None
         self._made_for: Size | None = None
 
     def show(self, image: NDArray[np.uint8] | None) -> None:
@@ -100,7 +92,7 @@ class CellPicture(Widget):
         if before is None or self._cells is None or before.shape != self._cells.shape:
             self.refresh()
             return
-        for y in (before != self._cells).any(axis=1).nonzero()[0].tolist():
+        for y in (before != self._cells).any(axis=(1, 2)).nonzero()[0].tolist():
             self.refresh(Region(0, y, self.size.width, 1))
 
     def render_line(self, y: int) -> Strip:

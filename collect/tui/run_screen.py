@@ -366,7 +366,7 @@ def _live_rows(now: Snapshot) -> list[tuple[str, Content | str]]:
 
 def scale_n(values_n: Sequence[float]) -> float:
     """The force that a full block stands for."""
-    return max(LEAST_SCALE_N, *values_n) if values_n else LEAST_SCALE_N
+    return max((LEAST_SCALE_N, *values_n))
 
 
 def spark(values_n: Sequence[float]) -> str:

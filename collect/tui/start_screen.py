@@ -236,17 +236,14 @@ def first_steps_content(browser: SessionBrowser) -> Content:
 No session yet. First steps:
 
 {rig} 1  The rig: {plain(str(browser.config))}
-An arm: `brushloop rig new` writes it, step by step.
-No arm: `brushloop sim --write-rig rig.toml --rate 20`, in another terminal.
+`brushloop rig new` writes it step by step, `brushloop sim --write-rig rig.toml --rate 20` without an arm.
 
 {protocol} 2  What to press: {plain(str(browser.protocol))}
 Copy examples/protocol-quick.toml, or press e and type another path.
 
 · 3  Health: d asks every device; nothing is powered.
 
-· 4  The first session: n
-It asks for a blank sheet; the set-up looks through the camera, finds the paper, and asks you about each measurement.
-Then the strokes follow.""")
+· 4  The first session: n. It asks for a blank sheet and about each measurement; then the strokes follow.""")
 
 
 def _row_content(row: Summary) -> Content:

@@ -175,7 +175,6 @@ TOUCHED = Prompt(
 )
 PAUSED = picture(state=State.PAUSED, step="paused", tip_mm=None)
 FAILED = picture(state=State.FAILED, error=ERROR, messages=("capture 13: blob 212 mm2, sharp", f"warning: {ERROR}"))
-DONE = picture(state=State.DONE, step="merge and verify", strokes_done=30, grid=grid_of(30), eta_s=0.0)
 
 
 class FakeEngine:

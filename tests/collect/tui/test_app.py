@@ -224,17 +224,6 @@ def test_a_screen_that_breaks_stops_the_arm(
     assert "ZeroDivisionError" in capsys.readouterr().err
 
 
-def test_a_screen_that_cannot_begin_stops_the_arm(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(_app: OperatorApp) -> None:
-        raise OSError("no terminal")
-
-    monkeypatch.setattr(OperatorApp, "run", refuse)
-    engine = FakeEngine(picture())
-    with pytest.raises(OSError, match="no terminal"):
-        run_app(app_of(engine))
-    assert engine.calls == ["start", "stop", "join"]
-
-
 def test_a_lost_terminal_hurts_nobody_and_does_not_start_the_driver_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     class Gone(io.StringIO):
         def write(self, _text: str) -> int:
