@@ -64,6 +64,10 @@ async def finished(work: Coroutine[Any, Any, T]) -> T:
     return result
 
 
+WAITING = 64
+"""Length of the backlog: refused processes connect to learn who holds the name, and are never served."""
+
+
 class Claimed(Exception):
     """Another process holds the name: its `pid` and `uid`, where they are known."""
 
@@ -91,7 +95,7 @@ def _named_socket(name: str) -> Generator[None]:
             if error.errno != errno.EADDRINUSE:
                 raise
             raise Claimed(*_holder(address)) from None
-        claim.listen(64)  # refused processes connect to learn who holds the name, and are never served
+        claim.listen(WAITING)
         yield
 
 

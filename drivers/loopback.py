@@ -25,6 +25,7 @@ from brushloop.drivers.errors import ProtocolViolation
 
 START_S = 120.0
 """Longest start; a busy machine may need most of it."""
+POLL_S = 0.05
 RATE = 30.0
 
 
@@ -70,7 +71,7 @@ def start(config: Path, log: Path, *options: str, detached: bool = False) -> Loo
         if process.poll() is not None or time.monotonic() > deadline:
             rig.end()
             raise RigDidNotStart(f"the loopback rig did not start; {log} says: {log.read_text(errors='replace')}")
-        time.sleep(0.05)
+        time.sleep(POLL_S)
     return rig
 
 
@@ -96,6 +97,11 @@ def simulate(
             rig.end()
 
 
+TIMEOUT_S = 5.0
+GUIDING_S = 120.0
+"""Longest wait for an act of the person in the lab."""
+
+
 class FaultRefused(Exception):
     """No rig listens, or the rig refused the request."""
 
@@ -106,7 +112,7 @@ def ask(path: Path, request: Mapping[str, object]) -> dict[str, Any]:
     """Send a request; return the rig's answer. Raises `FaultRefused`, with one line, if it is missing or a refusal."""
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
-            client.settimeout(120.0 if request["do"] == "hand" else 5.0)  # a person takes longer
+            client.settimeout(GUIDING_S if request["do"] == "hand" else TIMEOUT_S)
             client.connect(str(path))
             client.sendall(json.dumps(request).encode() + b"\n")
             answer: Any = json.loads(client.makefile("rb").readline())

@@ -48,6 +48,7 @@ SAMPLE_STEP = 7
 BLACK_BELOW = 25
 LIGHT_SHARE = 0.005
 """A frame in which fewer of the sampled pixels than this are lighter than `BLACK_BELOW` is black."""
+SATURATED_SHARE = 0.5
 TORN_BAND_SHARE = 0.02
 """Share of the rows, at the bottom, that are uniform if the decoder ran out of data."""
 BURST_SHARE = 0.5
@@ -86,7 +87,7 @@ def looked_at(picture: Picture) -> NDArray[np.uint8] | FrameFault:
     sample = image[::SAMPLE_STEP, ::SAMPLE_STEP]
     if np.count_nonzero(sample >= BLACK_BELOW) < LIGHT_SHARE * sample.size:
         return FrameFault.BLACK
-    if float(np.mean(sample >= 255)) > 0.5:
+    if float(np.mean(sample >= 255)) > SATURATED_SHARE:
         return FrameFault.SATURATED
     band = image[-max(8, round(TORN_BAND_SHARE * image.shape[0])) :]
     if int(band.max()) - int(band.min()) <= 1 and int(band.min()) < 254:  # clipped white is light, not loss
@@ -218,7 +219,7 @@ class _Grabber:
         """The first valid frame exposed after `after_ns`. Raises `DeviceTimeout`, `ConnectionLost`."""
         until_s, skipped_before = time.monotonic() + self._table.timeout_s, self._skipped.copy()
         faulty: Counter[FrameFault] = Counter()
-        while time.monotonic() < until_s:
+        while True:
             newest = self._newest
             if self.closing.is_set():
                 raise ConnectionLost(DEVICE, "fresh", "closed while waiting")
@@ -230,15 +231,15 @@ class _Grabber:
                 after_ns = newest.exposed_after_ns + 1
             elif self._ended is not None:
                 raise self._ended
-            else:
-                await asyncio.sleep(POLL_S)
-        raise DeviceTimeout(
-            DEVICE,
-            "fresh",
-            f"no valid new frame from {self._table.source} in {self._table.timeout_s:g} s"
-            + self._why(self._skipped - skipped_before + faulty),
-            remedy="Check cable, light and stream; the arm does not move meanwhile.",
-        )
+            if time.monotonic() >= until_s:
+                raise DeviceTimeout(
+                    DEVICE,
+                    "fresh",
+                    f"no valid new frame from {self._table.source} in {self._table.timeout_s:g} s"
+                    + self._why(self._skipped.copy() - skipped_before + faulty),
+                    remedy="Check cable, light and stream; the arm does not move meanwhile.",
+                )
+            await asyncio.sleep(POLL_S)
 
     def _why(self, skipped: Counter[FrameFault]) -> str:
         """Why no valid frame came, in brackets; empty if that is not known."""

@@ -119,14 +119,17 @@ class SocketcandServer(LoopbackServer):
                         writer.write(b"< ok >")
                         self._listeners.add(writer)
                     case ["send", can_id, length, *data]:
-                        self.board.obey(_frame(can_id, length, data))
-                        if self._streaming is None or self._streaming.done():
-                            self._streaming = asyncio.create_task(self._stream(), name="force rounds")
+                        await self._sent(_frame(can_id, length, data))
                     case _:
                         writer.write(b"< error unknown command >")
                 await writer.drain()
         finally:
             self._listeners.discard(writer)
+
+    async def _sent(self, frame: CanFrame) -> None:
+        self.board.obey(frame)
+        if self._streaming is None or self._streaming.done():
+            self._streaming = asyncio.create_task(self._stream(), name="force rounds")
 
     async def _stream(self) -> None:
         loop = asyncio.get_running_loop()

@@ -21,6 +21,9 @@ from brushloop.drivers.sim.faults import KINDS, LOST, STOPS, Device, Fault, Faul
 from brushloop.drivers.sim.motion import Rest
 from brushloop.drivers.sim.world import World
 
+PIECE_S = 0.001
+CUTS = (2, 4, 3)
+"""Lengths of the first pieces of a split frame: it is cut in the magic bytes, in the length, and after the head."""
 GARBAGE = b"\x00\xffnothing that anyone speaks\r\n"
 
 
@@ -39,12 +42,12 @@ async def send(
             asyncio.get_running_loop().call_later(fault.late_s, _write, writer, whole)
             return
         case "split":
-            for cut in (2, 4, 3, len(whole) // 2):  # in the magic bytes, in the length, after the head
+            for cut in (*CUTS, len(whole) // 2):
                 if cut < len(whole):
                     writer.write(whole[:cut])
                     whole = whole[cut:]
                     await writer.drain()
-                    await asyncio.sleep(0.001)
+                    await asyncio.sleep(PIECE_S)
         case "duplicate":
             whole *= 2
         case "wrong-id":
@@ -150,6 +153,7 @@ OUTPUTS = {
     "R1_actual_TCP_pose": 1021,
 }
 """Identifier of each output that a client may subscribe to."""
+MAX_HZ = 500.0
 BACKLOG_BYTES = 32 * 1024
 """A client that does not read is sent nothing more until it has caught up."""
 
@@ -179,7 +183,7 @@ class RtdeServer(LoopbackServer):
                     if (old := pushes.pop(chanel, None)) is not None:
                         old.cancel()
                     if hz > 0.0 and names and OUTPUTS.keys() >= set(names):
-                        push = self._push(chanel, 1.0 / min(hz, 500.0), names, writer)
+                        push = self._push(chanel, 1.0 / min(hz, MAX_HZ), names, writer)
                         pushes[chanel] = asyncio.create_task(push, name="rtde push")
         finally:
             for task in pushes.values():
@@ -188,19 +192,21 @@ class RtdeServer(LoopbackServer):
 
     async def _push(self, chanel: int, period_s: float, names: list[str], writer: asyncio.StreamWriter) -> None:
         loop = asyncio.get_running_loop()
-        due, before_s, world = loop.time(), self._cabinet.now_s(), self._cabinet.world
+        due, before_s = loop.time(), self._cabinet.now_s()
         while not writer.is_closing():
             now_s = self._cabinet.now_s()
             if writer.transport.get_write_buffer_size() < BACKLOG_BYTES:
-                world.motion.advance(now_s)
-                rests: list[Rest | None] = [None]
-                if world.clock.rate > 1.0:  # a whole press might pass between two pushes
-                    rests = [*(rest for rest in world.motion.rests if before_s < rest.at_s <= now_s), None]
-                for rest in rests:
+                for rest in (*self._rests(before_s, now_s), None):
                     self._push_once(chanel, [self._value(name, rest) for name in names], writer)
             before_s = now_s
             due = max(due + period_s, loop.time())
             await asyncio.sleep(due - loop.time())
+
+    def _rests(self, after_s: float, until_s: float) -> list[Rest]:
+        """Rests of the arm between two pushes. With fast simulated time a whole press might pass between them."""
+        world = self._cabinet.world
+        world.motion.advance(until_s)
+        return [rest for rest in world.motion.rests if after_s < rest.at_s <= until_s] if world.clock.rate > 1.0 else []
 
     def _value(self, name: str, rest: Rest | None) -> Any:
         """An output as it is now, or as it was when the arm came to rest."""

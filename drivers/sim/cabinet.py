@@ -19,9 +19,11 @@ from brushloop.drivers.geometry import from_wire, to_wire
 from brushloop.drivers.sim.kinematics import LIMITS_DEG, Joints, forward, inverse, inverted, matrix_of, pose_of
 from brushloop.drivers.sim.world import World
 
+BOOT_S = 0.7
 POWER_ON_S = 1.0
 """Time from `poweron` to Idle."""
 BRAKE_RELEASE_S = 1.0
+POWER_OFF_S = 0.3
 
 EMERGENCY_STOPS = frozenset({SafetyMode.SYSTEM_EMERGENCY_STOP, SafetyMode.ROBOT_EMERGENCY_STOP})
 
@@ -58,7 +60,7 @@ class Power:
         if self.safety in EMERGENCY_STOPS:
             return ReturnCode.BAD_STATE
         if self.mode == RobotMode.POWER_OFF:
-            self.then((0.0, RobotMode.BOOTING), (0.7, RobotMode.POWER_ON), (POWER_ON_S, RobotMode.IDLE))
+            self.then((0.0, RobotMode.BOOTING), (BOOT_S, RobotMode.POWER_ON), (POWER_ON_S, RobotMode.IDLE))
         return ReturnCode.OK
 
     def start_up(self) -> int:
@@ -77,10 +79,12 @@ class Power:
 
 
 ROBOT = "rob1"
+IK_NO_CONVERGE = -23
 HARD_STOP_M_S2 = 10.0
 SOFT_STOP_M_S2 = 2.0
 POSE_OUT_OF_REACH = 30047
 BLEND_M = (0.001, 1.0)
+MOST_MOVES = 64
 
 Params = dict[str, Any]
 
@@ -129,7 +133,7 @@ class Cabinet:
         """Stop the arm, engage the brakes, then switch its power off."""
         self.stop(HARD_STOP_M_S2, HARD_STOP_M_S2)
         if self.power.mode != RobotMode.POWER_OFF:
-            self.power.then((0.0, RobotMode.POWERING_OFF), (0.3, RobotMode.POWER_OFF))
+            self.power.then((0.0, RobotMode.POWERING_OFF), (POWER_OFF_S, RobotMode.POWER_OFF))
         return ReturnCode.OK
 
     @property
@@ -165,7 +169,7 @@ class Cabinet:
         """[joints, return code]; the joints are `qnear` if there is no solution."""
         target, near = (numbers("inverseKinematics", p[name]) for name in ("pose", "qnear"))
         joints = self._solved(from_wire(target), near)
-        return [near, -23] if joints is None else [joints, 0]  # it did not converge
+        return [near, IK_NO_CONVERGE] if joints is None else [joints, 0]
 
     def _solved(self, target: Pose, near: Sequence[float]) -> Joints | None:
         """Joints for a pose of the configured tool centre point, searched from `near`."""
@@ -231,7 +235,7 @@ class Cabinet:
         paced = p["a"] > 0.0 and p["v"] > 0.0 and 0.0 <= duration_s < math.inf
         if not paced or not (blend_m == 0.0 or BLEND_M[0] <= blend_m <= BLEND_M[1]):
             return -ReturnCode.INVALID_ARGUMENT
-        return ReturnCode.QUEUE_FULL if self.motion.size >= 64 else ReturnCode.OK
+        return ReturnCode.QUEUE_FULL if self.motion.size >= MOST_MOVES else ReturnCode.OK
 
     def _out_of_reach(self) -> int:
         """Accept a move that then proves to be out of reach: the arm stops and a message says why."""

@@ -47,7 +47,10 @@ from brushloop.drivers.sim.scene import Held, MjpegServer
 
 HAND_MM, BY_EYE_MM = 0.3, 1.0
 """Standard deviation of a tip that touches a thing, and of one that is brought near it by eye, along each axis."""
+SEEN_SIGMAS = 2.5
+"""Errors beyond this many standard deviations are seen and corrected by the person."""
 DIP_ABOVE_BOTTOM_MM = 2.5
+UPRIGHT_ABOVE_MM = 70.0
 LOOK_S = 0.005
 PUSH_N, PUSH_S = 2.0, 1.0
 PUSHES = ((0.0, 0.0, -PUSH_N), (PUSH_N, 0.0, 0.0), (0.0, PUSH_N, 0.0))
@@ -264,7 +267,7 @@ class UnknownLab(LoopbackRig):
         in_picture = facts.trap is Trap.PARK_IN_PICTURE
         return {
             "pin": facts.pin_mm,
-            "upright": over_sheet(table, 70.0),
+            "upright": over_sheet(table, UPRIGHT_ABOVE_MM),
             "well": table.to_base(x, y, DIP_ABOVE_BOTTOM_MM),
             "well-rim": table.to_base(x, y + table.well_radius_mm, table.well_depth_mm),
             "wash-pot": table.to_base(wash_x, wash_y, DIP_ABOVE_BOTTOM_MM),
@@ -326,10 +329,10 @@ class UnknownLab(LoopbackRig):
 
 
 def _error_mm(rng: np.random.Generator, spread_mm: float) -> list[float]:
-    """Normal error along each axis; one beyond 2.5 standard deviations is seen, and corrected: it is drawn again."""
+    """Normal error along each axis; drawn again while it is larger than what a person would see and correct."""
     while True:
         error_mm = rng.normal(0.0, spread_mm, 3)
-        if np.abs(error_mm).max() <= 2.5 * spread_mm:
+        if np.abs(error_mm).max() <= SEEN_SIGMAS * spread_mm:
             return error_mm.tolist()
 
 

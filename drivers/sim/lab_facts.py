@@ -69,8 +69,16 @@ BRUSHES = ((5.5, 46.0), (6.0, 48.0), (6.5, 50.0))
 LIFT_MM = 60.0
 """How far a person lifts the brush before going elsewhere."""
 PIN_TILT_DEG = 38.0
+CLEAR_OF_PICTURE_MM = 75.0
+"""More than the arm hides around the tip."""
+BOARD_MARGIN_PX = 12.0
+"""Least distance of the board from the edge of the picture: the lens distorts."""
+CLEAR_APART_MM = 160.0
+"""Between two places out of the picture."""
 PRESS_SHARE = 0.45
 """Deepest press, as a share of the free length, that the maker of the brush allows."""
+BASE_CLEAR_MM = 230.0
+"""Least distance from the axis of the base that a straight way may have."""
 
 
 class Trap(StrEnum):
@@ -138,9 +146,8 @@ def draw(seed: int, rate: float = 1.0, picture_px: tuple[int, int] = PICTURE_PX)
         facts = _guess(np.random.default_rng([seed, 16, attempt]), seed, rate, picture_px)
         if facts is None:
             continue
-        # The board keeps clear of the edge of the picture: the lens distorts.
         board = [corner(facts.config.table, "board", name) for name in CORNERS]
-        if in_picture(facts.config, board, 12.0) and reaches(facts.config, poses(facts)):
+        if in_picture(facts.config, board, BOARD_MARGIN_PX) and reaches(facts.config, poses(facts)):
             return facts
     raise AssertionError("unreachable")
 
@@ -173,7 +180,7 @@ def _guess(rng: np.random.Generator, seed: int, rate: float, picture_px: tuple[i
     if park is None or min(math.dist(pin, wash), math.dist(pin, table.well_mm), math.dist(wash, table.well_mm)) < 60.0:
         return None
     others = _places_aside(np.random.default_rng([seed, 43]), config, 400)
-    clear = next((place for place in others if math.dist(park, place) >= 160.0), None)
+    clear = next((place for place in others if math.dist(park, place) >= CLEAR_APART_MM), None)
     if clear is None:
         return None
     return Facts(
@@ -263,7 +270,7 @@ def _places_aside(rng: np.random.Generator, config: SimConfig, tries: int) -> It
         bearing = math.radians(azimuth_deg(middle) + rng.uniform(-80, 80))
         z_mm = table.paper_z_mm + float(rng.uniform(110, 180))
         place = (float(reach_mm * math.cos(bearing)), float(reach_mm * math.sin(bearing)), z_mm)
-        if in_picture(config, [place]) or _nearest_mm(middle, place) < 230.0:
+        if in_picture(config, [place]) or _nearest_mm(middle, place) < BASE_CLEAR_MM:
             continue
         if abs(math.degrees(bearing)) < 150.0 and reaches(config, [brush_pose(*place)]):
             yield place
@@ -283,7 +290,7 @@ def in_picture(config: SimConfig, places: Sequence[Place], margin_px: float | No
     """
     view = config.view
     at_px = mapped(homography(view), np.array([config.table.to_paper(*place[:2]) for place in places]))
-    least = -75.0 * view.px_per_mm if margin_px is None else margin_px  # the arm hides less around its tip
+    least = -CLEAR_OF_PICTURE_MM * view.px_per_mm if margin_px is None else margin_px
     return bool(np.all((at_px > least) & (at_px < np.array([view.width_px, view.height_px]) - least)))
 
 
@@ -316,6 +323,9 @@ def reaches(config: SimConfig, wanted: Iterable[Pose]) -> bool:
 
 SHRUNK = 0.97
 """What `fit to page` does to an A3 page."""
+SLOW_S = 1.2
+TOO_FAR_MM = 330.0
+"""How much farther away the sheet lies."""
 
 
 def trapped(facts: Facts, trap: Trap) -> tuple[Facts, Facts]:
@@ -335,12 +345,12 @@ def trapped(facts: Facts, trap: Trap) -> tuple[Facts, Facts]:
         case Trap.TCP_IN_METRES:
             wrong = replace(facts, cabinet_tcp=(0.0, 0.0, facts.config.tool_mm / 1e6, 0.0, 0.0, 0.0))
         case Trap.SLOW_CAMERA:
-            wrong = _with(facts, view=replace(view, delay_s=1.2))
+            wrong = _with(facts, view=replace(view, delay_s=SLOW_S))
         case Trap.FORCE_SIGN:
             wrong, mended = _with(facts, sensor_sign=-1), _with(facts, sensor_sign=1)
         case Trap.SHEET_OUT_OF_REACH:  # with board, pots and camera; the pin stays within reach
             x, y, _ = over_sheet(table)
-            stretch = 330.0 / math.hypot(x, y)  # so many mm farther away
+            stretch = TOO_FAR_MM / math.hypot(x, y)
             origin_mm = (table.origin_mm[0] + stretch * x, table.origin_mm[1] + stretch * y)
             wrong = _with(facts, table=replace(table, origin_mm=origin_mm))
         case Trap.CABLE_PULLED:

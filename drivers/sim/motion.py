@@ -32,6 +32,11 @@ from brushloop.drivers.sim.kinematics import (
 
 STEADY_LAG_S = 0.08
 """The controller reports steady a little after its queue is empty."""
+SAME_POSE_MM = 1e-4
+SAME_POSE_DEG = 1e-4
+SAME_JOINT_RAD = 1e-6
+RESTS_KEPT = 64
+SHORTEST_CUT = 1e-6
 CORNER_SHARE = 0.5
 """Share of the acceleration that the bend of a corner may need; the rest is left for the speed along it."""
 SLACK = 1e-9
@@ -141,7 +146,7 @@ class MotionQueue:
         self.tool: Matrix = np.eye(4) if tool is None else tool
         self.near: Joints = HOME
         """The last known joints, from which inverse kinematics starts."""
-        self.rests: deque[Rest] = deque(maxlen=64)
+        self.rests: deque[Rest] = deque(maxlen=RESTS_KEPT)
         """The newest places and times at which the arm came to rest."""
         self.held = False
         """True between `hold` and `resume`, even if nothing was moving."""
@@ -178,7 +183,7 @@ class MotionQueue:
         start = self._last()
         configured = start if fix is None else pose_of(matrix_of(start) @ inverted(fix))
         travel_mm, turn_deg = distance(configured, target)
-        if travel_mm <= 1e-4 and turn_deg <= 1e-4:
+        if travel_mm <= SAME_POSE_MM and turn_deg <= SAME_POSE_DEG:
             return False
         end = target if fix is None else pose_of(matrix_of(target) @ fix)
         line = Line(start, end, travel_mm, math.radians(turn_deg))
@@ -191,7 +196,7 @@ class MotionQueue:
         self.advance(now_s)
         exact = self._pieces[-1].joints(self._pieces[-1].stop) if self._pieces else None
         line = JointLine(exact or self.near_joints(self._last()), joints, self.tool)
-        if line.length <= 1e-6:
+        if line.length <= SAME_JOINT_RAD:
             return False
         self._append(line, speed_rad_s, acc_rad_s2, now_s)
         return True
@@ -335,7 +340,7 @@ class MotionQueue:
                 cut = min(last.blend_mm, 0.5 * a.length, 0.5 * b.length)
             case _:
                 return None
-        if cut <= 1e-6 or last.stop - cut < along:
+        if cut <= SHORTEST_CUT or last.stop - cut < along:
             return None
         corner, acc = Corner(a, b, cut), min(last.acc, piece.acc)
         # the speed bends by `bend` v within 2 cut / v: an acceleration of v^2 bend / (2 cut)

@@ -41,13 +41,7 @@ class Optics:
         self.glare = _glare(view, self.homography) if view.glare else None
         self.camera_matrix = camera_matrix(view)
         self.distortion: Floats = np.array([view.k1, 0.0, 0.0, 0.0])
-        self._map: NDArray[np.float32] | None = None
-        """(h, w, 2): for every pixel of the distorted image, its place in the undistorted one."""
-        if view.k1:
-            columns, rows = np.meshgrid(np.arange(view.width_px), np.arange(view.height_px))
-            pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2).astype(np.float64)
-            places = cv2.undistortPoints(pixels, self.camera_matrix, self.distortion, P=self.camera_matrix)
-            self._map = places.reshape(view.height_px, view.width_px, 2).astype(np.float32)
+        self._map = self._undistorted_places(view) if view.k1 else None
 
     def image_of(self, paper_mm: Floats) -> Floats:
         """(n, 2) pixels (centres on integers) of (n, 2) points of the paper plane, distortion included."""
@@ -63,6 +57,13 @@ class Optics:
             return undistorted
         distorted = cv2.remap(undistorted, self._map, np.empty(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return cast("NDArray[np.uint8]", distorted)
+
+    def _undistorted_places(self, view: View) -> NDArray[np.float32]:
+        """(h, w, 2): for every pixel of the distorted image, its place in the undistorted one."""
+        columns, rows = np.meshgrid(np.arange(view.width_px), np.arange(view.height_px))
+        pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2).astype(np.float64)
+        places = cv2.undistortPoints(pixels, self.camera_matrix, self.distortion, P=self.camera_matrix)
+        return places.reshape(view.height_px, view.width_px, 2).astype(np.float32)
 
 
 def mapped(homography: Floats, points: Floats) -> Floats:
@@ -137,6 +138,7 @@ class Held:
 
 TABLE_GRAY = 120
 PAPER_GRAY = 228
+INK_REFLECTANCE = 0.06
 TOOL_GRAY = 70
 TOOL_CLEAR_MM = 60.0
 """Radius of the disc that the arm hides when it is over the sheet."""
@@ -202,7 +204,7 @@ class Scene:
         table = self._world.config.table
         raster = self._blank.copy()
         sheet = _sheet_slices(table)
-        kept = 1.0 - 0.94 * self._world.paper.density  # full ink reflects 6 %
+        kept = 1.0 - (1.0 - INK_REFLECTANCE) * self._world.paper.density
         raster[sheet] = (raster[sheet] * kept).astype(np.uint8)
         # raster pixel centres (cv2 convention) -> mm in the paper frame -> image
         (left_mm, bottom_mm), (_, along_mm) = _extent(table)
@@ -359,9 +361,7 @@ class MjpegServer(LoopbackServer):
         shown = b""
         while not writer.is_closing():  # a late picture is not drained, which would notice
             kind = None if self._faults is None else self._faults.kind_met(Device.CAMERA)
-            async with self._rendering:  # the scene keeps a cache: one thread at a time
-                tool = self._world.tool()  # here, because the motion queue belongs to the event loop's thread
-                exposed_s, image = loop.time(), await asyncio.to_thread(self._jpeg, tool)
+            exposed_s, image = await self._exposed()
             if kind == "frozen":
                 image = renumbered(shown or image, time.time_ns())
             elif kind in SPOILED:
@@ -379,6 +379,12 @@ class MjpegServer(LoopbackServer):
             await writer.drain()  # of earlier pictures: else a slow client would fall farther and farther behind
             due_s = max(due_s + 1.0 / self._view.fps, loop.time())
             await asyncio.sleep(due_s - loop.time())
+
+    async def _exposed(self) -> tuple[float, bytes]:
+        """A new picture: the loop's time at its exposure, and its JPEG."""
+        async with self._rendering:  # the scene keeps a cache: one thread at a time
+            tool = self._world.tool()  # here, because the motion queue belongs to the event loop's thread
+            return asyncio.get_running_loop().time(), await asyncio.to_thread(self._jpeg, tool)
 
     def _jpeg(self, tool: Pose) -> bytes:
         image = self._render(tool)

@@ -24,6 +24,9 @@ from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.kinematics import Matrix, matrix_of
 from brushloop.drivers.sim.motion import MotionQueue
 
+SIDEWAYS_MM = 0.5
+"""A contact that travels less far sideways is a press."""
+
 
 def _sideways_mm(a: Pose, b: Pose) -> float:
     """Travel along the paper or across the brush's axis, whichever is shorter."""
@@ -34,6 +37,9 @@ def _sideways_mm(a: Pose, b: Pose) -> float:
 
 TILTS_DEG = (0.0, 7.5, 15.0, 30.0)
 """Tilts for which the push is solved; between them it is interpolated."""
+GRAVITY_M_S2 = 9.81
+ALONG_RAD = 1e-6
+LEVEL = (0.0, 0.0, 1.0)
 
 
 class Reaction:
@@ -57,7 +63,7 @@ class Reaction:
 
 def leaning_with(pose: Pose, normal: tuple[float, float, float]) -> Pose:
     """The pose in a frame whose z is the paper's normal, rotated from the base frame by the least angle."""
-    if normal == (0.0, 0.0, 1.0):
+    if normal == LEVEL:
         return pose
     nx, ny, nz = normal
     share = math.acos(nz) / math.hypot(nx, ny)  # of (ny, -nx, 0), the cross product of the normal and the level one
@@ -76,7 +82,7 @@ def bent_toward(pose: Pose, tilt_deg: float, heading_deg: float, set_lean_deg: f
     along, _, _ = columns(unit(pose.quaternion))
     wrist_deg = math.degrees(math.atan2(along[1], along[0]))
     off = math.radians(math.remainder(heading_deg - wrist_deg, 360.0))
-    if abs(off) < 1e-6:
+    if abs(off) < ALONG_RAD:
         return heading_deg
     return wrist_deg + math.degrees(math.atan2(tilt_deg * math.sin(off), tilt_deg * math.cos(off) + set_lean_deg))
 
@@ -174,7 +180,7 @@ class World:
         paper_n = 0.0
         if not self.is_over_well(x_mm, y_mm):
             paper_n = self.reaction.push_n(depth_mm, lean(leaning_with(tip, normal))[0])
-        push_n, weight_n = (paper_n * part for part in normal), (0.0, 0.0, 9.81 * self.config.hanging_kg)
+        push_n, weight_n = (paper_n * part for part in normal), (0.0, 0.0, self.config.hanging_kg * GRAVITY_M_S2)
         force_n = [a - b + c for a, b, c in zip(push_n, weight_n, self.push_n, strict=True)]
         fx, fy, fz = (x * force_n[0] + y * force_n[1] + z * force_n[2] for x, y, z in columns(unit(tip.quaternion)))
         return fx, fy, fz, -arm_m * fy, arm_m * fx, 0.0
@@ -195,7 +201,7 @@ class World:
         if low >= 0.0 and self._contact:
             contact, self._contact = self._contact, []
             # Withdrawing along the brush's own axis is not a drag, even if it is tilted.
-            if sum(_sideways_mm(a, b) for a, b in itertools.pairwise(contact)) > 0.5:
+            if sum(_sideways_mm(a, b) for a, b in itertools.pairwise(contact)) > SIDEWAYS_MM:
                 self._leave_drag(contact)
             else:
                 self._leave_mark(min(contact, key=self._above_mm))
