@@ -62,10 +62,7 @@ def write_page(path: Path, template: str, **values: Any) -> Path:
 
 def about(header: Header) -> dict[str, str]:
     """The `label` and the `note` of a page about one recording."""
-    return {
-        "label": source_label(header.source, [header.brush]),
-        "note": source_note(header.source, header.brush),
-    }
+    return {"label": source_label(header.source, [header.brush]), "note": source_note(header.source, header.brush)}
 
 
 @functools.cache

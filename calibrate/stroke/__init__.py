@@ -15,13 +15,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from brushloop.calibrate.board.lens import Floats, Gray
 from brushloop.calibrate.board.pix2len import Plane
 from brushloop.calibrate.errors import CaptureRefused
 
-Gray = NDArray[np.uint8]
 Soft = NDArray[np.float32]
 Mask = NDArray[np.bool_]
-Floats = NDArray[np.float64]
 Rect = tuple[float, float, float, float]
 """Four lengths: x, y, width and height of a rectangle, or how far to reach to the left, top, right and bottom."""
 PX_PER_MM = 20.0

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Annotated, Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, PlainSerializer, PlainValidator, ValidationError, model_validator
 
 from brushloop.calibrate.artefact import Frozen, SessionFit, load_artefact, made_by
@@ -25,7 +24,7 @@ from brushloop.calibrate.session import OpenSession
 from brushloop.model.ccdbsm import Brush, DomainError
 from brushloop.model.characters.glyph import CHARACTERS, parse_csv, parse_glyph, paths_of, reference, swept
 from brushloop.model.characters.plan import Patch, Reach, StrokePath, covered, drawn, first_lead, lead
-from brushloop.model.drag import NAMES, Footprint
+from brushloop.model.drag import NAMES, Floats, Footprint
 from brushloop.model.similarity import csim, ssim
 from brushloop.model.strokes import StrokeModel, stroke_model
 from brushloop.sessions.disk import check_writable
@@ -50,7 +49,6 @@ Points = tuple[tuple[tuple[Number, Number, Number, Number, Number], ...], ...]
 """[stroke][point] of x, y, depth, tilt, heading, as in the protocol."""
 Medians = tuple[tuple[tuple[Number, Number, Number], ...], ...]
 """[stroke][point] of x, y and half width in mm."""
-Floats = NDArray[np.float64]
 
 
 def _encoded(ink: Image) -> str:

@@ -18,7 +18,6 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from brushloop.calibrate.artefact import made_by, put_to_use
 from brushloop.calibrate.commands import FitFootprintRequest, LearnRequest, PracticeRequest
@@ -52,12 +51,11 @@ from brushloop.model.characters.plan import (
     phase_map,
     without_tilt,
 )
-from brushloop.model.drag import NAMES, Drawings, Footprint, fit_each, fit_footprint, inked
+from brushloop.model.drag import NAMES, Drawings, Floats, Footprint, fit_each, fit_footprint, inked
 from brushloop.model.similarity import binary_scores
 from brushloop.sessions.disk import check_writable
 from brushloop.sessions.terminal import Progress, unseen
 
-Floats = NDArray[np.float64]
 GAIN = 0.7
 """Share of the miss that is corrected in one round."""
 MOST_MM = 1.5
@@ -84,7 +82,6 @@ DEEPEST = 0.3
 """Greatest depth as a share of the brush's length."""
 MM_BETWEEN = 2.0
 TILT_DEG = 5.0
-NAME = "practice"
 
 
 def fit(request: FitFootprintRequest, progress: Progress = unseen) -> Written:
@@ -140,7 +137,7 @@ def practice(request: PracticeRequest, _progress: Progress = unseen) -> Written:
     strokes = practice_strokes(request.cell_mm, by.reach, by.length_mm)
     figures = tuple(
         Figure(
-            name=f"{NAME}-{number + 1:02d}",
+            name=f"practice-{number + 1:02d}",
             source=f"practice strokes, seed {SEED}",
             commanded=as_points(strokes[number * PER_FIGURE : (number + 1) * PER_FIGURE]),
         )
