@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,11 +30,11 @@ from brushloop.collect.touch.heights import (
     PITCH_MM,
     KnownHeights,
     Reach,
-    SpotGrid,
     Touch,
     at_one_point,
     coarse_count,
     lowest_z_mm,
+    spots,
 )
 from brushloop.drivers.devices import Frame
 from brushloop.sessions.events import TouchedPoint
@@ -58,46 +59,32 @@ def before_and_after(config: RigConfig, before: Frame, after: Frame) -> tuple[Gr
         raise StepError(f"the board is not seen: {error.what}") from None
 
 
-def _darkening(first: NDArray[np.float32], second: NDArray[np.float32]) -> tuple[NDArray[np.float32], float] | None:
-    """Return (gray levels by which each pixel became darker, level of the paper), corrected for the light.
+def _darkening(first: NDArray[np.float32], second: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
+    """(gray levels by which each pixel became darker, level of the paper), corrected for the light.
 
-    None for pictures that show no paper.
+    Pictures that show no paper did not become darker.
     """
     paper = float(np.quantile(first, 0.9))
     clean = first > DARK_SHARE * paper
     if paper < 1.0 or not clean.any():
-        return None
+        return np.zeros_like(first), 1.0
     light = float(np.median(second[clean] / first[clean]))
     return np.asarray(first - second / max(light, 1e-3), np.float32), paper
-
-
-def new_ink(
-    before: Gray, after: Gray, image_to_paper: Floats, window_mm: tuple[float, float, float, float]
-) -> NDArray[np.float32]:
-    """How much darker a window (x, y, width, height in the paper frame) became, (h, w) at 20 px/mm.
-
-    As a share of the paper's brightness: 1 is paper turned black. Noise averages to 0.
-    """
-    first, second = (rectify(image, image_to_paper, window_mm).astype(np.float32) for image in (before, after))
-    darkened = _darkening(first, second)
-    if darkened is None:
-        return np.zeros(first.shape, np.float32)
-    darkening, paper = darkened
-    return np.asarray(darkening / paper, np.float32)
 
 
 def ink_at(
     before: Gray, after: Gray, image_to_paper: Floats, spots_mm: list[tuple[float, float]], side_mm: float
 ) -> Floats:
-    """New ink in a square around each spot, (n,) in mm2 of black."""
-    amounts: list[float] = []
+    """New ink in a square around each spot, (n,) in mm2 of paper turned black. Noise averages to 0."""
+    amounts_mm2: list[float] = []
     for x, y in spots_mm:
-        # Larger by one side all around, so that the median sees paper.
+        # Larger by one side all around, so that the median sees paper; at 20 px/mm.
         window = (x - 1.5 * side_mm, y - 1.5 * side_mm, 3.0 * side_mm, 3.0 * side_mm)
-        darker = new_ink(before, after, image_to_paper, window)
-        third = darker.shape[0] // 3
-        amounts.append(float(darker[third : 2 * third, third : 2 * third].sum()) / PX_PER_MM**2)
-    return np.array(amounts, np.float64)
+        first, second = (rectify(image, image_to_paper, window).astype(np.float32) for image in (before, after))
+        darkening, paper = _darkening(first, second)
+        third = darkening.shape[0] // 3
+        amounts_mm2.append(float(darkening[third : 2 * third, third : 2 * third].sum()) / paper / PX_PER_MM**2)
+    return np.array(amounts_mm2, np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,10 +101,7 @@ def new_marks(before: Gray, after: Gray, image_to_paper: Floats, least_ink_mm2: 
     import skimage.measure  # slow to import
 
     first, second = before.astype(np.float32), after.astype(np.float32)
-    darkened = _darkening(first, second)
-    if darkened is None:
-        return []
-    darkening, paper = darkened
+    darkening, paper = _darkening(first, second)
     darker = np.asarray(darkening / np.maximum(first, DARK_SHARE * paper), np.float32)
     height, width = darker.shape
     middle = np.array([0.5 * width, 0.5 * height])
@@ -184,54 +168,56 @@ class FirstInkTouch:
 
         Without that plane, the sheet's lean along a row would be mistaken for height. Raises `StepError`.
         """
-        paper = self._rig.config.paper
+        paper, touches = self._rig.config.paper, self._config.touches
         known = KnownHeights(paper, self._config)
-        grids = [
-            SpotGrid(point, paper.size_mm, lowest_z_mm(paper, self._config, *point, EXTENT_MM)) for point in points_mm
-        ]
+        fresh = [spots(point, paper.size_mm) for point in points_mm]
         rough: list[Touch] = []
-        for grid, point in zip(grids, points_mm, strict=True):
-            rough.append(await self._coarse(grid, known.reach(*point, EXTENT_MM)))
+        for row, point in zip(fresh, points_mm, strict=True):
+            rough.append(await self._coarse(row, known.reach(*point, EXTENT_MM)))
             known.add(rough[-1].x_mm, rough[-1].y_mm, rough[-1].z_mm)
         rounds = [rough]
-        for k in range(self._config.touches):
+        for k in range(touches):
             lean = _plane(rounds[-1])
             # Staggered by parts of a step: equal heights would only repeat the same result.
-            lower_mm = k / self._config.touches * FINE_STEP_MM
-            rounds.append([await self._fine(p, around, lean, lower_mm) for p, around in zip(grids, rough, strict=True)])
-        touches = [list(point) for point in zip(*rounds[1:], strict=True)]
-        lean = _plane([touch for point in touches for touch in point])
-        return [at_one_point(point, self._config, lean) for point in touches]
+            higher_mm = 0.5 * FINE_STEP_MM * (FINE_COUNT - 1) - k / touches * FINE_STEP_MM
+            rounds.append([])
+            for row, point, around in zip(fresh, points_mm, rough, strict=True):
+                lowest_mm = lowest_z_mm(paper, self._config, *point, EXTENT_MM)
+                rounds[-1].append(await self._fine(row, around, lean, higher_mm, lowest_mm))
+        by_point = [list(point) for point in zip(*rounds[1:], strict=True)]
+        lean = _plane([touch for point in by_point for touch in point])
+        return [at_one_point(point, self._config, lean) for point in by_point]
 
-    async def _coarse(self, grid: SpotGrid, reach: Reach) -> Touch:
+    async def _coarse(self, row: Iterator[tuple[float, float]], reach: Reach) -> Touch:
         """Touch lower and lower until a photograph shows ink."""
         count = coarse_count(reach)
         before = await self._photograph()
-        spots: list[Spot] = []
+        touched: list[Spot] = []
         for k in range(count):
-            spots.append((*grid.take(), max(reach.start_z_mm - k * COARSE_STEP_MM, reach.lowest_z_mm)))
-            await self._touch(spots[-1])
-            if len(spots) % SPOTS_PER_PHOTO == 0 or k + 1 == count:
-                ink = await self._ink(before, spots)
+            touched.append((*next(row), max(reach.start_z_mm - k * COARSE_STEP_MM, reach.lowest_z_mm)))
+            await self._touch(touched[-1])
+            if len(touched) % SPOTS_PER_PHOTO == 0 or k + 1 == count:
+                ink = await self._ink(before, touched)
                 if (ink >= LEAST_INK_MM2).any():
-                    return self._between(spots, ink, COARSE_STEP_MM)
-        raise StepError(f"nothing was touched down to {spots[-1][2]:.2f} mm: no spot of the row left ink")
+                    return self._between(touched, ink, COARSE_STEP_MM)
+        raise StepError(f"nothing was touched down to {touched[-1][2]:.2f} mm: no spot of the row left ink")
 
-    async def _fine(self, grid: SpotGrid, around: Touch, lean: PaperPlane, lower_mm: float) -> Touch:
-        before, spots = await self._photograph(), list[Spot]()
-        highest_mm = 0.5 * FINE_STEP_MM * (FINE_COUNT - 1) - lower_mm
+    async def _fine(
+        self, row: Iterator[tuple[float, float]], around: Touch, lean: PaperPlane, higher_mm: float, lowest_mm: float
+    ) -> Touch:
+        before, touched = await self._photograph(), list[Spot]()
         for k in range(FINE_COUNT):
-            x, y = grid.take()
+            x, y = next(row)
             along_mm = lean.touch_z_mm(x, y) - lean.touch_z_mm(around.x_mm, around.y_mm)
-            z_mm = around.z_mm + along_mm + highest_mm - k * FINE_STEP_MM
-            spots.append((x, y, max(z_mm, grid.lowest_z_mm)))
-            await self._touch(spots[-1])
-        return self._between(spots, await self._ink(before, spots), FINE_STEP_MM)
+            z_mm = around.z_mm + along_mm + higher_mm - k * FINE_STEP_MM
+            touched.append((x, y, max(z_mm, lowest_mm)))
+            await self._touch(touched[-1])
+        return self._between(touched, await self._ink(before, touched), FINE_STEP_MM)
 
-    def _between(self, spots: list[Spot], ink_mm2: NDArray[np.float64], step_mm: float) -> Touch:
+    def _between(self, touched: list[Spot], ink_mm2: NDArray[np.float64], step_mm: float) -> Touch:
         """Half way between the last clean spot and the first inked one; every height between them is equally likely."""
         first = first_ink(ink_mm2, LEAST_INK_MM2)
-        x, y, z = (0.5 * (a + b) for a, b in zip(spots[first - 1], spots[first], strict=True))
+        x, y, z = (0.5 * (a + b) for a, b in zip(touched[first - 1], touched[first], strict=True))
         return Touch(x, y, z, step_mm / math.sqrt(12.0))
 
     async def _touch(self, spot: Spot) -> None:
@@ -250,10 +236,10 @@ class FirstInkTouch:
             self._last = await self._procedures.capture()
         return self._last
 
-    async def _ink(self, before: Frame, spots: list[Spot]) -> NDArray[np.float64]:
+    async def _ink(self, before: Frame, touched: list[Spot]) -> NDArray[np.float64]:
         after = await self._photograph()
         frames = await asyncio.to_thread(before_and_after, self._rig.config, before, after)
-        return await asyncio.to_thread(ink_at, *frames, [(x, y) for x, y, _ in spots], WINDOW_MM)
+        return await asyncio.to_thread(ink_at, *frames, [(x, y) for x, y, _ in touched], WINDOW_MM)
 
 
 def _plane(touches: list[Touch]) -> PaperPlane:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import asyncio
 import math
 import statistics
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Protocol
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,146 +149,119 @@ class Reading:
     sd_n: float
     """Standard deviation of one sample."""
 
-
-class Probe(Protocol):
-    """A vertical brush over one point of the sheet."""
-
-    async def rest(self, z_mm: float, samples: int) -> Reading:
-        """Go to the height, come to rest, and average this many samples."""
-        ...
-
-
-@dataclass(slots=True)
-class _Log:
-    """The readings of one touch so far."""
-
-    spring: Spring | None
-    readings: list[tuple[Reading, int]] = field(default_factory=list[tuple[Reading, int]])
-
     @property
-    def samples(self) -> int:
-        return sum(reading.samples for reading, _ in self.readings)
+    def least_n(self) -> float:
+        """The least force there that counts as a push."""
+        return max(THRESHOLD_N, FELT_SIGMAS * self.sd_n / math.sqrt(self.samples))
 
-    def contact(self) -> Contact:
-        """Fit the hinge to the readings of the linear part; iterated, because that part depends on the hinge.
 
-        More readings are kept where too few are left to give it: the descent lay too low, or they are noisy still.
-        """
-        contact = self._fit(-math.inf)
-        for _ in range(3):
-            lowest_z_mm = contact.z_mm - LINEAR_MM
-            if not any(lowest_z_mm <= reading.z_mm < contact.z_mm for reading, _ in self.readings):
-                break
-            try:
-                contact = self._fit(lowest_z_mm)
-            except StepError:
-                break
-        return contact
-
-    def _fit(self, lowest_z_mm: float) -> Contact:
-        used = [(r, run) for r, run in self.readings if r.z_mm >= lowest_z_mm]
-        total = sum(r.samples for r, _ in used)
-        sd_n = math.sqrt(sum(r.samples * r.sd_n**2 for r, _ in used) / total)
-        return find_contact(
-            np.array([r.z_mm for r, _ in used]),
-            np.array([r.force_n for r, _ in used]),
-            np.array([r.samples for r, _ in used]),
-            sd_n,
-            np.array([run for _, run in used]),
-            self.spring,
-        )
+Rest = Callable[[float, int], Awaitable[Reading]]
+"""Brings a vertical brush to a height over one point of the sheet, to rest, and averages this many samples."""
 
 
 async def touch_by_force(
-    probe: Probe,
+    rest: Rest,
     reach: Reach,
     config: ForceTouchConfig,
     spring: Spring | None = None,
     near_z_mm: float | None = None,
-    report: Callable[[str], None] = lambda _doing: None,
 ) -> Contact:
-    """Touch once; the probe is left down.
+    """Touch once; the brush is left down.
 
     `spring` is the stiffness that the last touch found. With it and `near_z_mm`, the height of the last touch at this
-    point, only the slow descents are left to do. `report` gets a few words on each part. Raises `StepError` if nothing
-    is felt over the whole travel, if something is felt at its start, or if the noise leaves the contact unknown.
+    point, only the slow descents are left to do. Raises `StepError` if nothing is felt over the whole travel, if
+    something is felt at its start, or if the noise leaves the contact unknown.
     """
-    log, lowest_z_mm = _Log(None if spring is None else spring.next()), reach.lowest_z_mm
-    highest_z_mm = reach.start_z_mm
+    spring_before = None if spring is None else spring.next()
+    lowest_z_mm, highest_z_mm = reach.lowest_z_mm, reach.start_z_mm
+    readings = list[tuple[Reading, int]]()
     if near_z_mm is None or spring is None:
-        report(f"down to the paper in steps of {FAST_STEP_MM:g} mm")
-        felt_z_mm = await _fast(probe, reach.start_z_mm, lowest_z_mm, config)
-        start_z_mm = felt_z_mm + LATE_STEPS * FAST_STEP_MM + CLEAR_STEPS * MEDIUM_STEP_MM
-        report(f"steps of {MEDIUM_STEP_MM:g} mm around {felt_z_mm:.1f} mm")
-        await _medium(probe, log, start_z_mm, lowest_z_mm, config)
+        first = await rest(reach.start_z_mm, config.fast_samples)
+        if abs(first.force_n) > first.least_n:
+            raise StepError(
+                f"the force is {1e3 * first.force_n:.1f} mN at the start of the approach, at {first.z_mm:.2f} mm: "
+                "the brush touches already, or the sensor was not set to zero"
+            )
+        fast = await _until_felt(rest, reach.start_z_mm - FAST_STEP_MM, lowest_z_mm, FAST_STEP_MM, config.fast_samples)
+        start_z_mm = fast[-1].z_mm + LATE_STEPS * FAST_STEP_MM + CLEAR_STEPS * MEDIUM_STEP_MM
+        medium = await _until_felt(
+            rest, start_z_mm, lowest_z_mm, MEDIUM_STEP_MM, config.medium_samples, clear=CLEAR_STEPS, in_a_row=2
+        )
+        readings += [(reading, ROUGH_RUN) for reading in medium]
         highest_z_mm = start_z_mm + FAST_STEP_MM
-        near_z_mm = log.contact().z_mm
-    run, left = ROUGH_RUN, ""
+        near_z_mm = fitted(readings, spring_before).z_mm
+    run = ROUGH_RUN
     while True:
         run += 1
-        report(f"slow descent {run}{left}")
         for depth_mm, share in zip(SLOW_MM, SLOW_SHARES, strict=True):
             z_mm = max(near_z_mm - depth_mm, lowest_z_mm)
-            log.readings.append((await probe.rest(z_mm, max(4, round(share * config.slow_samples))), run))
-        contact = log.contact()
-        if _known(contact, near_z_mm, config):
+            readings.append((await rest(z_mm, max(4, round(share * config.slow_samples))), run))
+        contact, samples = fitted(readings, spring_before), sum(reading.samples for reading, _ in readings)
+        # The standard error is computed from the stiffness. If that is uncertain, or if the descent lay beside the
+        # contact, the true error can be much larger.
+        sure = contact.spring.sigma_n_mm <= SPRING_SHARE * contact.spring.n_mm
+        if sure and abs(contact.z_mm - near_z_mm) <= BESIDE_MM and contact.sigma_mm <= config.sigma_mm:
             if contact.z_mm > highest_z_mm:
                 raise StepError(
                     f"the contact was found at {contact.z_mm:.2f} mm, above {highest_z_mm:.2f} mm where the brush was "
                     "in the air: the sensor is too noisy for so few samples"
                 )
             return contact
-        if log.samples > MOST_SAMPLES:
+        if samples > MOST_SAMPLES:
             raise StepError(
-                f"the contact is known to only {contact.sigma_mm:.3f} mm after {log.samples} samples of the force, "
+                f"the contact is known to only {contact.sigma_mm:.3f} mm after {samples} samples of the force, "
                 f"{config.sigma_mm:g} mm are asked for: the sensor is too noisy for this brush"
             )
         near_z_mm = contact.z_mm
-        more = max(1, math.ceil(log.samples * ((contact.sigma_mm / config.sigma_mm) ** 2 - 1.0) / config.slow_samples))
-        left = f", about {more} to go: known to {contact.sigma_mm:.3f} mm, {config.sigma_mm:g} mm asked for"
 
 
-def _known(contact: Contact, tried_z_mm: float, config: ForceTouchConfig) -> bool:
-    """Whether the contact is known well enough, after a descent around `tried_z_mm`.
+def fitted(readings: Sequence[tuple[Reading, int]], spring: Spring | None) -> Contact:
+    """Fit the hinge to the readings of the linear part; iterated, because that part depends on the hinge.
 
-    Its standard error is computed from the stiffness. If the stiffness is uncertain, or if the descent lay beside the
-    contact, the true error can be much larger.
+    More readings are kept where too few are left to give it: the descent lay too low, or they are noisy still.
     """
-    sure = contact.spring.sigma_n_mm <= SPRING_SHARE * contact.spring.n_mm
-    return sure and abs(contact.z_mm - tried_z_mm) <= BESIDE_MM and contact.sigma_mm <= config.sigma_mm
 
-
-async def _fast(probe: Probe, start_z_mm: float, lowest_z_mm: float, config: ForceTouchConfig) -> float:
-    """Go down in large steps; return the height of the first rest at which something is felt."""
-    z_mm, reading = start_z_mm, await probe.rest(start_z_mm, config.fast_samples)
-    felt_n = _felt_n(reading)
-    if abs(reading.force_n) > felt_n:
-        raise StepError(
-            f"the force is {1e3 * reading.force_n:.1f} mN at the start of the approach, at {start_z_mm:.2f} mm: "
-            "the brush touches already, or the sensor was not set to zero"
+    def fit(lowest_z_mm: float) -> Contact:
+        used = [(r, run) for r, run in readings if r.z_mm >= lowest_z_mm]
+        sd_n = math.sqrt(sum(r.samples * r.sd_n**2 for r, _ in used) / sum(r.samples for r, _ in used))
+        return find_contact(
+            np.array([r.z_mm for r, _ in used]),
+            np.array([r.force_n for r, _ in used]),
+            np.array([r.samples for r, _ in used]),
+            sd_n,
+            np.array([run for _, run in used]),
+            spring,
         )
-    while z_mm > lowest_z_mm + 1e-6:
-        z_mm = max(z_mm - FAST_STEP_MM, lowest_z_mm)
-        if (await probe.rest(z_mm, config.fast_samples)).force_n > felt_n:
-            return z_mm
-    raise StepError(f"nothing was touched down to {lowest_z_mm:.2f} mm: the force stayed below {1e3 * felt_n:.1f} mN")
+
+    contact = fit(-math.inf)
+    for _ in range(3):
+        lowest_z_mm = contact.z_mm - LINEAR_MM
+        if not any(lowest_z_mm <= reading.z_mm < contact.z_mm for reading, _ in readings):
+            break
+        try:
+            contact = fit(lowest_z_mm)
+        except StepError:
+            break
+    return contact
 
 
-async def _medium(probe: Probe, log: _Log, start_z_mm: float, lowest_z_mm: float, config: ForceTouchConfig) -> None:
-    """Go down in smaller steps until something is felt at two rests in a row."""
-    z_mm, before_n = start_z_mm, 0.0
+async def _until_felt(
+    rest: Rest, z_mm: float, lowest_z_mm: float, step_mm: float, samples: int, *, clear: int = 0, in_a_row: int = 1
+) -> list[Reading]:
+    """Go down in steps until something is felt at so many rests in a row, the first of which are `clear` of the paper.
+
+    Raises `StepError` at the lowest height.
+    """
+    readings = list[Reading]()
     while True:
-        reading = await probe.rest(z_mm, config.medium_samples)
-        log.readings.append((reading, ROUGH_RUN))
-        if min(before_n, reading.force_n) > _felt_n(reading) and len(log.readings) > CLEAR_STEPS:
-            return
+        z_mm = max(z_mm, lowest_z_mm)
+        readings.append(await rest(z_mm, samples))
+        last = readings[-in_a_row:]
+        if len(readings) > clear and all(reading.force_n > reading.least_n for reading in last):
+            return readings
         if z_mm <= lowest_z_mm + 1e-6:
-            raise StepError(f"nothing was touched down to {z_mm:.2f} mm, in steps of {MEDIUM_STEP_MM:g} mm")
-        z_mm, before_n = max(z_mm - MEDIUM_STEP_MM, lowest_z_mm), reading.force_n
-
-
-def _felt_n(reading: Reading) -> float:
-    return max(THRESHOLD_N, FELT_SIGMAS * reading.sd_n / math.sqrt(reading.samples))
+            raise StepError(f"nothing was touched down to {z_mm:.2f} mm, in steps of {step_mm:g} mm")
+        z_mm -= step_mm
 
 
 SILENT_S = 5.0
@@ -334,23 +306,18 @@ class ForceTap:
         return statistics.fmean(pushes), statistics.stdev(pushes), len(pushes)
 
 
-class RigProbe:
-    """`Probe` over one point of the sheet, on a rig's arm and force sensor."""
+def resting(procedures: Procedures, tap: ForceTap, at_mm: tuple[float, float], config: TouchConfig) -> Rest:
+    """Rests over one point of the sheet, on a rig's arm and force sensor; each is reached from above."""
+    last_z_mm = -math.inf
 
-    def __init__(self, procedures: Procedures, tap: ForceTap, at_mm: tuple[float, float], config: TouchConfig) -> None:
-        self._procedures = procedures
-        self._tap = tap
-        self._at_mm = at_mm
-        self._config = config
-        self._last_z_mm: float | None = None
-
-    async def rest(self, z_mm: float, samples: int) -> Reading:
-        """Go to the height from above, come to rest, and average this many samples."""
-        force, speed_mm_s = self._config.force, self._config.speed_mm_s
-        if self._last_z_mm is not None and z_mm > self._last_z_mm:
-            await self._procedures.lower(*self._at_mm, z_mm + CLEAR_MM, speed_mm_s)
-        rests_z_mm = await self._procedures.lower(*self._at_mm, z_mm, speed_mm_s)
-        self._last_z_mm = z_mm
-        after_ns = self._procedures.rig.clock.now_ns() + round(force.settle_s * 1e9)
-        force_n, sd_n, count = await self._tap.average(samples, force.push_axis, after_ns)
+    async def rest(z_mm: float, samples: int) -> Reading:
+        nonlocal last_z_mm
+        if z_mm > last_z_mm > -math.inf:
+            await procedures.lower(*at_mm, z_mm + CLEAR_MM, config.speed_mm_s)
+        rests_z_mm = await procedures.lower(*at_mm, z_mm, config.speed_mm_s)
+        last_z_mm = z_mm
+        after_ns = procedures.rig.clock.now_ns() + round(config.force.settle_s * 1e9)
+        force_n, sd_n, count = await tap.average(samples, config.force.push_axis, after_ns)
         return Reading(rests_z_mm, force_n, count, sd_n)
+
+    return rest

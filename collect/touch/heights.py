@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import statistics
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from brushloop.collect.errors import StepError
@@ -103,8 +105,8 @@ def at_one_point(touches: list[Touch], config: TouchConfig, guide: PaperPlane | 
 
 def taught(paper: PaperConfig, rests_mm: float) -> ZeroTouchResult:
     """The level plane at the taught height, which was visited and not measured; the arm rested at `rests_mm`."""
-    visited = Touch(*paper.touch_point_mm, rests_mm)
-    return _result(PaperPlane(paper.touch_z_mm), "taught", [at_one_point([visited], TouchConfig())], (0.0,))
+    visited = at_one_point([Touch(*paper.touch_point_mm, rests_mm)], TouchConfig())
+    return ZeroTouchResult(method="taught", touch_z_mm=paper.touch_z_mm, residuals_mm=(0.0,), points=(visited,))
 
 
 def through(points: list[TouchedPoint], config: TouchConfig) -> ZeroTouchResult:
@@ -116,14 +118,8 @@ def through(points: list[TouchedPoint], config: TouchConfig) -> ZeroTouchResult:
             f"the touched points do not lie in a plane: residuals {listed} mm, limit {config.residual_mm:g} mm. "
             "Does the sheet lie flat?"
         )
-    return _result(plane, config.method, points, residuals_mm)
-
-
-def _result(
-    plane: PaperPlane, method: str, points: list[TouchedPoint], residuals_mm: tuple[float, ...]
-) -> ZeroTouchResult:
     return ZeroTouchResult(
-        method=method,
+        method=config.method,
         touch_z_mm=plane.z0_mm,
         slope_x=plane.slope_x,
         slope_y=plane.slope_y,
@@ -150,28 +146,21 @@ FINE_COUNT = 1 + 2 * SLACK_STEPS + math.ceil(COARSE_STEP_MM / FINE_STEP_MM)
 """Spots of one fine row."""
 
 
-class SpotGrid:
-    """The spots around one point, to and fro from the lower left, so that consecutive touches are neighbours."""
+def spots(at_mm: tuple[float, float], sheet_mm: tuple[float, float]) -> Iterator[tuple[float, float]]:
+    """Fresh spots around one point, to and fro from the lower left, so that consecutive touches are neighbours.
 
-    def __init__(self, at_mm: tuple[float, float], sheet_mm: tuple[float, float], lowest_z_mm: float) -> None:
-        """No spot lies lower than `lowest_z_mm`."""
-        self.lowest_z_mm = lowest_z_mm
-        self._at_mm = at_mm
-        self._sheet_mm = sheet_mm
-        self._next = 0
-
-    def take(self) -> tuple[float, float]:
-        """The next fresh spot. Raises `StepError` where it does not lie on the sheet."""
-        row, column = divmod(self._next, COLUMNS)
-        self._next += 1
+    Raises `StepError` where the next one does not lie on the sheet.
+    """
+    for number in itertools.count():
+        row, column = divmod(number, COLUMNS)
         column = COLUMNS - 1 - column if row % 2 else column
-        x_mm, y_mm = self._at_mm[0] + column * PITCH_MM, self._at_mm[1] + row * PITCH_MM
-        if not (0.0 <= x_mm <= self._sheet_mm[0] and 0.0 <= y_mm <= self._sheet_mm[1]):
+        x_mm, y_mm = at_mm[0] + column * PITCH_MM, at_mm[1] + row * PITCH_MM
+        if not (0.0 <= x_mm <= sheet_mm[0] and 0.0 <= y_mm <= sheet_mm[1]):
             raise StepError(
-                f"the touches at ({self._at_mm[0]:g}, {self._at_mm[1]:g}) mm do not fit on the sheet: "
-                f"spot {self._next} would lie at ({x_mm:g}, {y_mm:g}) mm"
+                f"the touches at ({at_mm[0]:g}, {at_mm[1]:g}) mm do not fit on the sheet: "
+                f"spot {number + 1} would lie at ({x_mm:g}, {y_mm:g}) mm"
             )
-        return x_mm, y_mm
+        yield x_mm, y_mm
 
 
 def coarse_count(reach: Reach) -> int:

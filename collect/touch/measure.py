@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 
 from brushloop.collect.errors import NeedsOperator, StepError
 from brushloop.collect.motion import Dip, Procedures
 from brushloop.collect.operator import Asker, Choice, Prompt
 from brushloop.collect.rig.config import TouchConfig
 from brushloop.collect.touch.camera import FirstInkTouch
-from brushloop.collect.touch.force import ForceTap, RigProbe, Spring, touch_by_force
+from brushloop.collect.touch.force import ForceTap, Rest, Spring, resting, touch_by_force
 from brushloop.collect.touch.heights import KnownHeights, Reach, Touch, at_one_point, taught, through
 from brushloop.sessions.events import TouchedPoint, ZeroTouchResult
 
@@ -46,18 +46,20 @@ async def measure_plane(
 
 
 Point = tuple[float, float]
-TouchPoint = Callable[[int, Point, Reach], Awaitable[list[Touch]]]
-"""Touches one point several times: its number from 0, its place, and the approach."""
+TouchOnce = Callable[[str, Point, Reach, Sequence[Touch]], Awaitable[Touch]]
+"""Touches once: its name for the person, its place, the approach, and the touches there before it."""
 
 
 async def _at_points(
-    procedures: Procedures, config: TouchConfig, points_mm: list[Point], touch: TouchPoint
+    procedures: Procedures, config: TouchConfig, points_mm: list[Point], touch: TouchOnce
 ) -> list[TouchedPoint]:
-    known, points = KnownHeights(procedures.rig.config.paper, config), list[TouchedPoint]()
-    for number, point in enumerate(points_mm):
-        reach = known.reach(*point)
+    known, points, count = KnownHeights(procedures.rig.config.paper, config), list[TouchedPoint](), 0
+    for point in points_mm:
+        reach, touches = known.reach(*point), list[Touch]()
         await procedures.approach(*point, reach.start_z_mm)
-        touches = await touch(number, point, reach)
+        for _ in range(config.touches):
+            count += 1
+            touches.append(await touch(f"touch {count} of {len(points_mm) * config.touches}", point, reach, touches))
         await procedures.lift()
         mean = at_one_point(touches, config)
         points.append(mean)
@@ -65,26 +67,24 @@ async def _at_points(
     return points
 
 
-def _by_force(procedures: Procedures, config: TouchConfig, tap: ForceTap, tell: Callable[[str], None]) -> TouchPoint:
+def _by_force(procedures: Procedures, config: TouchConfig, tap: ForceTap, tell: Callable[[str], None]) -> TouchOnce:
     if procedures.rig.force is None:
         raise StepError("zero touch by force needs a force sensor: [force] is missing")
 
+    rest: Rest | None = None
     spring: Spring | None = None
 
-    async def touch(number: int, point: Point, reach: Reach) -> list[Touch]:
-        nonlocal spring
-        probe = RigProbe(procedures, tap, point, config)
-        near_z_mm, touches = None, list[Touch]()
-        for k in range(config.touches):
-            place = f"point {number + 1} of {max(len(config.points_mm), 1)}, touch {k + 1} of {config.touches}: "
-            contact = await touch_by_force(
-                probe, reach, config.force, spring, near_z_mm, lambda doing, place=place: tell(place + doing)
-            )
-            near_z_mm, spring = contact.z_mm, contact.spring
-            touches.append(Touch(*point, contact.z_mm, contact.sigma_mm))
-        return touches
+    async def once(name: str, point: Point, reach: Reach, before: Sequence[Touch]) -> Touch:
+        nonlocal rest, spring
+        tell(f"{name}: down to the paper until the force is known to {config.force.sigma_mm:g} mm")
+        near_z_mm = before[-1].z_mm if before else None
+        if rest is None or not before:
+            rest = resting(procedures, tap, point, config)
+        contact = await touch_by_force(rest, reach, config.force, spring, near_z_mm)
+        spring = contact.spring
+        return Touch(*point, contact.z_mm, contact.sigma_mm)
 
-    return touch
+    return once
 
 
 JOG_MM = {"1": -1.0, "2": -0.1, "3": -0.02, "8": 0.02, "9": 0.1, "0": 1.0}
@@ -93,21 +93,20 @@ TOUCHES, GIVE_UP = "t", "x"
 ROUNDING_MM = 1e-6
 
 
-def _by_jog(procedures: Procedures, config: TouchConfig, asker: Asker) -> TouchPoint:
+def _by_jog(procedures: Procedures, config: TouchConfig, asker: Asker) -> TouchOnce:
     choices = (
         *(Choice(key, f"{'down' if step < 0 else 'up'} {abs(step):g} mm") for key, step in JOG_MM.items()),
         Choice(TOUCHES, "the tip just touches"),
         Choice(GIVE_UP, "give up: the height of the paper stays unchanged"),
     )
-    of = max(len(config.points_mm), 1) * config.touches
 
-    async def once(number: int, point: Point, reach: Reach) -> Touch:
+    async def once(name: str, point: Point, reach: Reach, _before: Sequence[Touch]) -> Touch:
         """Leaves the brush where the operator stopped. A step beyond either end of the approach is shortened."""
         z_mm = reach.start_z_mm
         while True:
             rests_mm = await procedures.lower(*point, z_mm, config.speed_mm_s)
             question = (
-                f"Touch {number} of {of}. Jog until the tip just touches the paper. "
+                f"{name.capitalize()}. Jog until the tip just touches the paper. "
                 f"It is {rests_mm - reach.expected_z_mm:+.2f} mm from the expected height."
             )
             if z_mm <= reach.lowest_z_mm + ROUNDING_MM:
@@ -116,13 +115,9 @@ def _by_jog(procedures: Procedures, config: TouchConfig, asker: Asker) -> TouchP
                 )
             key = await asker.ask(Prompt(question, choices, GIVE_UP))
             if key == GIVE_UP:
-                raise NeedsOperator(f"the operator gave up at touch {number} of {of}")
+                raise NeedsOperator(f"the operator gave up at {name}")
             if key == TOUCHES:
                 return Touch(*point, rests_mm)
             z_mm = min(max(z_mm + JOG_MM[key], reach.lowest_z_mm), reach.start_z_mm)
 
-    async def touch(number: int, point: Point, reach: Reach) -> list[Touch]:
-        first = number * config.touches + 1
-        return [await once(first + k, point, reach) for k in range(config.touches)]
-
-    return touch
+    return once
