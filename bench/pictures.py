@@ -30,7 +30,7 @@ from textual.pilot import Pilot
 
 import brushloop
 from bench.harness import ROOT
-from brushloop.collect.commission.step import Visit
+from brushloop.collect.commission.visit import Visit
 from brushloop.collect.commission.wizard import Wizard
 from brushloop.collect.engine.control import State
 from brushloop.collect.errors import CollectAborted

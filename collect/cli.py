@@ -198,7 +198,7 @@ def _first_report(config: Path, report: Path) -> bool:
     import asyncio
 
     from brushloop.collect.commission.arm import write_first_report
-    from brushloop.collect.commission.notebook import Notebook, notebook_path
+    from brushloop.collect.commission.visit import Notebook, notebook_path
 
     path = notebook_path(config)
     if not path.exists():
@@ -230,7 +230,7 @@ def teach(
 def _commission(rig: Path, step: str | None, *, arm: bool) -> None:
     import sys
 
-    from brushloop.collect.commission.step import Visit
+    from brushloop.collect.commission.visit import Visit
     from brushloop.collect.errors import ConfigError
     from brushloop.collect.tui.commission_app import run_commission
     from brushloop.drivers.host import HostClock
@@ -274,7 +274,7 @@ def check(rig: RigFile = RIG_FILE) -> None:
 
     Ends with code 5 if values contradict each other.
     """
-    from brushloop.collect.commission.notebook import Notebook, gaps
+    from brushloop.collect.commission.visit import Notebook, gaps
     from brushloop.collect.rig.check import check_page, check_rig
     from brushloop.collect.rig.config import load_rig
 

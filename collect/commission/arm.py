@@ -9,8 +9,7 @@ from collections.abc import Sequence
 from contextlib import AbstractAsyncContextManager
 from pathlib import Path
 
-from brushloop.collect.commission.notebook import Notebook, Taught
-from brushloop.collect.commission.step import Asked, Step, Visit
+from brushloop.collect.commission.visit import Asked, Notebook, Step, Taught, Visit
 from brushloop.collect.rig.doctor import Finding, Scrubber, numbers_only, transcript, write_archive
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, Controller, only_asking
 from brushloop.drivers.arcs.settings import read_back

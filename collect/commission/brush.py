@@ -9,9 +9,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from brushloop.collect.commission.notebook import Notebook, Taught
 from brushloop.collect.commission.sheet import inside_corners
-from brushloop.collect.commission.step import Asked, Step, Visit
+from brushloop.collect.commission.visit import Asked, Notebook, Step, Taught, Visit
 from brushloop.collect.errors import NotAccepted
 from brushloop.collect.operator import Choice
 from brushloop.collect.rig.check import brush_shorter_than_tool, deepest_press

@@ -17,8 +17,7 @@ from brushloop.calibrate.board.lens import GOOD_VIEWS, fit_lens, guidance, held,
 from brushloop.calibrate.board.spec import BoardSpec, BoardView, describe
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_gray
-from brushloop.collect.commission.notebook import Notebook, Taught
-from brushloop.collect.commission.step import NO, YES, Asked, Step, Visit
+from brushloop.collect.commission.visit import NO, YES, Asked, Notebook, Step, Taught, Visit
 from brushloop.collect.errors import NotAccepted
 from brushloop.collect.operator import Prompt
 from brushloop.collect.photograph.frames import gray

@@ -11,9 +11,8 @@ import numpy as np
 from brushloop.calibrate.files import read_gray
 from brushloop.collect.commission.arm import taught_arm, tip_of, touch
 from brushloop.collect.commission.camera import shown_live, still, taught_camera
-from brushloop.collect.commission.notebook import Notebook, Taught, Value, rig_of
 from brushloop.collect.commission.sheet import Point, corners_of
-from brushloop.collect.commission.step import NO, YES, Asked, Step, Visit
+from brushloop.collect.commission.visit import NO, YES, Asked, Notebook, Step, Taught, Value, Visit, rig_of
 from brushloop.collect.errors import ConfigError, NotAccepted
 from brushloop.collect.photograph.frames import ARM_SHARE, Thumbnail, changed_share, thumbnail
 from brushloop.collect.rig.check import draw_rig

@@ -7,8 +7,7 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
-from brushloop.collect.commission.notebook import Taught, rig_of
-from brushloop.collect.commission.step import Step, Visit
+from brushloop.collect.commission.visit import Step, Taught, Visit, rig_of
 from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.open_or_resume import CollectRequest, Opening
 from brushloop.collect.errors import NotAccepted

@@ -18,8 +18,7 @@ from scipy.optimize import least_squares
 from brushloop.calibrate.board.spec import BoardSpec, size_mm
 from brushloop.collect.commission.arm import taught_arm, tip_of, touch
 from brushloop.collect.commission.camera import board_of
-from brushloop.collect.commission.notebook import Notebook, Taught
-from brushloop.collect.commission.step import Step, Visit
+from brushloop.collect.commission.visit import Notebook, Step, Taught, Visit
 from brushloop.collect.errors import NotAccepted
 from brushloop.collect.rig.paper import PaperPlane, fit_plane
 

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from brushloop.collect.commission.arm import taught_arm, tip_of, touch
-from brushloop.collect.commission.notebook import Notebook, Taught
-from brushloop.collect.commission.step import Step, Visit
+from brushloop.collect.commission.visit import Notebook, Step, Taught, Visit
 from brushloop.collect.errors import NotAccepted
 from brushloop.collect.rig.check import brush_square
 from brushloop.drivers.arcs.controller import Controller

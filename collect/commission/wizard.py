@@ -9,12 +9,11 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.commission.arm import ArmStep
 from brushloop.collect.commission.brush import BrushStep, ForceStep
 from brushloop.collect.commission.camera import CameraStep
-from brushloop.collect.commission.notebook import StepName, Value, write_rig
 from brushloop.collect.commission.places import LimitsStep, PlacesStep
 from brushloop.collect.commission.proof import ProofStep
 from brushloop.collect.commission.sheet import SheetStep
-from brushloop.collect.commission.step import LeftOff, Step, Visit, WentBack, choice_of
 from brushloop.collect.commission.tip import TipStep
+from brushloop.collect.commission.visit import LeftOff, Step, StepName, Value, Visit, WentBack, choice_of, write_rig
 from brushloop.collect.errors import CollectAborted, ConfigError, NotAccepted, StepError
 from brushloop.collect.operator import Choice
 from brushloop.drivers.errors import DeviceError

@@ -22,7 +22,7 @@ from textual.content import Content
 from textual.screen import Screen
 from textual.widgets import Footer, Input
 
-from brushloop.collect.commission.step import LeftOff, Tone, Visit, WentBack
+from brushloop.collect.commission.visit import LeftOff, Tone, Visit, WentBack
 from brushloop.collect.engine.snapshot import REFRESH_S
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.operator import Prompt, stop_signals

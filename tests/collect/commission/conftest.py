@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from brushloop.collect.commission.notebook import Taught, Value
-from brushloop.collect.commission.step import LeftOff, Tone, Visit
+from brushloop.collect.commission.visit import LeftOff, Taught, Tone, Value, Visit
 from brushloop.collect.commission.wizard import Wizard
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.operator import Asker, Prompt

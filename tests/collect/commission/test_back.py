@@ -10,8 +10,7 @@ import pytest
 from brushloop.collect.commission.arm import ADDRESS
 from brushloop.collect.commission.brush import BRUSH, BUS, PORT, BrushStep, ForceStep
 from brushloop.collect.commission.camera import CameraStep
-from brushloop.collect.commission.notebook import Notebook, Taught
-from brushloop.collect.commission.step import Asked, LeftOff, Visit, WentBack
+from brushloop.collect.commission.visit import Asked, LeftOff, Notebook, Taught, Visit, WentBack
 from brushloop.collect.commission.wizard import Wizard
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.operator import Prompt

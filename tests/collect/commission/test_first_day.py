@@ -12,10 +12,9 @@ from types import SimpleNamespace
 import pytest
 
 from brushloop.collect.commission import camera, proof
-from brushloop.collect.commission.notebook import Notebook
 from brushloop.collect.commission.places import AWAY
 from brushloop.collect.commission.proof import ProofStep, read_proof
-from brushloop.collect.commission.step import Visit
+from brushloop.collect.commission.visit import Notebook, Visit
 from brushloop.collect.commission.wizard import Wizard
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.rig.doctor import Finding

@@ -16,12 +16,11 @@ from scipy.spatial.transform import Rotation
 
 from brushloop.collect.commission import arm, places, proof
 from brushloop.collect.commission.arm import ArmStep
-from brushloop.collect.commission.notebook import Notebook, Taught
 from brushloop.collect.commission.places import PlacesStep, check_pot, check_wipe
 from brushloop.collect.commission.proof import ProofStep, slowly
 from brushloop.collect.commission.sheet import BOARD, all_corners
-from brushloop.collect.commission.step import Visit
 from brushloop.collect.commission.tip import TipStep
+from brushloop.collect.commission.visit import Notebook, Taught, Visit
 from brushloop.collect.errors import ConfigError, NotAccepted
 from brushloop.collect.operator import Prompt
 from brushloop.collect.photograph.frames import Thumbnail

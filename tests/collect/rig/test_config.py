@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from brushloop.collect.commission.notebook import Notebook, Taught
+from brushloop.collect.commission.visit import Notebook, Taught
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.check import check_rig, places_of

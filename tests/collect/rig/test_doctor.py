@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from brushloop.collect.commission.notebook import Notebook, Taught
+from brushloop.collect.commission.visit import Notebook, Taught
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.doctor import examine, numbers_only, scrubber_of
 from brushloop.drivers.arcs.controller import SafetyMode

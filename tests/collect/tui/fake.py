@@ -21,7 +21,7 @@ from textual.pilot import Pilot
 
 from brushloop.collect.commission.arm import ADDRESS
 from brushloop.collect.commission.brush import BRUSH, BUS
-from brushloop.collect.commission.step import Visit
+from brushloop.collect.commission.visit import Visit
 from brushloop.collect.engine.capture import mark_of
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.engine import Engine

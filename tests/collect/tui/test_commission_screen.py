@@ -12,7 +12,7 @@ from contextlib import asynccontextmanager
 import pytest
 from textual.pilot import Pilot
 
-from brushloop.collect.commission.step import LeftOff, WentBack
+from brushloop.collect.commission.visit import LeftOff, WentBack
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.tui.commission_app import CommissionApp, Steps
 from brushloop.collect.tui.widgets import AskScreen

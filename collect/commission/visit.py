@@ -1,0 +1,434 @@
+"""What has been taught so far, in one file beside the future `rig.toml`, and the visit in which a person teaches it.
+
+The file is written whole after each value. It holds what was observed (where the flange stood at each thing) and what
+was found from it, so that a session that was interrupted asks nothing again, and a value that depends on others is
+computed again when they change.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import textwrap
+import time
+import tomllib
+from abc import ABC, abstractmethod
+from collections import defaultdict
+from collections.abc import Callable, Generator, Iterator, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, ClassVar, Literal, get_args
+
+import numpy as np
+import pydantic.dataclasses
+from numpy.typing import NDArray
+from pydantic import Field, ValidationError
+
+from brushloop.calibrate.files import replacing, write_whole
+from brushloop.collect.errors import ConfigError, NotAccepted, StepError
+from brushloop.collect.operator import Asker, Choice, Prompt
+from brushloop.collect.rig.check import Check, unmeasured
+from brushloop.collect.rig.config import RigConfig, with_optics
+from brushloop.collect.rig.config_file import Config, Finite, read_text, refusal
+from brushloop.drivers.arcs.wire import Framing
+from brushloop.drivers.devices import Pose
+from brushloop.drivers.host import Clock
+from brushloop.sessions.disk import fsync_folder, number, set_aside, sync
+
+MAX_BYTES = 1024 * 1024
+ENDING, ASIDE = ".taught.json", "aside."
+Value = bool | int | float | str | list[Finite] | list[list[Finite]]
+"""What a field of `rig.toml` can hold."""
+StepName = Literal["arm", "camera", "tip", "sheet", "places", "brush", "force", "limits", "proof"]
+"""In the order in which they are taught: the box of the limits needs the deepest press."""
+STEPS: tuple[StepName, ...] = get_args(StepName)
+UNKNOWN = "not "
+"""Beginning of the text for a value that was taken over without a measurement."""
+HEAD = "# Made by `brushloop rig new`. Each value: how it was obtained, how well it is known, when."
+UNPROVEN = "# NOT PROVEN: `brushloop rig teach proof --arm` has not been run since the last value was taught."
+PROVEN = "# Proven by a dry run, a touch, the self-check and a judged press"
+UNTRIED = """\
+# The software that wrote this file has never been tried on a real cabinet. A difference would show in:
+#   framing, ports, modes: step 1 of `brushloop rig new`; flange poses: the residuals of step 3;
+#   speeds and stops: the dry run of the last step; forces: the push in the step of the brush."""
+
+
+def now_utc() -> str:
+    """The current time in UTC as text, to the second, as the notebook keeps it."""
+    return datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+
+
+@pydantic.dataclasses.dataclass(frozen=True)
+class Taught:
+    """The value of one field of `rig.toml`, how it was obtained, and how well it is known."""
+
+    value: Value
+    how: str
+    """How it was obtained, as a clause."""
+    unit: str = ""
+    sigma: float | None = None
+    """One standard error, in the unit; None where none can be given."""
+    known: str = ""
+    """How well it is known, in words."""
+    at: str = field(default_factory=now_utc)
+    """When, in UTC."""
+
+    def comment(self) -> str:
+        """One line for `rig.toml`."""
+        error = "" if self.sigma is None else f", standard error {self.sigma:.3g} {self.unit}".rstrip()
+        return f"{self.how}{error}{'; ' if self.known else ''}{self.known} ({self.at})"
+
+
+class Notebook(Config):
+    """Everything that is known of one rig. It is kept in one file, which `save` replaces as a whole."""
+
+    schema_version: Literal[1] = 1
+    values: dict[str, Taught] = Field(default_factory=dict[str, Taught])
+    """By the path of the field in `rig.toml`; `aside.` marks values that are not in it."""
+    touches: dict[str, Pose] = Field(default_factory=dict[str, Pose])
+    """The flange in the base frame while the tip was at a thing, by its name: `pin 0`, `board-corner lower left 1`."""
+    done: dict[StepName, str] = Field(default_factory=dict[StepName, str])
+    """Steps that were finished, and when."""
+
+    @classmethod
+    def load(cls, rig_path: Path) -> Notebook:
+        """What was taught of this rig; an empty notebook where there is no file. Raises `ConfigError`."""
+        path = notebook_path(rig_path)
+        try:
+            return cls.model_validate_json(read_text(path, MAX_BYTES)) if path.exists() else cls()
+        except ValidationError as error:
+            raise refusal(path, error, cls) from None
+
+    def save(self, rig_path: Path) -> None:
+        """Replace the file; returns once it is safe against a loss of power. Raises `ConfigError`."""
+        path = notebook_path(rig_path)
+        try:
+            with replacing(path) as part, part.open("w", encoding="utf-8") as file:
+                file.write(self.model_dump_json(indent=1))
+                sync(file)
+            fsync_folder(path.absolute().parent)
+        except OSError as error:
+            raise ConfigError(path, "", error.strerror or str(error)) from None
+
+    @property
+    def framing(self) -> Framing:
+        """Framing that the controller answered; `sof` until that is known."""
+        return "bare" if self.get("robot.framing") == "bare" else "sof"
+
+    def get(self, field: str) -> Value | None:
+        """The value of a field; None where it was not taught."""
+        known = self.values.get(field)
+        return None if known is None else known.value
+
+    def number(self, field: str) -> float:
+        """A value that is one number. Raises KeyError where it was not taught."""
+        value = self.values[field].value
+        assert isinstance(value, int | float)
+        return float(value)
+
+    def numbers(self, field: str) -> tuple[float, ...]:
+        """A value that is a list of numbers. Raises KeyError where it was not taught."""
+        value = self.values[field].value
+        assert isinstance(value, list)
+        return tuple(float(v) for v in value if not isinstance(v, list))
+
+    def table(self, beginning: str) -> dict[str, Value]:
+        """The values whose paths begin like this, by the rest of their paths."""
+        return {name.removeprefix(beginning): t.value for name, t in self.values.items() if name.startswith(beginning)}
+
+    def touched(self, kind: str) -> dict[str, Pose]:
+        """Everything touched of one kind, by the rest of its name, in the order in which it was touched."""
+        return {name[len(kind) + 1 :]: pose for name, pose in self.touches.items() if name.split(" ")[0] == kind}
+
+    def with_values(self, values: Mapping[str, Taught]) -> Notebook:
+        """The same with these values; others stay."""
+        return self.model_copy(update={"values": {**self.values, **values}})
+
+    def with_touch(self, name: str, flange: Pose) -> Notebook:
+        """The same with one more touch, or another one in its place."""
+        return self.model_copy(update={"touches": {**self.touches, name: flange}})
+
+    def without(self, *names: str) -> Notebook:
+        """The same without the values whose paths begin like this, and without what was touched of these kinds, such
+        as `pin`, or of these names, such as `pin 0`."""
+        values = {field: known for field, known in self.values.items() if not field.startswith(names)}
+        touches = {n: touch for n, touch in self.touches.items() if n not in names and n.split(" ")[0] not in names}
+        return self.model_copy(update={"values": values, "touches": touches})
+
+    def finished(self, step: StepName) -> Notebook:
+        """The same with this step done. Only the proof proves what it rests on: after another step it is done again."""
+        unproven = self.reopened("proof")
+        return unproven.model_copy(update={"done": {**unproven.done, step: now_utc()}})
+
+    def reopened(self, step: StepName) -> Notebook:
+        """The same with this step to be done again."""
+        return self.model_copy(update={"done": {name: at for name, at in self.done.items() if name != step}})
+
+
+def notebook_path(rig_path: Path) -> Path:
+    """Where the notebook of a rig lies: beside its `rig.toml`."""
+    return rig_path.with_name(rig_path.stem + ENDING)
+
+
+def gaps(notebook: Notebook) -> Iterator[Check]:
+    """Steps that were not finished, and values that were taken over from a pendant or a default: for `rig check`."""
+    if not notebook.values:
+        return
+    for step in STEPS:
+        if step not in notebook.done:
+            arm = " --arm" if step == "proof" else ""
+            yield unmeasured(f"step {step}", "not done since something was taught", f"brushloop rig teach {step}{arm}")
+    for path, known in notebook.values.items():
+        if known.known.startswith(UNKNOWN) and not path.startswith(ASIDE):
+            yield unmeasured(path, f"{known.value} {known.unit}".rstrip(), f"{known.how}, {known.known}")
+
+
+def rig_of(notebook: Notebook, rig_path: Path) -> RigConfig:
+    """The configuration that the notebook gives, without overrides from the environment. Raises `ConfigError`."""
+    try:
+        rig = RigConfig.model_validate(tomllib.loads(rig_text(notebook, rig_path)))
+    except ValidationError as error:
+        raise refusal(rig_path, error, RigConfig) from None
+    return rig.model_copy(update={"camera": with_optics(rig_path, rig.camera)})
+
+
+def rig_text(notebook: Notebook, rig_path: Path) -> str:
+    """`rig.toml`: every value with how it was obtained, how well it is known, and when."""
+    proven = notebook.done.get("proof")
+    lines = [HEAD, UNPROVEN if proven is None else f"{PROVEN}, {proven}.", *UNTRIED.splitlines()]
+    tables = defaultdict[str, list[str]](list)
+    named = {"name": rig_path.stem, "paper.name": "Xuan paper"}
+    for path, value in {**named, **notebook.table("")}.items():
+        if path.startswith(ASIDE):
+            continue
+        table, _, name = path.rpartition(".")
+        if (known := notebook.values.get(path)) is not None:
+            tables[table] += [f"# {line}" for line in textwrap.wrap(known.comment().replace("\n", " "), 116)]
+        # TOML writes numbers, strings, lists and booleans as JSON does, but for one character.
+        text = json.dumps(_rounded(value), ensure_ascii=False).replace("\x7f", "\\u007f")
+        tables[table].append(f"{name} = {text}")
+    for table in sorted(tables, key=lambda name: (name != "", name.split(".")[0] != "robot", name)):
+        lines += ["", *([f"[{table}]"] if table else []), *tables[table]]
+    return "\n".join(lines) + "\n"
+
+
+def write_rig(rig_path: Path, notebook: Notebook) -> Path | None:
+    """Write `rig.toml`; returns where an older file with another text is kept. Raises `ConfigError`, OSError."""
+    rig_of(notebook, rig_path)
+    text = rig_text(notebook, rig_path)
+    changed = rig_path.exists() and rig_path.read_text(encoding="utf-8") != text
+    kept = set_aside(rig_path, "bak") if changed else None
+    write_whole(rig_path, text)
+    return kept
+
+
+def _rounded(value: Value) -> Any:
+    """Round a value for the file: no value is known better than 0.001 mm or 0.0001 deg."""
+    if isinstance(value, list):
+        return [_rounded(v) for v in value]
+    return round(value, 4) + 0.0 if isinstance(value, float) else value
+
+
+# The person
+
+
+Picture = NDArray[np.uint8]
+"""(h, w) gray or (h, w, 3) BGR."""
+ARM = Choice("a", "let it move: I look at the cell, my hand is at the emergency stop")
+STAY = Choice("x", "leave it where it is")
+YES, NO = Choice("y", "yes"), Choice("n", "no")
+THERE, SKIP = Choice("enter", "it is there"), Choice("k", "skip it")
+Tone = Literal["finding", "warning", "trouble"]
+"""After a warning the step can go on; trouble ends it, and its last line says what to do."""
+
+
+class LeftOff(Exception):
+    """The person ended the session in the middle; everything taught so far is kept."""
+
+
+class WentBack(Exception):
+    """The person wants to go back one question: what was answered before this one is taken back, and asked again."""
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """One value that a person types or chooses: its field in `rig.toml`, the question, its range, and its check."""
+
+    field: str
+    question: str
+    unit: str = ""
+    low: float = 0.0
+    high: float = 0.0
+    """Range of a number; a text or a choice has none."""
+    sigma: float | None = None
+    default: str | Callable[[Notebook], str] = ""
+    """What an empty line stands for; an empty text if it is no answer."""
+    choices: tuple[Choice, ...] = ()
+    check: Callable[[Notebook, float], Check] | None = None
+    """Compares the number with what is known already."""
+    read: Callable[[str], Value] = str
+    """Reads a text; raises ValueError, worded for the person, where it cannot be used."""
+
+    def prompt(self, notebook: Notebook) -> Prompt:
+        """The question, with what its empty line stands for."""
+        default = self.default if isinstance(self.default, str) else self.default(notebook)
+        if self.choices:
+            return choice_of(self.question, self.choices, default)
+        allowed = f"{self.low:g} to {self.high:g} {self.unit}" if self.high > self.low else ""
+        return Prompt(self.question, default=default, read=lambda line: self.value(line, notebook), allowed=allowed)
+
+    def value(self, line: str, notebook: Notebook) -> Value:
+        """What a line stands for. Raises ValueError, worded for the person, where it cannot be the value."""
+        if self.high <= self.low:
+            return self.read(line)
+        try:
+            value = number(line.replace(",", "."))
+        except ValueError:
+            raise ValueError(f"{line!r} is not a number") from None
+        if not self.low <= value <= self.high:
+            raise ValueError(f"{value:g} is outside {self.low:g} to {self.high:g} {self.unit}")
+        if self.check is not None and (check := self.check(notebook, value)).verdict == "contradicts":
+            raise ValueError(f"{value:g} {self.unit} cannot be ({check.allowed}). {check.remedy}")
+        return value
+
+
+def choice_of(question: str, choices: tuple[Choice, ...], default: str = "") -> Prompt:
+    """A question with answers on keys; Enter stands for the default, or for nothing if there is none."""
+    return Prompt(question, choices, default, answers={"enter": default} if default else {})
+
+
+class Visit:
+    """One session with a person at one rig. What is kept is on disk at once; a screen in another thread reads it."""
+
+    def __init__(self, rig_path: Path, clock: Clock, *, armed: bool) -> None:
+        """`armed`: the command line allows motion; the person is asked again each time. Raises `ConfigError`."""
+        self.rig_path = rig_path
+        self.clock = clock
+        self.armed = armed
+        self.asker = Asker(watched=True)
+        self.notebook = Notebook.load(rig_path)
+        self.step = ""
+        """Which step is taught now."""
+        self.findings: list[tuple[Tone, str]] = []
+        self.picture: Picture | None = None
+        """The newest picture of a finding."""
+        self.live: Picture | None = None
+        """What the camera sees now, while somebody guides something by it."""
+        self.doing: tuple[str, float] = ("", time.monotonic())
+        """What is at work while nothing is asked, empty where no step has said so, and since when."""
+        self._answered: list[Notebook] = []
+        """The notebook as it was at each question of this process that was answered."""
+
+    # The notebook
+
+    def save(self, notebook: Notebook) -> None:
+        """Replace the notebook."""
+        notebook.save(self.rig_path)
+        self.notebook = notebook
+
+    def keep(self, values: Mapping[str, Taught]) -> None:
+        """Note values by their fields: after a loss of power all of them are known, or none."""
+        self.save(self.notebook.with_values(values))
+
+    def forget(self, *names: str) -> None:
+        """Take values and touches out of the notebook, so that they are asked for again."""
+        self.save(self.notebook.without(*names))
+
+    @contextlib.contextmanager
+    def asked_again_if_refused(self, *names: str) -> Generator[None]:
+        """Forget values and touches of these names where they contradict each other; they are asked for again."""
+        try:
+            yield
+        except (NotAccepted, StepError):
+            self.forget(*names)
+            raise
+
+    def teach_afresh(self, step: Step) -> None:
+        """Forget what a step observed; going back undoes that."""
+        self._answered.append(self.notebook)
+        self.save(self.notebook.without(*step.observes).reopened(step.name))
+
+    def back(self) -> None:
+        """Restore the notebook of the last answered question, if there is one, so that it is asked again."""
+        if self._answered:
+            self.save(self._answered.pop())
+
+    # The person
+
+    def say(self, *lines: str, tone: Tone = "finding", picture: Picture | None = None) -> None:
+        """Show lines, and a picture if there is one."""
+        self.findings.append((tone, "\n".join(lines)))
+        self.picture = self.picture if picture is None else picture
+
+    def working(self, what: str) -> None:
+        """Show what is being done until the next question."""
+        self.doing = what, time.monotonic()
+
+    async def ask(self, prompt: Prompt, *, back: bool = True) -> Any:
+        """Wait for an answer that the prompt allows, and let going `back` lead here. Raises `WentBack` and `LeftOff`.
+
+        A step asks nothing that is in the notebook, so the notebook of now leads it to this question again; answers
+        that were not kept are one with those before them.
+        """
+        notebook = self.notebook
+        try:
+            answer = await self.asker.ask(prompt)
+        finally:
+            self.working("")
+        if back and not (self._answered and self._answered[-1] is notebook):
+            self._answered.append(notebook)
+        return answer
+
+    async def choose(self, question: str, choices: tuple[Choice, ...], default: str = "") -> str:
+        """The key of one of the choices; `default` is taken for an empty answer, which is none if it is empty."""
+        return str(await self.ask(choice_of(question, choices, default)))
+
+    async def yes(self, question: str) -> bool:
+        """Ask for yes or no; Enter is neither."""
+        return await self.choose(question, (YES, NO)) == YES.key
+
+    async def brought(self, thing: str, how: str, *, may_skip: bool = False) -> bool:
+        """Ask the person to bring a thing somewhere; False if it is skipped, where it `may_skip`."""
+        choices = (THERE, SKIP) if may_skip else (THERE,)
+        answers = {choice.key: choice is THERE for choice in choices}
+        return bool(await self.ask(Prompt(how, choices, thing=thing, answers=answers)))
+
+    async def values(self, *values: Asked) -> None:
+        """Ask for each of these values that is not known yet, and keep it."""
+        for asked in values:
+            if asked.field in self.notebook.values:
+                continue
+            prompt = asked.prompt(self.notebook)
+            value = await self.ask(prompt)
+            agreed = isinstance(value, float) and prompt.default and value == float(prompt.default)
+            how = "suggested, and agreed" if agreed else f"typed: {asked.question}"
+            self.keep({asked.field: Taught(value, how, asked.unit, asked.sigma)})
+
+    async def may_move(self, what: str) -> None:
+        """Ask for the key that lets the arm move. Raises `NotAccepted` unless both it and `--arm` are given."""
+        if not self.armed:
+            raise NotAccepted(f"{what}: this moves the arm.", "Start the same command again with --arm.")
+        question = f"{what}. The arm moves by itself, slower than 50 mm/s. Is nobody within its reach?"
+        if await self.choose(question, (ARM, STAY), STAY.key) != ARM.key:
+            raise NotAccepted("the arm was left where it is.", "Try this step again once it may move.")
+
+
+class Step(ABC):
+    """One step of the first day."""
+
+    name: ClassVar[StepName]
+    title: ClassVar[str]
+    minutes: ClassVar[int]
+    needs: ClassVar[tuple[StepName, ...]]
+    """Steps whose values this one depends on."""
+    observes: ClassVar[tuple[str, ...]] = ()
+    """Beginnings of fields and kinds of touches that are forgotten when it is taught again."""
+
+    @abstractmethod
+    async def carry_out(self, visit: Visit) -> None:
+        """Ask, measure and keep. Raises `WentBack`, `LeftOff`, `NotAccepted` and what the devices raise."""
+
+    def derived(self, notebook: Notebook) -> dict[str, Taught]:
+        """Values that follow from the notebook alone; computed again whenever a value they depend on changes."""
+        return {}
