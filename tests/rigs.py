@@ -11,6 +11,7 @@ import sys
 import threading
 from collections.abc import AsyncGenerator, Callable, Iterator
 from concurrent.futures import Future
+from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -65,25 +66,37 @@ _R = TypeVar("_R")
 
 
 @contextlib.contextmanager
-def serving(config: SimConfig) -> Iterator[LoopbackRig]:
-    """The rig serves from another thread's event loop until the block ends."""
-    ready: Future[tuple[LoopbackRig, asyncio.AbstractEventLoop, asyncio.Event]] = Future()
+def in_thread(servers: AbstractAsyncContextManager[_R]) -> Iterator[tuple[_R, asyncio.AbstractEventLoop]]:
+    """They serve from another thread's event loop until the block ends."""
+    ready: Future[tuple[_R, asyncio.AbstractEventLoop, asyncio.Event]] = Future()
 
     async def serve() -> None:
         over = asyncio.Event()
-        async with LoopbackRig(config) as rig:
-            ready.set_result((rig, asyncio.get_running_loop(), over))
-            await over.wait()
+        try:
+            async with servers as entered:
+                ready.set_result((entered, asyncio.get_running_loop(), over))
+                await over.wait()
+        except BaseException as error:
+            if not ready.done():
+                ready.set_exception(error)
+            raise
 
-    thread = threading.Thread(target=lambda: asyncio.run(serve()), name="loopback rig", daemon=True)
+    thread = threading.Thread(target=lambda: asyncio.run(serve()), name="servers", daemon=True)
     thread.start()
-    rig, loop, over = ready.result(timeout=PATIENCE_S)
+    entered, loop, over = ready.result(timeout=PATIENCE_S)
     try:
-        yield rig
+        yield entered, loop
     finally:
         loop.call_soon_threadsafe(over.set)
         thread.join(timeout=PATIENCE_S)
-        assert not thread.is_alive(), f"waited {PATIENCE_S:g} s for the loopback rig to end"
+        assert not thread.is_alive(), f"waited {PATIENCE_S:g} s for the servers to end"
+
+
+@contextlib.contextmanager
+def serving(config: SimConfig) -> Iterator[LoopbackRig]:
+    """The rig serves from another thread's event loop until the block ends."""
+    with in_thread(LoopbackRig(config)) as (rig, _):
+        yield rig
 
 
 @dataclass

@@ -6,10 +6,7 @@ import asyncio
 import contextlib
 import itertools
 import math
-import threading
 from collections.abc import AsyncIterator, Iterator
-from concurrent.futures import Future
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +25,7 @@ from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.lab import UnknownLab
 from brushloop.drivers.sim.lab_facts import Trap
 from brushloop.drivers.sim.world import World, tool_of
-from tests.waiting import PATIENCE_S
+from tests.rigs import in_thread
 
 
 class Person(Asker):
@@ -157,28 +154,8 @@ class InLab(Person):
 @contextlib.contextmanager
 def in_lab(seed: int, trap: Trap | None = None, **options: Any) -> Iterator[InLab]:
     """The lab serves from a thread of its own until the block ends."""
-    ready: Future[tuple[UnknownLab, asyncio.AbstractEventLoop, asyncio.Event]] = Future()
-
-    async def serve() -> None:
-        over = asyncio.Event()
-        try:
-            async with UnknownLab(seed, trap, **options) as lab:
-                ready.set_result((lab, asyncio.get_running_loop(), over))
-                await over.wait()
-        except BaseException as error:
-            if not ready.done():
-                ready.set_exception(error)
-            raise
-
-    thread = threading.Thread(target=lambda: asyncio.run(serve()), name="unknown lab", daemon=True)
-    thread.start()
-    lab, loop, over = ready.result(timeout=PATIENCE_S)
-    try:
+    with in_thread(UnknownLab(seed, trap, **options)) as (lab, loop):
         yield InLab(lab, loop)
-    finally:
-        loop.call_soon_threadsafe(over.set)
-        thread.join(timeout=PATIENCE_S)
-        assert not thread.is_alive(), f"waited {PATIENCE_S:g} s for the lab to end"
 
 
 async def first_day(person: InLab, rig_path: Path, *, armed: bool = True) -> Path | None:
@@ -194,50 +171,23 @@ def newest_session(rig_path: Path) -> Path:
     return max(rig_path.parent.glob("rig.proof-*/sessions/*"), key=lambda session: session.stat().st_mtime)
 
 
-@dataclass(frozen=True, slots=True)
-class Errors:
-    """What a first day got wrong; base frame, against the truth."""
-
-    tcp_mm: float
-    origin_mm: float
-    yaw_deg: float
-    touch_mm: float
-    """Of the true tip above the true sheet at the touch point, with the arm at the taught height."""
-    delay_share: float
-
-    @property
-    def within(self) -> bool:
-        """Whether all are within the limits that a first day promises."""
-        return (
-            self.tcp_mm <= 0.5
-            and self.origin_mm <= 0.5
-            and self.yaw_deg <= 0.2
-            and self.touch_mm <= 0.1
-            and self.delay_share <= 0.2
-        )
-
-    def __str__(self) -> str:
-        return (
-            f"TCP {self.tcp_mm:.2f} mm, origin {self.origin_mm:.2f} mm, yaw {self.yaw_deg:.2f} deg, touch "
-            f"{self.touch_mm:.3f} mm, delay {100 * self.delay_share:.0f} %"
-        )
+LIMITS = {"tip_mm": 0.5, "origin_mm": 0.5, "yaw_deg": 0.2, "touch_mm": 0.1, "delay_share": 0.2}
+"""Errors of a proven rig that a first day promises."""
 
 
-def errors(rig_path: Path, lab: UnknownLab) -> Errors:
-    """Compare a `rig.toml` with the truth of its lab."""
+def errors(rig_path: Path, lab: UnknownLab) -> dict[str, float]:
+    """Compare a `rig.toml` with the truth of its lab, in the base frame."""
     rig, tool = load_rig(rig_path), tool_of(lab.facts.config)
-    tcp_error = np.array(rig.robot.tcp_offset_mm) - 1e3 * tool[:3, 3]
-    paper = rig.paper
-    x, y = to_base(paper, *paper.touch_point_mm)
-    table = lab.facts.config.table
-    paper_x, paper_y = lab.world.config.table.to_paper(x, y)
+    paper, table, view = rig.paper, lab.facts.config.table, lab.facts.config.view
+    tip_error = np.array(rig.robot.tcp_offset_mm) - 1e3 * tool[:3, 3]
     # A brush held upright with a tool that is taken for too long stands that much higher.
-    true_tip_z_mm = paper.touch_z_mm + float(tcp_error @ tool[:3, 2])
-    delay_s = lab.facts.config.view.delay_s + 0.5 * lab.facts.config.view.delay_jitter_s
-    return Errors(
-        float(np.linalg.norm(tcp_error)),
-        math.dist(paper.origin_mm, table.origin_mm),
-        abs(math.remainder(paper.yaw_deg - table.yaw_deg, 360.0)),
-        abs(true_tip_z_mm - table.surface_z_mm(paper_x, paper_y)),
-        abs(rig.camera.latency_ms / 1e3 - delay_s) / delay_s,
-    )
+    true_tip_z_mm = paper.touch_z_mm + float(tip_error @ tool[:3, 2])
+    sheet_z_mm = table.surface_z_mm(*table.to_paper(*to_base(paper, *paper.touch_point_mm)))
+    delay_s = view.delay_s + 0.5 * view.delay_jitter_s
+    return {
+        "tip_mm": float(np.linalg.norm(tip_error)),
+        "origin_mm": math.dist(paper.origin_mm, table.origin_mm),
+        "yaw_deg": abs(math.remainder(paper.yaw_deg - table.yaw_deg, 360.0)),
+        "touch_mm": abs(true_tip_z_mm - sheet_z_mm),
+        "delay_share": abs(rig.camera.latency_ms / 1e3 - delay_s) / delay_s,
+    }

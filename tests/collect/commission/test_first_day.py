@@ -16,12 +16,10 @@ from brushloop.collect.commission.places import AWAY
 from brushloop.collect.commission.proof import ProofStep, read_proof
 from brushloop.collect.commission.visit import Notebook, Visit
 from brushloop.collect.commission.wizard import Wizard
-from brushloop.collect.rig.config import RigConfig, load_rig
-from brushloop.collect.rig.doctor import Finding
-from brushloop.drivers.host import Clock
+from brushloop.collect.rig.config import load_rig
 from brushloop.drivers.sim.lab_facts import Trap
 from brushloop.sessions.events import SelfCheckResult, ZeroTouchResult
-from tests.collect.commission.conftest import Errors, InLab, errors, first_day, in_lab, newest_session
+from tests.collect.commission.conftest import LIMITS, InLab, errors, first_day, in_lab, newest_session
 
 SMALL_PX = (800, 600)
 FAST = 30.0
@@ -139,7 +137,9 @@ async def test_killed_again_and_again_it_asks_nothing_twice_and_a_step_taught_ag
     text = rig.read_text(encoding="utf-8")
     assert "NOT PROVEN" in text
     assert "# the same pin touched from" in text
-    _within_a_hands_error(errors(rig, person.lab), load_rig(rig).camera.latency_ms)
+    off = errors(rig, person.lab)
+    by_hand = LIMITS | {"touch_mm": 0.5}
+    assert all(off[name] <= most for name, most in by_hand.items() if name != "delay_share"), off
 
     before, brought = Notebook.load(rig), len(person.brought)
     await Wizard(person.visit(rig)).again("tip")
@@ -152,56 +152,24 @@ async def test_killed_again_and_again_it_asks_nothing_twice_and_a_step_taught_ag
     assert rig.with_name("rig.toml.bak-1").read_text(encoding="utf-8") == text
     assert any("Changed with it, because it depends on this step:" in text for _, text in person.shown)
 
-    await _killed_in_each_part_of_the_proof(person, rig, monkeypatch)
+    await _proven(person, rig, monkeypatch)
     assert "NOT PROVEN" not in rig.read_text(encoding="utf-8")
     assert load_rig(rig).camera.latency_ms == DELAY_MS
 
 
-async def _killed_in_each_part_of_the_proof(person: InLab, rig: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def _proven(person: InLab, rig: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Devices are examined and values kept as ever; the two runs, which take minutes, are left out."""
-    parts, examine, save = ["doctor", "dry run", "presses", "values"], proof.examine, Notebook.save
     brought, asked = len(person.brought), len(person.asked)
 
-    def reached(part: str) -> None:
-        if parts and parts[0] == part:
-            parts.pop(0)
-            raise Killed
-
-    async def examined(config: RigConfig, clock: Clock) -> list[Finding]:
-        found = await examine(config, clock)
-        reached("doctor")
-        return found
-
-    async def run(_step: ProofStep, _day: Visit, folder: Path, _protocol: str, *, dry: bool) -> Path:
-        reached("dry run" if dry else "presses")
+    async def run(_step: ProofStep, _visit: Visit, folder: Path, _protocol: str, *, dry: bool) -> Path:
         return folder
 
-    def saved(notebook: Notebook, path: Path) -> None:
-        save(notebook, path)
-        if notebook.get("camera.latency_ms") == DELAY_MS:
-            reached("values")
-
     with monkeypatch.context() as proving:
-        proving.setattr(proof, "examine", examined)
         proving.setattr(ProofStep, "_run", run)
         proving.setattr(proof, "read_proof", lambda _session: PROVEN)
-        proving.setattr(Notebook, "save", saved)
-        for left in (3, 2, 1, 0):
-            with pytest.raises(Killed):
-                await first_day(person, rig)
-            assert len(parts) == left
         assert await first_day(person, rig) == rig
     assert len(person.brought) == brought, "something was brought again"
     assert all("The arm moves by itself" in question for question in person.asked[asked:])
-
-
-def _within_a_hands_error(found: Errors, latency_ms: float) -> None:
-    """By hand alone: without the arm's own touch, heights are known to a few tenths, and the delay is not."""
-    assert found.tcp_mm <= 0.5
-    assert found.origin_mm <= 0.5
-    assert found.yaw_deg <= 0.2
-    assert found.touch_mm <= 0.5
-    assert latency_ms == 250.0
 
 
 @pytest.mark.parametrize("trap", [Trap.OLD_SOFTWARE, Trap.MIRRORED_CAMERA])
@@ -213,12 +181,8 @@ async def test_a_trap_is_named_with_the_way_out_and_the_first_day_goes_on_once_i
         person.mends = True
         person.leave_after = 3
         assert await first_day(person, tmp_path / "rig.toml", armed=False) is None
-        assert _named(person, trap), person.trouble
+        assert _words_on(person, trap), person.trouble
         assert len(person.brought) == 3, "went on to the pin once it was mended"
-
-
-def _named(person: InLab, trap: Trap) -> bool:
-    return bool(_words_on(person, trap))
 
 
 def _words_on(person: InLab, trap: Trap) -> str:
@@ -242,13 +206,12 @@ async def test_thirty_labs(seed: int, tmp_path: Path) -> None:
         if trap is Trap.WRONG_BOARD_SIZE:  # the way out that is named: the camera's step depends on the board's size
             assert await Wizard(person.visit(rig, armed=True)).again("camera") is None
             made = await first_day(person, rig)
-        assert trap is None or _named(person, trap), person.trouble
+        assert trap is None or _words_on(person, trap), person.trouble
         if trap is not None:
             sys.stdout.write(f"{seed:2d} {trap}: {_words_on(person, trap)}\n")
         assert made is not None, person.trouble
-        found, (_, _, captures) = errors(made, person.lab), read_proof(newest_session(made))
+        off, (_, _, captures) = errors(made, person.lab), read_proof(newest_session(made))
         again = sum(capture.retake for capture in captures)
-        took_s = time.monotonic() - began_s
-        sys.stdout.write(f"{seed:2d}: {found}, {again} presses made again, {took_s:.0f} s\n")
-        assert found.within, found
+        sys.stdout.write(f"{seed:2d}: {off}, {again} presses made again, {time.monotonic() - began_s:.0f} s\n")
+        assert all(off[name] <= most for name, most in LIMITS.items()), off
         assert len(captures) - again == proof.PRESSES

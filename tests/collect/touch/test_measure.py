@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import math
 from dataclasses import replace
 from itertools import pairwise
@@ -12,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 from brushloop.collect.errors import ConfigError, NeedsOperator, StepError
 from brushloop.collect.operator import Asker, Prompt
@@ -91,32 +89,6 @@ async def test_touches_by_camera_lie_within_150_um_of_the_truth_at_3_sigma(
     assert abs(float(np.mean(errors))) < 0.03
 
 
-async def test_the_result_goes_into_a_journal_with_its_residuals(make_bench: MakeBench) -> None:
-    bench = make_bench((0.5, 0.5))
-    four = [*THREE["points_mm"], (104.0, 76.0)]
-    result = await measured(bench, method="force", touches=2, points_mm=four, force={"sigma_mm": 0.03})
-    document = json.loads(result.model_dump_json())
-    assert document["method"] == "force"
-    assert len(document["residuals_mm"]) == 4
-    assert 0.0 < max(map(abs, document["residuals_mm"])) < 0.1
-    assert [len(point["touches_mm"]) for point in document["points"]] == [2, 2, 2, 2]
-    assert all(0.0 < sigma <= 0.03 for point in document["points"] for sigma in point["sigma_mm"])
-
-
-async def test_touches_that_do_not_repeat_are_refused_with_their_heights(make_bench: MakeBench) -> None:
-    bench, worn_mm = make_bench(), 0.0
-
-    def wearing(pose: Pose) -> Pose:
-        nonlocal worn_mm
-        worn_mm += 0.005
-        return replace(pose, z_mm=pose.z_mm + worn_mm)
-
-    bench.bent = wearing
-    with pytest.raises(StepError, match=r"not repeat at \(2, 2\) mm: the heights 1.*span 0\.\d+ mm, limit 0\.15"):
-        await measured(bench, method="force", force={"sigma_mm": 0.03})
-    assert bench.lifted
-
-
 @pytest.mark.parametrize(("method", "deeper_mm"), [("force", 2.5), ("camera", 4.5)])
 async def test_nothing_within_the_travel_ends_with_the_brush_lifted(
     make_bench: MakeBench, method: str, deeper_mm: float
@@ -163,7 +135,7 @@ async def test_an_arm_that_was_stopped_or_failed_is_left_where_it_is(
 
 
 def test_by_camera_three_points_are_needed() -> None:
-    with pytest.raises(ValidationError, match="by camera three are needed"):
+    with pytest.raises(ValueError, match="by camera three are needed"):
         TouchConfig(method="camera", points_mm=[(4.0, 4.0)])
 
 
@@ -220,13 +192,6 @@ async def test_a_jog_ends_at_the_travel_limit_and_says_so(make_bench: MakeBench)
     assert bench.lifted
 
 
-async def test_a_jog_that_nobody_watches_asks_for_an_operator(make_bench: MakeBench) -> None:
-    bench = make_bench()
-    with pytest.raises(NeedsOperator, match="Jog until the tip just touches"):
-        await measured(bench, method="jog")
-    assert bench.lifted
-
-
 @pytest.mark.parametrize(
     ("sigma_mm", "second_mm", "repeats"),
     [(None, 0.14, True), (None, 0.16, False), (0.02, 0.16, False), (0.04, 0.19, True), (0.04, 0.21, False)],
@@ -246,21 +211,14 @@ PAPER = PaperConfig(origin_mm=(0.0, 0.0), touch_z_mm=120.0, size_mm=(244.0, 172.
 SHEET = Sheet(PAPER)
 
 
-def used(**config: Any) -> set[int]:
-    return used_patches(SHEET, PAPER, TouchConfig(**config))
-
-
-def test_the_taught_height_and_touches_in_the_margin_cost_no_cell() -> None:
-    assert used() == set()
-    assert used(method="force") == set()
-    assert used(method="force", points_mm=[(2.0, 2.0), (242.0, 2.0), (122.0, 170.0)]) == set()
-
-
-def test_a_patch_costs_every_cell_that_it_may_reach() -> None:
+def test_patches_that_may_be_inked_are_used_up_and_those_beside_touches_in_the_margin_are_not() -> None:
+    margin = TouchConfig(method="force", points_mm=[(2.0, 2.0), (242.0, 2.0), (122.0, 170.0)])
+    for config in (TouchConfig(), margin):
+        assert used_patches(SHEET, PAPER, config) == set()
     corner = SHEET.patch(36)
-    patches = used(method="camera", points_mm=[(corner.x_mm + 4.0, corner.y_mm + 9.0), (124.0, 6.0), (6.0, 100.0)])
-    assert 36 in patches
-    assert 30 in patches, "it grows into the patch above"
+    points = [(corner.x_mm + 4.0, corner.y_mm + 9.0), (124.0, 6.0), (6.0, 100.0)]
+    patches = used_patches(SHEET, PAPER, TouchConfig(method="camera", points_mm=points))
+    assert {30, 36} <= patches, "its rows grow into the patch above"
     assert len(patches) < SHEET.capacity / 3
 
 
