@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from contextlib import AbstractAsyncContextManager
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from brushloop.collect.commission.visit import Asked, Notebook, Step, Taught, Visit
 from brushloop.collect.rig.doctor import Finding, Scrubber, numbers_only, transcript, write_archive
@@ -38,13 +39,10 @@ STILL_S, PATIENCE_S = 0.1, 20.0
 
 def address_of(text: str) -> tuple[str, int]:
     """Host and port from `HOST` or `HOST:PORT`. Raises ValueError, worded for the person who typed it."""
-    host, _, port = text.strip().partition(":")
-    if not host or any(c.isspace() for c in host):
+    parts = urlsplit(f"//{text.strip()}")
+    if not parts.hostname or any(c.isspace() for c in parts.hostname):
         raise ValueError(f"{text!r} is not an address like 192.0.2.7 or 192.0.2.7:{ARCS_PORT}")
-    port = port or str(ARCS_PORT)
-    if not (port.isdecimal() and len(port) <= 5 and 1 <= int(port) <= 65535):
-        raise ValueError(f"port {port!r} is not a number from 1 to 65535")
-    return host, int(port)
+    return parts.hostname, parts.port or ARCS_PORT
 
 
 ADDRESS = Asked(
@@ -151,8 +149,8 @@ class ArmStep(Step):
         visit.working(f"asking {host}:{port} who it is")
         framing, name = await find_framing(host, port)
         async with only_asking(host, port, framing) as controller:
-            settings, mode = await read_back(controller), await controller.mode()
-            safety = str(await controller.ask("RobotState.getSafetyModeType"))
+            settings = await read_back(controller)
+            mode, safety = await controller.mode(), await controller.safety()
         visit.say(
             f"{host}:{port} answers in the {framing} framing: {name}",
             f"robot mode {mode}, safety {safety}",

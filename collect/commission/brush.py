@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+from urllib.parse import urlsplit
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -107,14 +108,13 @@ class BrushStep(Step):
 
 def _addressed(bus: str) -> dict[str, str | int]:
     """The fields of `[force]` for what was typed; none for an empty text. Raises ValueError."""
-    host, colon, rest = bus.partition(":")
-    if not colon:
+    if ":" not in bus:
         return {"kind": "sri-m8123", "interface": "socketcan", "channel": bus} if bus else {}
-    port, _, channel = rest.partition("/")
-    if not port.isdecimal() or not 0 < int(port) < 65536:
+    parts = urlsplit(f"//{bus}")
+    if not parts.hostname or not parts.port:
         raise ValueError(f"{bus!r} is no bus: type can0, or HOST:PORT/can0 of a gateway")
-    at = {"kind": "sri-m8123", "interface": "socketcand", "channel": channel or "can0"}
-    return {**at, "host": host, "port": int(port)}
+    at = {"kind": "sri-m8123", "interface": "socketcand", "channel": parts.path.strip("/") or "can0"}
+    return {**at, "host": parts.hostname, "port": parts.port}
 
 
 def _bus(line: str) -> str:

@@ -80,7 +80,7 @@ class PlacesStep(Step):
             how = "Bring the tip into the middle of the well, as deep as a dip should go: a few mm above its bottom."
             await touch(visit, arm, "well 0", how)
             with visit.asked_again_if_refused("well-rim", "well"):
-                visit.say(check_pot(visit.notebook, "well-rim 0", "well 0", "well"))
+                check_pot(visit.notebook, "well-rim 0", "well 0", "well")
             await visit.values(WIPE)
             if visit.notebook.get(WIPE.field) == YES.key:
                 how = "Bring the tip to the rim on the side where the drop shall be wiped off, away from the sheet."
@@ -179,8 +179,8 @@ def sheet_corners(notebook: Notebook) -> list[Point]:
     return [(*to_base(paper, x, y), plane.touch_z_mm(x, y)) for x, y in corners_of(*paper.size_mm).tolist()]
 
 
-def check_pot(notebook: Notebook, rim: str, middle: str, what: str, way_out: str = "") -> str:
-    """Describe a well or pot by its two touches. Raises `NotAccepted` if rim and dip contradict each other."""
+def check_pot(notebook: Notebook, rim: str, middle: str, what: str, way_out: str = "") -> None:
+    """Raise `NotAccepted` if rim and dip of a well or a pot contradict each other."""
     (rim_x, rim_y, rim_z), (x, y, z) = tips(notebook)[rim], tips(notebook)[middle]
     radius_mm = math.dist((rim_x, rim_y), (x, y))
     way_out = way_out or f"Teach the {what} again: its rim, then its middle."
@@ -191,7 +191,6 @@ def check_pot(notebook: Notebook, rim: str, middle: str, what: str, way_out: str
         )
     if z >= rim_z - WIPE_BELOW_MM:
         raise NotAccepted(f"the dip is no deeper than the rim of the {what}.", way_out)
-    return f"{what} of radius {radius_mm:.0f} mm, its rim {rim_z - z:.1f} mm above the bottom of a dip"
 
 
 def wipe_of(notebook: Notebook) -> tuple[tuple[float, float], float]:

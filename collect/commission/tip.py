@@ -34,7 +34,6 @@ HAND_MM = 0.15
 """Smallest plausible error of a touch by hand, in one axis: a few touches may agree by chance."""
 LEAST_OFF_DEG, LEAST_AGREEING = 1.0, 5
 """A hold that is less than this from the others is no stray, and fewer holds than this do not outvote a stray."""
-MEDIAN_STEPS = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,14 +140,10 @@ class AxisFit:
 def find_axis(flanges: Sequence[Pose]) -> AxisFit:
     """The brush's direction in the flange's frame: the mean of where "down" was, without the holds that stray.
 
-    A hold strays if it is far from the geometric median of all, which a minority of bad holds hardly moves (Weiszfeld's
-    iteration; Vardi and Zhang 2000). At least one pose.
+    A hold strays if it is far from the median of all, which a minority of bad holds hardly moves. At least one pose.
     """
     down = np.array([Rotation.from_quat(p.quaternion).inv().apply([0.0, 0.0, -1.0]) for p in flanges])
-    middle = down.mean(axis=0)
-    for _ in range(MEDIAN_STEPS):
-        weights = 1.0 / np.maximum(np.linalg.norm(down - middle, axis=1), 1e-6)
-        middle = weights @ down / weights.sum()
+    middle = np.median(down, axis=0)
     typical_deg = float(np.sort(_angles_deg(down, middle))[(len(down) - 1) // 2])
     agree = _angles_deg(down, middle) <= max(LEAST_OFF_DEG, OUTLIER_SHARE * typical_deg)
     mean = np.asarray(down[agree].mean(axis=0), np.float64)

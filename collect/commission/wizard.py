@@ -41,17 +41,13 @@ class Wizard:
         self._visit = visit
         self._steps = tuple(steps)
 
-    def _open(self) -> list[StepName]:
-        """Steps that are not done."""
-        return [step.name for step in self._steps if step.name not in self._visit.notebook.done]
-
     async def run(self) -> Path:
         """Teach every step that is not done, then write `rig.toml`; returns its path.
 
         Raises `CollectAborted` where the person stops: the same command resumes from there.
         """
         while names := self._open():
-            await self._attempt(next(step for step in self._steps if step.name == names[0]))
+            await self._attempt(self._named(names[0]))
         return self._written()
 
     async def again(self, name: str) -> Path | None:
@@ -59,11 +55,8 @@ class Wizard:
 
         Raises `ConfigError` for an unknown name, otherwise as `run` does.
         """
-        step = next((step for step in self._steps if step.name == name), None)
-        if step is None:
-            raise ConfigError("STEP", "", f"{name!r} is not one of {', '.join(step.name for step in self._steps)}")
-        missing = [need for need in step.needs if need not in self._visit.notebook.done]
-        if missing:
+        step = self._named(name)
+        if missing := [need for need in step.needs if need in self._open()]:
             raise CollectAborted(
                 f"`{name}` depends on {', '.join(missing)}, which is not taught yet: `brushloop rig new` resumes there"
             )
@@ -71,6 +64,16 @@ class Wizard:
         while name in self._open():
             await self._attempt(step)
         return self._written() if self._open() in ([], ["proof"]) else None
+
+    def _open(self) -> list[StepName]:
+        """Steps that are not done."""
+        return [step.name for step in self._steps if step.name not in self._visit.notebook.done]
+
+    def _named(self, name: str) -> Step:
+        for step in self._steps:
+            if step.name == name:
+                return step
+        raise ConfigError("STEP", "", f"{name!r} is not one of {', '.join(step.name for step in self._steps)}")
 
     async def _attempt(self, step: Step) -> None:
         """Teach a step once. Where the person goes back, or where it fails, the notebook says what comes next.

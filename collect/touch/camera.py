@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,6 +28,7 @@ from brushloop.collect.touch.heights import (
     FINE_COUNT,
     FINE_STEP_MM,
     PITCH_MM,
+    SPOTS_PER_PHOTO,
     KnownHeights,
     Reach,
     Touch,
@@ -146,8 +147,6 @@ WINDOW_MM = 0.75 * PITCH_MM
 """Side of the window in which a spot's ink is measured."""
 SPOTS_PER_DIP = 2
 """Touches after which the brush is dipped again: a tip that dries leaves no ink at first."""
-SPOTS_PER_PHOTO = 2
-"""Touches per photograph in the coarse row, which ends when ink is seen; few, so that spots stay small."""
 LEAST_INK_MM2 = 0.25
 """Darkening that counts as ink: area times how much darker it became, 1 being black."""
 
@@ -188,31 +187,35 @@ class FirstInkTouch:
         lean = _plane([touch for point in by_point for touch in point])
         return [at_one_point(point, self._config, lean) for point in by_point]
 
-    async def _coarse(self, row: Iterator[tuple[float, float]], reach: Reach) -> Touch:
+    async def _coarse(self, fresh: Iterator[tuple[float, float]], reach: Reach) -> Touch:
         """Touch lower and lower until a photograph shows ink."""
-        count = coarse_count(reach)
-        before = await self._photograph()
-        touched: list[Spot] = []
-        for k in range(count):
-            touched.append((*next(row), max(reach.start_z_mm - k * COARSE_STEP_MM, reach.lowest_z_mm)))
-            await self._touch(touched[-1])
-            if len(touched) % SPOTS_PER_PHOTO == 0 or k + 1 == count:
-                ink = await self._ink(before, touched)
-                if (ink >= LEAST_INK_MM2).any():
-                    return self._between(touched, ink, COARSE_STEP_MM)
-        raise StepError(f"nothing was touched down to {touched[-1][2]:.2f} mm: no spot of the row left ink")
+        heights_mm = (reach.start_z_mm - k * COARSE_STEP_MM for k in range(coarse_count(reach)))
+        spots = ((*next(fresh), max(z_mm, reach.lowest_z_mm)) for z_mm in heights_mm)
+        return await self._row(spots, COARSE_STEP_MM, SPOTS_PER_PHOTO)
 
     async def _fine(
-        self, row: Iterator[tuple[float, float]], around: Touch, lean: PaperPlane, higher_mm: float, lowest_mm: float
+        self, fresh: Iterator[tuple[float, float]], around: Touch, lean: PaperPlane, higher_mm: float, lowest_mm: float
     ) -> Touch:
-        before, touched = await self._photograph(), list[Spot]()
+        """Touch a whole row in fine steps along the leaning sheet."""
+        touched = list[Spot]()
         for k in range(FINE_COUNT):
-            x, y = next(row)
+            x, y = next(fresh)
             along_mm = lean.touch_z_mm(x, y) - lean.touch_z_mm(around.x_mm, around.y_mm)
             z_mm = around.z_mm + along_mm + higher_mm - k * FINE_STEP_MM
             touched.append((x, y, max(z_mm, lowest_mm)))
-            await self._touch(touched[-1])
-        return self._between(touched, await self._ink(before, touched), FINE_STEP_MM)
+        return await self._row(touched, FINE_STEP_MM, FINE_COUNT)
+
+    async def _row(self, spots: Iterable[Spot], step_mm: float, per_photograph: int) -> Touch:
+        """Touch one spot after the other until a photograph shows ink. Raises `StepError` if none does."""
+        before, touched = await self._photograph(), list[Spot]()
+        for spot in spots:
+            touched.append(spot)
+            await self._touch(spot)
+            if len(touched) % per_photograph == 0:
+                ink = await self._ink(before, touched)
+                if (ink >= LEAST_INK_MM2).any():
+                    return self._between(touched, ink, step_mm)
+        raise StepError(f"nothing was touched down to {touched[-1][2]:.2f} mm: no spot of the row left ink")
 
     def _between(self, touched: list[Spot], ink_mm2: NDArray[np.float64], step_mm: float) -> Touch:
         """Half way between the last clean spot and the first inked one; every height between them is equally likely."""

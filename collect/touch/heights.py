@@ -140,6 +140,8 @@ PITCH_MM, COLUMNS = 4.0, 9
 """Distance between spots, and spots in a row of a point's patch: a shallow touch leaves a mark of one to three
 millimetres, and camera and arm must agree on the place within a quarter of the pitch."""
 EXTENT_MM = (COLUMNS - 1) * PITCH_MM
+SPOTS_PER_PHOTO = 2
+"""Touches per photograph in the coarse row, which ends when ink is seen; few, so that spots stay small."""
 SLACK_STEPS = 2
 """Fine steps beyond the coarse step, on either side: a coarse touch is accurate only to its step."""
 FINE_COUNT = 1 + 2 * SLACK_STEPS + math.ceil(COARSE_STEP_MM / FINE_STEP_MM)
@@ -164,8 +166,9 @@ def spots(at_mm: tuple[float, float], sheet_mm: tuple[float, float]) -> Iterator
 
 
 def coarse_count(reach: Reach) -> int:
-    """Spots of a whole coarse row, which ends early where ink is seen."""
-    return math.ceil((reach.start_z_mm - reach.lowest_z_mm) / COARSE_STEP_MM) + 1
+    """Spots of a whole coarse row, which ends early where ink is seen; all of them are photographed."""
+    heights = math.ceil((reach.start_z_mm - reach.lowest_z_mm) / COARSE_STEP_MM) + 1
+    return math.ceil(heights / SPOTS_PER_PHOTO) * SPOTS_PER_PHOTO
 
 
 MARK_MM = 3.0

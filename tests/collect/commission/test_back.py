@@ -134,8 +134,9 @@ async def test_a_step_that_was_refused_goes_on_where_the_person_wants(
         (PORT, "", "no serial line was named"),
         (BUS, "no:bus", "'no:bus' is no bus"),
         (PRINT[0], "26", "is not two numbers of squares like 26x20"),
-        (ADDRESS, "192.0.2.7:65536", "is not a number from 1 to 65535"),
-        (ADDRESS, "192.0.2.7:x", "is not a number from 1 to 65535"),
+        (ADDRESS, "192.0.2.7:65536", "Port out of range"),
+        (ADDRESS, "192.0.2.7:x", "Port could not be cast to integer value as 'x'"),
+        (ADDRESS, "the cabinet", "is not an address like 192.0.2.7"),
     ],
 )
 def test_a_line_that_cannot_be_the_value_is_refused_where_it_is_typed(
