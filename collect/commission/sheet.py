@@ -75,7 +75,12 @@ class SheetStep(Step):
                             check_board(all_corners(visit.notebook, BOARD), board_of(visit.notebook))
                 with visit.asked_again_if_refused(SHEET):
                     fit = fitted(visit.notebook)
-                visit.say(*in_words(fit))
+                (x, y), (width, height) = fit.origin_mm, fit.size_mm
+                visit.say(
+                    f"sheet of {width:.1f} x {height:.1f} mm, origin ({x:.2f}, {y:.2f}) mm, known to "
+                    f"{fit.origin_sigma_mm:.2f} mm (goal {GOOD_MM:g}), turned by {fit.yaw_deg:.2f} deg, leaning by "
+                    f"{fit.plane.slope_deg:.2f} deg; no touch is more than {fit.worst_mm:.2f} mm off."
+                )
                 if (sigma_mm := fit.origin_sigma_mm) <= GOOD_MM:
                     return
             if sigma_mm > WORST_MM:
@@ -91,7 +96,7 @@ class SheetStep(Step):
         plane, sigma_mm, point = fit.plane, fit.origin_sigma_mm, touch_point(fit)
         touches = len(notebook.touched(BOARD)) + len(notebook.touched(SHEET))
         how = f"{touches} corners of board and sheet touched by hand"
-        known = f"residuals up to {max(fit.residuals_mm.values()):.2f} mm"
+        known = f"residuals up to {fit.worst_mm:.2f} mm"
         leaning = f"the sheet leans by {plane.slope_deg:.2f} deg; not yet measured by touch"
         slopes = [plane.z0_mm, plane.slope_x, plane.slope_y]
         return {
@@ -132,19 +137,6 @@ def fitted(notebook: Notebook) -> SheetFit:
     return fit_sheet(all_corners(notebook, BOARD), all_corners(notebook, SHEET), board_of(notebook))
 
 
-def in_words(fit: SheetFit) -> tuple[str, ...]:
-    """The result in words for the person."""
-    (x, y), (width, height) = fit.origin_mm, fit.size_mm
-    worst = max(fit.residuals_mm, key=lambda name: fit.residuals_mm[name])
-    return (
-        f"sheet of {width:.1f} x {height:.1f} mm, origin ({x:.2f}, {y:.2f}) mm, known to {fit.origin_sigma_mm:.2f} mm "
-        f"(goal {GOOD_MM:g}), turned by {fit.yaw_deg:.2f} +- {fit.yaw_sigma_deg:.2f} deg, leaning by "
-        f"{fit.plane.slope_deg:.2f} deg",
-        f"largest residual: {worst}, {fit.residuals_mm[worst]:.2f} mm; "
-        f"the board measures {100 * fit.scale:.2f} % of its printed size",
-    )
-
-
 # From touched corners to the sheet
 
 
@@ -158,15 +150,13 @@ class SheetFit:
     board_origin_mm: tuple[float, float]
     plane: PaperPlane
     """Through all touched corners."""
-    residuals_mm: dict[str, float]
-    """Residual of each touch, along the sheet."""
+    worst_mm: float
+    """Largest residual of a touch, along the sheet."""
     origin_sigma_mm: float
     """Standard error of the origin in each axis, at worst."""
     yaw_sigma_deg: float
     depth_sigma_mm: float
     """Standard error of the plane's height in the middle of the sheet."""
-    scale: float
-    """Touched over printed size of the board."""
 
 
 def corners_of(size_x_mm: float, size_y_mm: float) -> Floats:
@@ -227,7 +217,7 @@ def fit_sheet(board: Mapping[str, Sequence[Point]], sheet: Mapping[str, Sequence
     """
     printed = corners_of(*size_mm(spec))
     (bk, b), (sk, s) = _stacked(board), _stacked(sheet)
-    yaw0, scale, _ = _similarity(printed[bk], b[:, :2])
+    yaw0, _, _ = _similarity(printed[bk], b[:, :2])
     straight = [s[sk == k, :2].mean(axis=0) @ _rotation(yaw0) for k in range(len(CORNERS))]
     size0 = _size_along_board(straight)
 
@@ -248,8 +238,6 @@ def fit_sheet(board: Mapping[str, Sequence[Point]], sheet: Mapping[str, Sequence
     points[:, :2] = (points[:, :2] - origin) @ _rotation(yaw)
     plane, off_mm = fit_plane([(float(x), float(y), float(z)) for x, y, z in points])
     board_x, board_y = (float(v) for v in (np.array([bx, by]) - origin) @ _rotation(yaw))
-    names = [f"board {CORNERS[k]}" for k in bk] + [f"sheet {CORNERS[k]}" for k in sk]
-    lengths = [float(v) for v in np.linalg.norm(residuals, axis=1)]
     above_mm = max(math.sqrt(sum(r * r for r in off_mm) / max(len(points) - 3, 1)), HAND_MM)
     return SheetFit(
         (sx, sy),
@@ -257,11 +245,10 @@ def fit_sheet(board: Mapping[str, Sequence[Point]], sheet: Mapping[str, Sequence
         (width, height),
         (board_x, board_y),
         plane,
-        {f"{name} {number}": length for number, (name, length) in enumerate(zip(names, lengths, strict=True), 1)},
+        float(np.linalg.norm(residuals, axis=1).max()),
         float(max(sigmas[3:5])),
         math.degrees(float(sigmas[0])),
         above_mm / math.sqrt(len(points)),
-        scale,
     )
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from brushloop.collect.errors import StepError
 from brushloop.collect.rig.config import PaperConfig, SelfCheckConfig
-from brushloop.collect.rig.paper import Patch, Sheet, to_base
+from brushloop.collect.rig.paper import Patch, Sheet
 from brushloop.collect.touch.selfcheck import (
     Triangle,
     judge,
@@ -26,7 +26,6 @@ from brushloop.collect.touch.selfcheck import (
     triangle_in,
     triangle_on,
 )
-from brushloop.drivers.devices import Pose
 from brushloop.sessions.events import SelfCheckResult
 
 if TYPE_CHECKING:
@@ -94,31 +93,6 @@ def test_no_turn_passes_for_a_mirror_nor_a_mirror_for_a_turn(noise: int, turn_de
 async def checked(bench: Bench, places: Triangle = PLACES) -> SelfCheckResult:
     bench.effector.rig = bench.rig  # with the board that the test gave it
     return await self_check(bench.effector, places, bench.effector.dip)
-
-
-async def test_marks_on_the_loopback_sheet_are_found_and_pass(make_bench: MakeBench) -> None:
-    bench = make_bench()
-    check = await checked(bench)
-    assert max(check.residuals_mm) < 0.4
-    assert check.scale == pytest.approx((1.0, 1.0), abs=0.006)
-    assert math.hypot(*check.offset_mm) < 2.0
-    assert bench.lifted
-
-
-async def test_an_arm_that_goes_elsewhere_is_refused(make_bench: MakeBench) -> None:
-    bench = make_bench()
-
-    def mirrored(pose: Pose) -> Pose:
-        x, y = bench.world.config.table.to_paper(pose.x_mm, pose.y_mm)
-        if not (0.0 <= x <= 110.0 and 0.0 <= y <= 80.0):
-            return pose
-        base_x, base_y = to_base(bench.rig.config.paper, 110.0 - x, y)
-        return replace(pose, x_mm=base_x, y_mm=base_y)
-
-    bench.bent = mirrored
-    with pytest.raises(StepError, match="mirrored in x"):
-        await checked(bench)
-    assert bench.lifted
 
 
 async def test_a_dry_brush_leaves_no_marks(make_bench: MakeBench) -> None:
