@@ -205,9 +205,7 @@ def rig_text(notebook: Notebook, rig_path: Path) -> str:
         table, _, name = path.rpartition(".")
         if (known := notebook.values.get(path)) is not None:
             tables[table] += [f"# {line}" for line in textwrap.wrap(known.comment().replace("\n", " "), 116)]
-        # TOML writes numbers, strings, lists and booleans as JSON does, but for one character.
-        text = json.dumps(_rounded(value), ensure_ascii=False).replace("\x7f", "\\u007f")
-        tables[table].append(f"{name} = {text}")
+        tables[table].append(f"{name} = {toml_value(value)}")
     for table in sorted(tables, key=lambda name: (name != "", name.split(".")[0] != "robot", name)):
         lines += ["", *([f"[{table}]"] if table else []), *tables[table]]
     return "\n".join(lines) + "\n"
@@ -223,11 +221,16 @@ def write_rig(rig_path: Path, notebook: Notebook) -> Path | None:
     return kept
 
 
-def _rounded(value: Value) -> Any:
-    """Round a value for the file: no value is known better than 0.001 mm or 0.0001 deg."""
-    if isinstance(value, list):
-        return [_rounded(v) for v in value]
-    return round(value, 4) + 0.0 if isinstance(value, float) else value
+def toml_value(value: Value) -> str:
+    """A value as `rig.toml` has it, rounded: none is known better than 0.001 mm or 0.0001 deg."""
+    match value:
+        case list():
+            return f"[{', '.join(map(toml_value, value))}]"
+        case float():
+            return str(round(value, 4) + 0.0)
+        case _:
+            # TOML writes texts, whole numbers and truth as JSON does, but for one character.
+            return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 # The person

@@ -13,7 +13,16 @@ from brushloop.collect.commission.places import LimitsStep, PlacesStep
 from brushloop.collect.commission.proof import ProofStep
 from brushloop.collect.commission.sheet import SheetStep
 from brushloop.collect.commission.tip import TipStep
-from brushloop.collect.commission.visit import LeftOff, Step, StepName, Value, Visit, WentBack, choice_of, write_rig
+from brushloop.collect.commission.visit import (
+    LeftOff,
+    Step,
+    StepName,
+    Visit,
+    WentBack,
+    choice_of,
+    toml_value,
+    write_rig,
+)
 from brushloop.collect.errors import CollectAborted, ConfigError, NotAccepted, StepError
 from brushloop.collect.operator import Choice
 from brushloop.drivers.errors import DeviceError
@@ -109,9 +118,9 @@ class Wizard:
                     values = other.derived(notebook)
                     notebook = notebook.with_values(values)
                     changed += [
-                        f"{field}: {_shown(old)} -> {_shown(new.value)}"
+                        f"{field}: {toml_value(old)} -> {toml_value(new.value)}"
                         for field, new in values.items()
-                        if (old := before.get(field)) is not None and _shown(old) != _shown(new.value)
+                        if (old := before.get(field)) is not None and toml_value(old) != toml_value(new.value)
                     ]
         self._visit.save(notebook.finished(step.name))
         if changed:
@@ -127,19 +136,9 @@ class Wizard:
         return path
 
 
-def _in_lines(error: Exception) -> tuple[str, ...]:
-    match error:
-        case NotAccepted():
-            return error.what, error.way_out
-        case DeviceError():
-            # With the notes: one of them may say that the arm was not seen at rest.
-            state = (f"{error.device}: {error.op}: {error.what}.", error.condition, *getattr(error, "__notes__", []))
-            return " ".join(filter(None, state)), error.remedy or "Check power, cable and address."
-        case _:
-            return (str(error),)
-
-
-def _shown(value: Value) -> str:
-    if isinstance(value, list):
-        return f"[{', '.join(_shown(v) for v in value)}]"
-    return f"{value:.3f}" if isinstance(value, float) else str(value)
+def _in_lines(error: Exception) -> list[str]:
+    # The notes of a device's error may say that the arm was not seen at rest.
+    lines = [str(error), *getattr(error, "__notes__", [])]
+    if isinstance(error, DeviceError) and not error.remedy:
+        lines.append("Check power, cable and address.")
+    return lines

@@ -132,7 +132,7 @@ async def test_a_step_that_was_refused_goes_on_where_the_person_wants(
         (BRUSH[1], "nan", "is not a number"),
         (BRUSH[0], "0,1", r"0\.1 is outside 0\.5 to 50 mm"),
         (PORT, "", "no serial line was named"),
-        (BUS, "no:bus", "'no:bus' is no bus"),
+        (BUS, "host:bus", "Port could not be cast to integer value as 'bus'"),
         (PRINT[0], "26", "is not two numbers of squares like 26x20"),
         (ADDRESS, "192.0.2.7:65536", "Port out of range"),
         (ADDRESS, "192.0.2.7:x", "Port could not be cast to integer value as 'x'"),
@@ -168,4 +168,6 @@ async def test_a_step_that_failed_says_in_what_state_the_arm_is(
     person = Person()
     with pytest.raises(CollectAborted):
         await Wizard(person.visit(tmp_path / "rig.toml"), (CameraStep(),)).run()
-    assert "no reply in 1 s. A stop was sent to the arm. The arm may still be moving.\n" in person.shown[0][1]
+    said = person.shown[0][1].splitlines()
+    assert said[0].startswith("robot: moveLine: no reply in 1 s. A stop was sent to the arm.")
+    assert said[1] == "The arm may still be moving."
