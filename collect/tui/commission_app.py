@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import threading
 import time
 from collections.abc import Callable, Coroutine
-from concurrent.futures import Future
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -63,12 +62,10 @@ class Steps:
     def __init__(self, work: Work) -> None:
         """Begin at once."""
         self._stop_sent = False
-        self._outcome: Future[Path | None] = Future()
         self._runner = asyncio.Runner(loop_factory=asyncio.new_event_loop)
         self._loop = self._runner.get_loop()
         self._task = self._loop.create_task(work())
-        self._thread = threading.Thread(target=self._run, name="first day", daemon=True)
-        self._thread.start()
+        self._outcome = ThreadPoolExecutor(1, "first day").submit(self._run)
 
     @property
     def finished(self) -> bool:
@@ -88,26 +85,23 @@ class Steps:
 
     def join(self) -> Path | None:
         """Wait for the end; return the `rig.toml` that was written, or raise what ended the steps."""
-        self._thread.join()
         return self._outcome.result()
 
-    def _run(self) -> None:
+    def _run(self) -> Path | None:
         async def steps() -> Path | None:
             return await self._task
 
         try:
             with self._runner as runner:
-                written = runner.run(steps())
+                return runner.run(steps())
         except asyncio.CancelledError as stopped:
             # The notes say whether the arm was seen at rest.
             notes = getattr(stopped, "__notes__", [])
-            self._outcome.set_exception(CollectAborted(" ".join([*notes, RED_BUTTON]) if notes else STOPPED))
-        except BaseException as error:
-            # A run within the steps has its own word for the stop that it was sent.
-            of_run = isinstance(error, CollectAborted) and self._stop_sent
-            self._outcome.set_exception(CollectAborted(STOPPED) if of_run else error)
-        else:
-            self._outcome.set_result(written)
+            raise CollectAborted(" ".join([*notes, RED_BUTTON]) if notes else STOPPED) from None
+        except CollectAborted:
+            if self._stop_sent:  # a run within the steps has its own word for that
+                raise CollectAborted(STOPPED) from None
+            raise
 
 
 class CommissionScreen(Screen[None], inherit_bindings=False):
@@ -333,6 +327,7 @@ def run_commission(visit: Visit, work: Work) -> Path | None:
         try:
             app.run()
         finally:
+            visit.asker.abandon(LeftOff)
             if not app.steps.finished:
                 app.steps.stop()
     return app.steps.join()

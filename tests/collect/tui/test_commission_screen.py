@@ -7,6 +7,7 @@ import contextlib
 import re
 import threading
 from collections.abc import AsyncIterator, Callable
+from concurrent.futures import wait
 from contextlib import asynccontextmanager
 
 import pytest
@@ -38,7 +39,7 @@ async def running(asking: Asking) -> AsyncIterator[tuple[CommissionApp, Pilot[No
             yield app, pilot
         finally:
             app.steps.stop()
-            app.steps._thread.join()
+            wait([app.steps._outcome])
 
 
 async def seen(app: CommissionApp, pilot: Pilot[None], condition: Callable[[], bool]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
+from concurrent.futures import wait
 from pathlib import Path
 
 import pytest
@@ -108,4 +109,4 @@ def test_first_day(snap_compare: Callable[..., bool]) -> None:
         assert snap_compare(app, terminal_size=SMALL, run_before=asked)
     finally:
         app.steps.stop()
-        app.steps._thread.join()
+        wait([app.steps._outcome])
