@@ -6,12 +6,11 @@ import asyncio
 import contextlib
 import itertools
 import math
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 from brushloop.collect.commission.visit import LeftOff, Taught, Tone, Value, Visit
 from brushloop.collect.commission.wizard import Wizard
@@ -20,11 +19,9 @@ from brushloop.collect.operator import Asker, Prompt
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.paper import to_base
 from brushloop.drivers.host import HostClock
-from brushloop.drivers.sim.arcs_server import ArcsServer
-from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.lab import UnknownLab
 from brushloop.drivers.sim.lab_facts import Trap
-from brushloop.drivers.sim.world import World, tool_of
+from brushloop.drivers.sim.world import tool_of
 from tests.rigs import in_thread
 
 
@@ -47,28 +44,14 @@ class Person(Asker):
         raise LeftOff
 
 
-@pytest.fixture
-async def server() -> AsyncIterator[ArcsServer]:
-    server = ArcsServer(World(SimConfig(rate=10.0)))
-    await server.start("127.0.0.1", 0)
-    yield server
-    await server.stop()
-
-
-def visit_of(
-    person: Person,
-    folder: Path,
-    port: int = 9,
-    *,
-    tip_mm: tuple[float, float, float] = (0.0, 0.0, 180.0),
-) -> Visit:
+def visit_of(person: Person, folder: Path) -> Visit:
     """A visit on which the arm and its tip are known."""
     visit = person.visit(folder / "rig.toml")
     values: dict[str, Value] = {
         "robot.host": "127.0.0.1",
-        "robot.port": port,
+        "robot.port": 9,
         "robot.framing": "sof",
-        "robot.tcp_offset_mm": list(tip_mm),
+        "robot.tcp_offset_mm": [0.0, 0.0, 180.0],
         "robot.tcp_rotation_deg": [0.0, 0.0, 0.0],
     }
     visit.keep({field: Taught(value, "typed") for field, value in values.items()})

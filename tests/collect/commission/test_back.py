@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import AsyncMock
 
 import pytest
 
@@ -50,25 +52,14 @@ async def led(person: Typing, folder: Path) -> Visit:
     return visit
 
 
-class Station:
-    """An ink station that counts its doses, once its cable is plugged in."""
-
-    doses = 0
-    plugged = True
-
-    async def connect(self) -> object:
-        if not Station.plugged:
-            raise DeviceTimeout("ink", "connect", "no reply")
-        return type("Identity", (), {"model": "station", "firmware": "1"})
-
-    async def level(self) -> None:
-        return None
-
-    async def dose(self, ml: float) -> None:
-        Station.doses += 1
-
-    async def close(self) -> None:
-        pass
+@pytest.fixture
+def station(monkeypatch: pytest.MonkeyPatch) -> AsyncMock:
+    """The ink station that is connected to, whatever line is named."""
+    station = AsyncMock()
+    station.connect.return_value = SimpleNamespace(model="station", firmware="1")
+    station.level.return_value = None
+    monkeypatch.setattr(InkStationConfig, "device", lambda *_: station)
+    return station
 
 
 @pytest.mark.parametrize(
@@ -87,14 +78,12 @@ class Station:
     ids=["one question", "into the step before", "no dose again"],
 )
 async def test_back_asks_the_question_before_and_no_other(
-    answers: tuple[str, ...], asked: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    answers: tuple[str, ...], asked: list[str], tmp_path: Path, station: AsyncMock
 ) -> None:
-    monkeypatch.setattr(InkStationConfig, "device", lambda *_: Station())
-    monkeypatch.setattr(Station, "doses", 0)
     person = Typing(*answers)
     visit = await led(person, tmp_path)
     assert person.asked == asked
-    assert Station.doses == answers.count("y")
+    assert station.dose.await_count == answers.count("y")
     if asked[-1] == R:
         assert not any(field.startswith("brush.") for field in visit.notebook.values)
 
@@ -110,17 +99,10 @@ async def test_back_asks_the_question_before_and_no_other(
     ids=["again", "the question before", "the step afresh", "not afresh after all"],
 )
 async def test_a_step_that_was_refused_goes_on_where_the_person_wants(
-    after: tuple[str, ...], asked: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    after: tuple[str, ...], asked: list[str], tmp_path: Path, station: AsyncMock
 ) -> None:
-    class Plugging(Typing):
-        async def ask(self, prompt: Prompt) -> Any:
-            if prompt.question == HOW:
-                monkeypatch.setattr(Station, "plugged", True)
-            return await super().ask(prompt)
-
-    monkeypatch.setattr(InkStationConfig, "device", lambda *_: Station())
-    monkeypatch.setattr(Station, "plugged", False)
-    person = Plugging("6", "48", "20", "", "i", "/dev/ttyUSB0", *after)
+    station.connect.side_effect = [DeviceTimeout("ink", "connect", "no reply"), station.connect.return_value]
+    person = Typing("6", "48", "20", "", "i", "/dev/ttyUSB0", *after)
     await led(person, tmp_path)
     assert person.asked == [R, L, DEEPEST, NAME, WELL, LINE, HOW, *asked]
 

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import AsyncMock
 
 import numpy as np
 import pytest
@@ -27,11 +28,10 @@ from brushloop.collect.photograph.frames import Thumbnail
 from brushloop.collect.rig.config import load_rig
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import rig_toml
 from brushloop.drivers.sim.world import tool_of
-from tests.collect.commission.conftest import Person, in_lab, visit_of
+from tests.collect.commission.conftest import Person, in_lab
 
 
 async def test_holds_that_were_not_upright_are_named_and_asked_for_again(tmp_path: Path) -> None:
@@ -198,40 +198,25 @@ def picture(*, arm: bool, light: float = 1.0) -> Thumbnail:
 
 
 class Parking(Person):
-    """Brings the arm wherever it is asked for, without a hand; answers no to everything else."""
+    """Brings the arm wherever it is asked for, without a hand."""
 
     async def ask(self, prompt: Prompt) -> Any:
-        if not prompt.thing:
-            self.asked.append(prompt.default)
-            return "n"
+        assert prompt.thing
         return True
 
 
 @pytest.fixture
-def parked(server: ArcsServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Visit]:
+def parked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Visit]:
     """Well and rim are touched; the arm is brought to a place, then parked, and a picture is taken with it at each."""
 
     def make(away_mm: Place, away: Thumbnail, parked: Thumbnail) -> Visit:
-        visit, poses, pictures = (
-            visit_of(Parking(), tmp_path, server.port, tip_mm=(0.0, 0.0, 0.0)),
-            [away_mm, PARK_MM],
-            [away, parked],
-        )
-        for field in ("aside.wipe", "aside.wash"):
-            visit.keep({field: Taught("n", "answered")})
-        for name, place in {"well-rim 0": RIM, "well 0": WELL}.items():
-            visit.save(visit.notebook.with_touch(name, brush_pose(*place)))
-
-        async def flange_at_rest(_: object) -> Pose:
-            return brush_pose(*poses.pop(0))
-
-        async def still(*_: object) -> Thumbnail:
-            return pictures.pop(0)
-
-        monkeypatch.setattr(arm, "flange_at_rest", flange_at_rest)
-        monkeypatch.setattr(places, "still", still)
-        monkeypatch.setattr(places, "taught_camera", lambda *_: contextlib.nullcontext())
-        monkeypatch.setattr(places, "shown_live", lambda *_: contextlib.nullcontext())
+        visit, neither = Parking().visit(tmp_path / "rig.toml"), Taught("n", "answered")
+        visit.save(touched().without("park").with_values({"aside.wipe": neither, "aside.wash": neither}))
+        flanges = [brush_pose(*away_mm), brush_pose(*PARK_MM)]
+        monkeypatch.setattr(arm, "flange_at_rest", AsyncMock(side_effect=flanges))
+        monkeypatch.setattr(places, "still", AsyncMock(side_effect=[away, parked]))
+        for context in ("taught_arm", "taught_camera", "shown_live"):
+            monkeypatch.setattr(places, context, lambda *_: contextlib.nullcontext())
         return visit
 
     return make
@@ -261,13 +246,3 @@ async def test_pictures_that_say_nothing_are_taken_again_at_both_places(
     with pytest.raises(NotAccepted, match=said):
         await PlacesStep().carry_out(visit)
     assert "aside.parked" not in visit.notebook.values
-    assert "well 0" in visit.notebook.touches
-
-
-@pytest.mark.parametrize("field", ["aside.wipe", "aside.wash"])
-async def test_wipe_and_pot_are_not_left_out_by_an_empty_answer(parked: Callable[..., Visit], field: str) -> None:
-    visit = parked(AWAY_MM, picture(arm=False), picture(arm=False))
-    visit.save(visit.notebook.without(field))
-    await PlacesStep().carry_out(visit)
-    assert isinstance(visit.asker, Parking)
-    assert visit.asker.asked == [""]
