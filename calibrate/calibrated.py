@@ -179,8 +179,7 @@ def _outline(calibration: Calibration, sheet_mm: tuple[float, float]) -> Floats:
 
 
 def _trust(calibration: Calibration, moved: Sequence[str]) -> Iterator[Point]:
-    flat = "a flat, sharp, still board gives 0.1 to 0.3 px"
-    residual = f"The residual is {calibration.rms_px:.2f} px, at most {RMS_LIMIT_PX:g} px are good; {flat}."
+    residual = f"The residual is {calibration.rms_px:.2f} px; at most {RMS_LIMIT_PX:g} px are good."
     yield Point(calibration.rms_px <= RMS_LIMIT_PX, residual)
     known = calibration.relative_reach
     yield Point(known <= WORST_INTERVAL, f"Scale known to ±{100 * known:.3f} %, goal ±{100 * WORST_INTERVAL:g} %.")
@@ -189,10 +188,7 @@ def _trust(calibration: Calibration, moved: Sequence[str]) -> Iterator[Point]:
     out = calibration.corners_dropped
     yield Point(not out, f"Corners that are left out, because they do not lie on the plane of the others: {out}.")
     if calibration.lens.source == FITTED:
-        words = "No lens file: k1 was fitted on this one board and is known only where corners were seen."
-        yield Point(None, words)
-    else:
-        yield Point(True, f"Seen through the {calibration.lens.source}; k1 was refitted for this focus.")
+        yield Point(None, "No lens file: k1 was fitted on this one board, and is known only where corners were seen.")
     for problem in (*calibration.flags, *moved):
         yield Point(False, f"{problem[0].upper()}{problem[1:]}.")
     if not moved:

@@ -111,10 +111,6 @@ class Recovered:
                 f"{name}: recovered {off.mean():+.2f}{scatter} {unit} from what was commanded; "
                 f"{inside} of {many} intervals (95 %) hold the command"
             )
-        yield (
-            "alpha follows from how far the mark lies from the zero-touch point, and is as accurate as the model's "
-            "prediction of that distance; the shape of the mark alone does not determine it."
-        )
         if bare := self._flagged(NO_MODEL_ERROR):
             yield (
                 f"warning: the intervals of {bare} presses leave out the error of the model: fewer than "
@@ -123,11 +119,8 @@ class Recovered:
         for name, flag in NOT_INFORMATIVE.items():
             if vague := self._flagged(flag):
                 yield f"warning: {vague} presses do not tell {name}: the interval covers most of the commanded range"
-        bound = self._flagged(Flag.AT_BOUND)
-        if 2 * bound > many:
+        if 2 * (bound := self._flagged(Flag.AT_BOUND)) > many:
             yield f"warning: {bound} presses end at a bound: the model does not fit this brush; do not repeat these"
-        elif bound:
-            yield f"warning: {bound} presses end at a bound of the range: their intervals hold on one side at most"
         for stroke_id, why in self.refused:
             yield f"not used: {stroke_id}: {why}"
         yield str(self.out)
@@ -155,9 +148,28 @@ def recover(request: RecoverRequest, progress: Progress = unseen) -> Recovered:
     chosen = {session.strokes[number * count // most].stroke_id for number in range(most)}
     presses = read_presses(session, refused, cut, chosen=chosen, progress=progress)
     rows = [row for press in presses if (row := _row(press, inverter, refused))]
+    if not rows:
+        why = f": {refused[0][0]}: {refused[0][1]}" if refused else ""
+        raise CalibrationError(str(session.recording.path), f"no stroke could be recovered{why}")
     recovered = Recovered(session, inverter.model.name, with_model_error(rows, fitted), refused, request.out)
-    _write(recovered, request.repeats, request.seed)
+    request.out.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(request.out, csv_text(COLUMNS, recovered.csv_rows()))
+    write_whole(recovered.protocol, _protocol(recovered, request))
     return recovered
+
+
+def _protocol(recovered: Recovered, request: RecoverRequest) -> str:
+    """The protocol that presses each recovered stroke `repeats` times, in an order drawn with `seed`."""
+    header = recovered.session.header
+    return (
+        f"# Recovered by {recovered.model} from {header.session_id} ({header.source}), "
+        f"recording sha256 {recovered.session.sha256}.\n"
+        'kind = "replay"\n'
+        f"of = {json.dumps(header.session_id, ensure_ascii=False)}\n"
+        f"file = {json.dumps(recovered.out.name, ensure_ascii=False)}\n"
+        f"repeats = {request.repeats}\n"
+        f"seed = {request.seed}\n"
+    )
 
 
 def _inverter(request: RecoverRequest, session: OpenSession) -> tuple[Inverter, Collection[Condition]]:
@@ -172,30 +184,6 @@ def _inverter(request: RecoverRequest, session: OpenSession) -> tuple[Inverter, 
         return Inverter(model, within, px_mm=MM_PER_PX, anchor_sigma_mm=ANCHOR_SD_MM), fitted
     except ValueError as error:
         raise CalibrationError(str(request.session), f"no press of this brush in the range: {error}") from None
-
-
-def _write(recovered: Recovered, repeats: int, seed: int) -> None:
-    """Write the CSV and the protocol, which presses each stroke `repeats` times in an order drawn with `seed`.
-
-    Raises `CalibrationError` and OSError.
-    """
-    where, refused = str(recovered.session.recording.path), recovered.refused
-    if not recovered.rows:
-        why = f": {refused[0][0]}: {refused[0][1]}" if refused else ""
-        raise CalibrationError(where, f"no stroke could be recovered{why}")
-    recovered.out.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(recovered.out, csv_text(COLUMNS, recovered.csv_rows()))
-    header = recovered.session.header
-    write_whole(
-        recovered.protocol,
-        f"# Recovered by {recovered.model} from {header.session_id} ({header.source}), "
-        f"recording sha256 {recovered.session.sha256}.\n"
-        'kind = "replay"\n'
-        f"of = {json.dumps(header.session_id, ensure_ascii=False)}\n"
-        f"file = {json.dumps(recovered.out.name, ensure_ascii=False)}\n"
-        f"repeats = {repeats}\n"
-        f"seed = {seed}\n",
-    )
 
 
 def _row(press: Press, inverter: Inverter, refused: list[Refused]) -> Row | None:
@@ -215,8 +203,6 @@ def with_model_error(rows: Sequence[Row], fitted: Collection[Condition] = ()) ->
 
     `fitted` are the conditions that the model was fitted to.
     """
-    if not rows:
-        return []
     commanded = [row.commanded for row in rows]
     (deep, deep_sd), (tilted, tilted_sd) = (np.transpose([row.off[name] for row in rows]) for name in ("H", "alpha"))
     more_mm = model_sd(deep, deep_sd, commanded, fitted)
@@ -227,17 +213,15 @@ def with_model_error(rows: Sequence[Row], fitted: Collection[Condition] = ()) ->
     more_deg = model_sd(shown * depth, tilted_sd * depth, commanded, fitted) / depth
     out: list[Row] = []
     for row, mm, deg in zip(rows, more_mm.tolist(), more_deg.tolist(), strict=True):
-        flags, depth_sd_mm, tilt_sd_deg = set(row.flags), row.depth_sd_mm, row.tilt_sd_deg
+        flags = set(row.flags)
         if math.isnan(mm) or math.isnan(deg):
             flags.add(NO_MODEL_ERROR)
-        else:
-            depth_sd_mm, tilt_sd_deg = float(np.hypot(depth_sd_mm, mm)), float(np.hypot(tilt_sd_deg, deg))
-        for name, value, sd, among in (
-            ("H", row.depth_mm, depth_sd_mm, [one.depth_mm for one in commanded]),
-            ("alpha", row.tilt_deg, tilt_sd_deg, [one.tilt_deg for one in commanded]),
-        ):
-            if covers_most(value, sd, among):
-                flags.add(NOT_INFORMATIVE[name])
+            mm = deg = 0.0
+        depth_sd_mm, tilt_sd_deg = math.hypot(row.depth_sd_mm, mm), math.hypot(row.tilt_sd_deg, deg)
+        if covers_most(row.depth_mm, depth_sd_mm, [at.depth_mm for at in commanded]):
+            flags.add(NOT_INFORMATIVE["H"])
+        if covers_most(row.tilt_deg, tilt_sd_deg, [at.tilt_deg for at in commanded]):
+            flags.add(NOT_INFORMATIVE["alpha"])
         out.append(replace(row, depth_sd_mm=depth_sd_mm, tilt_sd_deg=tilt_sd_deg, flags=frozenset(flags)))
     return out
 

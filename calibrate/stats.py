@@ -14,7 +14,7 @@ has strays of its own.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -38,7 +38,7 @@ CEILING = "ceiling"
 NEAR_POINTS = 1.5
 """Distance from the ceiling that counts as near, in points of average CSIM."""
 ODD_S, ODD_SPREADS, LEAST_WAITS = 2.0, 3.0, 4
-"""A wait is odd if it is this many seconds and median absolute deviations from the others; fewer waits have none."""
+"""A wait is odd if it is this many seconds and median absolute deviations from the others."""
 MAX_OTHERS = 9
 """Most others that a press or a writing is compared with: all those of ten, as in the paper, or the next nine of
 more."""
@@ -255,23 +255,16 @@ def waits_of(state: RunState) -> dict[int, float]:
     return {still: press.dip_to_touch_s for still, press in presses.items() if press.dip_to_touch_s is not None}
 
 
-def wait_limit_s(waits: Iterable[float]) -> tuple[float, float] | None:
-    """Median of a session's waits and the distance from it that counts as alike; None for too few waits."""
-    known = np.array([*waits])
-    if len(known) < LEAST_WAITS:
-        return None
-    median = float(np.median(known))
-    return median, max(ODD_S, ODD_SPREADS * float(np.median(np.abs(known - median))))
-
-
 def odd_waits(waits: Mapping[K, float]) -> dict[K, str]:
     """Reason for each stroke whose ink waited longer, or less long, than that of the others: it may be drier or wetter.
 
-    `waits` are seconds from dip to touch.
+    `waits` are seconds from dip to touch; fewer than four do not tell which of them is odd.
     """
-    if (limit_s := wait_limit_s(waits.values())) is None:
+    known = np.array([*waits.values()])
+    if len(known) < LEAST_WAITS:
         return {}
-    median, most_s = limit_s
+    median = float(np.median(known))
+    most_s = max(ODD_S, ODD_SPREADS * float(np.median(np.abs(known - median))))
     return {
         key: f"touched the paper {wait:.1f} s after its dip, the others after {median:.1f} s"
         for key, wait in waits.items()

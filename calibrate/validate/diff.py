@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import shlex
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -133,12 +134,11 @@ def _scores(path: Path, report: Report, *, by_stroke: bool) -> dict[Series, Stro
     if not table.is_file() or file_sha256(table) != report.scores_sha256:
         raise CalibrationError(str(table), f"is not the table of {path.name}: its SHA-256 differs")
     recordings = {s.session_id: s.recording_sha256 for s in report.sessions}
-    scores: dict[Series, dict[tuple[str, ...], list[float]]] = {}
+    scores: defaultdict[Series, defaultdict[tuple[str, ...], list[float]]] = defaultdict(lambda: defaultdict(list))
     with table.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
             cell = (row["depth_mm"], row["tilt_deg"])
             key = (*cell, recordings[row["session_id"]], as_text(row["stroke_id"])) if by_stroke else cell
             for measure in MEASURES:
-                series = (row["model"], row["alignment"], row["tone"], measure)
-                scores.setdefault(series, {}).setdefault(key, []).append(float(row[measure]))
+                scores[row["model"], row["alignment"], row["tone"], measure][key].append(float(row[measure]))
     return {series: {key: fmean(of_key) for key, of_key in keys.items()} for series, keys in scores.items()}

@@ -107,8 +107,8 @@ def test_what_repeats_nothing_is_named() -> None:
     pairs, refused = paired(ORIGINALS, again)
     assert len(pairs) == 1
     assert refused == {
-        "x~1": "repeats x, which does not exist or cannot be used",
-        "y": "repeats no stroke",
+        "x~1": "repeats x: it has no original that can be used",
+        "y": "repeats no stroke: it has no original that can be used",
         "a-r02": "was not pressed again",
         "b-r01": "was not pressed again",
     }

@@ -17,18 +17,16 @@ from typer.testing import CliRunner
 from brushloop.__main__ import app
 from brushloop.calibrate.board.lens import Gray
 from brushloop.calibrate.board.spec import BoardSpec, charuco_board
-from brushloop.calibrate.compare import KEYS, Tone
-from brushloop.calibrate.loop import NOT_AGAIN, Pair, score_pairs, statistics_of, verdicts, write_loop
-from brushloop.calibrate.presses import Press
+from brushloop.calibrate.compare import Tone
+from brushloop.calibrate.loop import Pair, write_loop
 from brushloop.calibrate.report import Axis, Marks, Panel, chart_uri, source_label, source_note
-from brushloop.calibrate.stroke import Measured
 from brushloop.calibrate.validate.page import pages_beside
 from brushloop.calibrate.writing import Figure, Plan, PlannedBy, as_points
 from brushloop.calibrate.writing.compare import Character, WritingComparison, write_written
-from brushloop.sessions.records import Header, Source, Stroke
+from brushloop.sessions.records import Header, Source
 from tests.browser import BROWSER, content_widths_px
 from tests.calibrate.given import CALIBRATION, photographed
-from tests.calibrate.records import loop_record
+from tests.calibrate.records import loop_record, pair_scores
 from tests.photographed import imported_presses
 
 SPEC = BoardSpec(squares=(9, 7), square_mm=20.0, marker_mm=15.0, dictionary="DICT_5X5_100", origin_mm=(0.0, 0.0))
@@ -72,18 +70,9 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 
 def _loop(folder: Path) -> str:
-    """The page of two presses of one cell, of which one was pressed again, a little shorter."""
-    measured = Measured(length_mm=15.0, width_mm=4.0, mid_width_mm=4.0, breadth_mm=4.0, area_mm2=60.0)
-
-    def press(name: str, depth_mm: float, end: int) -> Press:
-        image = np.zeros((128, 128), np.uint8)
-        image[58:70, 40:end] = 255
-        stroke = Stroke(stroke_id=name, kind="press", still=0, depth_mm=depth_mm, tilt_deg=5.0)
-        images = np.stack([image] * len(KEYS))
-        return Press("grid", "", stroke, images, np.float32(image / 255), (29.0, 19.0), measured, False)
-
-    first, second = press("a-r01", 15.0, 90), press("a-r02", 15.0, 88)
-    pairs = [Pair(first, press("a-r01~1", 14.6, 89), first.images)]
+    """The page of presses of three cells, of which one was not pressed again."""
+    scores = pair_scores()
+    pairs = [Pair(press, press, press.images) for press in scores.presses]
     original, again = (
         SimpleNamespace(
             header=Header(session_id=name, source=Source.LOOPBACK, software="test", brush=TWIN),
@@ -93,9 +82,7 @@ def _loop(folder: Path) -> str:
         )
         for name in ("grid", "replay")
     )
-    scores = score_pairs(pairs, [first, second])
-    rows = {"stats": tuple(statistics_of(scores)), "verdicts": tuple(verdicts(scores))}
-    record = loop_record("grid", "ab", refused=(("a-r02", NOT_AGAIN), ("x<u>", "is blank")), **rows)
+    record = loop_record("grid", "ab", refused=(("a-r02", "was not pressed again"), ("x<u>", "is blank")))
     return write_loop(record, (original, again), pairs, scores, folder / "loop").read_text(encoding="utf-8")
 
 
@@ -153,7 +140,7 @@ def test_a_page_of_a_twin_says_whose_twin_on_every_figure(pages: dict[str, str])
     for name in ("loop", "write"):
         assert '<span class="source">loopback rig, brush twin of 2026-03-02-grid-01</span>' in pages[name]
         assert pages[name].count("brush twin of 2026-03-02-grid-01") > 5
-    assert "One original was not pressed again." in pages["loop"]
+    assert "a-r02: was not pressed again" in pages["loop"]
     assert "x&lt;u&gt;: is blank" in pages["loop"]
 
 

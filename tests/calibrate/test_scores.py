@@ -123,11 +123,6 @@ def test_many_pairs_at_once_are_scored_as_one_by_one() -> None:
     assert (cosine, share, blank) == (pytest.approx(csim(seen[0], truth[0])), pytest.approx(1 / 4), [0.0, 0.0])
 
 
-def test_images_of_different_shape_are_refused() -> None:
-    with pytest.raises(ValueError, match="of one shape"):
-        csim(np.ones((4, 4)), np.ones((4, 5)))
-
-
 MODELS = stroke_models(Brush())
 ANCHOR, CELL = (60.0, 40.0), (30.0, 28.0, 40.0, 24.0)
 MM, NORMAL = (Alignment.MM, Tone.BINARY), (Alignment.SIZE_NORMALISED, Tone.BINARY)
