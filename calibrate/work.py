@@ -39,8 +39,6 @@ FOLDER = "work"
 """Folder of a session that holds its finished work."""
 MAX_ENTRY_BYTES = 16 * 1024**2
 """Largest entry once it is unpacked."""
-MAX_BYTES = 4 * 1024**3
-"""Largest sum of all entries on disk; the oldest are removed first."""
 UNREADABLE = (OSError, EOFError, ValueError, zlib.error, zipfile.BadZipFile)
 AHEAD = 2
 """Jobs submitted per worker; more would only hold photographs in memory."""
@@ -66,12 +64,6 @@ class Store:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._unwritten: dict[str, Arrays] = {}
-        entries = [(path.stat(), path) for path in folder.glob("*.npz.gz")]
-        total = 0
-        for stat, path in sorted(entries, key=lambda entry: entry[0].st_mtime_ns, reverse=True):
-            total += stat.st_size
-            if total > MAX_BYTES:
-                path.unlink(missing_ok=True)
 
     def get(self, key: str) -> Arrays | None:
         """The arrays of an entry; None where there is none, or it is damaged: it is then put again."""

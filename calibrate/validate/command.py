@@ -21,7 +21,7 @@ from brushloop.calibrate.loop import FILE as LOOP_FILE
 from brushloop.calibrate.loop import LoopRecord, read_loop
 from brushloop.calibrate.remote import URL, local_path
 from brushloop.calibrate.report import data_uri, framed, write_files
-from brushloop.calibrate.scores import scores_csv, write_parquet
+from brushloop.calibrate.scores import scores_csv
 from brushloop.calibrate.session import open_session as open_recording
 from brushloop.calibrate.validate.findings import terminal_lines
 from brushloop.calibrate.validate.page import Curve, page_of, pages_beside, read_curve
@@ -197,9 +197,8 @@ def _write(outcome: Outcome, folder: Path, curves: Sequence[Curve], beside: Besi
     files["summary.csv"] = summary_csv(report)
     files["failures.csv"] = csv_text(Refused._fields, report.refused)
     files["report.json"] = report.to_json()
-    names = [*files, *write_parquet(outcome.scores, report.label, folder / "scores.parquet")]
     pages = list(pages_beside(outcome.sessions, folder))
-    files["report.html"] = page_of(outcome, report, curves, names, beside.figures_13, pages)
+    files["report.html"] = page_of(outcome, report, curves, list(files), beside.figures_13, pages)
     write_files(folder, files)
     return report
 

@@ -14,7 +14,7 @@ from brushloop.calibrate.compare import Key
 from brushloop.calibrate.report import Point, brush_and_size, source_note, source_point
 from brushloop.calibrate.scores import Stat
 from brushloop.calibrate.stats import CEILING, NEAR_POINTS, Interval, Summary, is_near
-from brushloop.calibrate.validate.run import BEZIER_REFITTED, FITTED_HELD_OUT, HELD_OUT, PRESSES
+from brushloop.calibrate.validate.run import FITTED_HELD_OUT, HELD_OUT, PRESSES
 from brushloop.calibrate.validate.tables import (
     NORMAL,
     STRICT,
@@ -45,14 +45,13 @@ SHORT = {HELD_OUT: ", held out", "fitted, in sample": ", in sample"}
 def measured(report: Report) -> str:
     """Summary of the strokes and models that were compared."""
     compared, strokes = (sum(getattr(s, name) for s in report.sessions) for name in ("compared", "strokes"))
-    sessions = f"{len(report.sessions)} sessions" if len(report.sessions) > 1 else "one session"
-    where = f" at {len(report.cells)} combinations of press depth H and brush tilt α" if report.cells else ""
     brush = next(filter(None, (brush_and_size(s.header) for s in report.sessions)), "a brush that is not named")
-    left = "" if compared == strokes else f", {strokes - compared} more could not be used"
+    at = f" at {len(report.cells)} combinations of press depth H and brush tilt α" if report.cells else ""
+    left = f", {strokes - compared} more could not be used" if strokes > compared else ""
     models = sum(model.basis != PRESSES for model in report.models)
     return (
-        f"{compared} brush presses{where}, from {sessions}, were compared with what {models} stroke models predict "
-        f"for them{left}. Each press is one vertical dab of {brush} ({report.label})."
+        f"{compared} brush presses{at} (sessions: {len(report.sessions)}) were compared with what {models} stroke "
+        f"models predict for them{left}. Each press is one vertical dab of {brush} ({report.label})."
     )
 
 
@@ -66,23 +65,14 @@ def headline(report: Report) -> Iterator[tuple[str, float]]:
 
 
 def verdict(report: Report) -> Iterator[str]:
-    """How well the model shown predicts, beside what, and how large the marks are."""
-    shown, top, bezier, published = (
-        _csim(report, name) for name in (report.shown, CEILING, BEZIER_REFITTED, "ccd-bsm")
-    )
-    if shown is not None:
-        below = ""
-        if top is not None and shown.below_ceiling is not None:
-            below = f", {_points(shown)} below the ceiling of {top.avg:.1f} %"
+    """How well the model shown predicts, and how large the marks are."""
+    csim, top = _csim(report, report.shown), _csim(report, CEILING)
+    if csim is not None:
+        unknown = top is None or csim.below_ceiling is None
+        below = "" if unknown else f", {_points(csim)} below the ceiling of {top.avg:.1f} %"
         unseen = " from cells that it has not seen" if report.shown == FITTED_HELD_OUT else ""
         label = _label(report, report.shown)
-        yield f"{label} predicts presses{unseen} with an average CSIM of {shown.avg:.1f} %{below}."
-    others = [f"a Bézier stroke fitted to the same captures reaches {bezier.avg:.1f} %"] if bezier is not None else []
-    if published is not None and report.shown != "ccd-bsm":
-        others.append(f"CCD-BSM as published reaches {published.avg:.1f} %")
-    if others:
-        words = " and ".join(others)
-        yield f"{words[0].upper()}{words[1:]}."
+        yield f"{label} predicts presses{unseen} with an average CSIM of {csim.avg:.1f} %{below}."
     ratios = [session.size_ratio for session in report.sessions if session.size_ratio is not None]
     if ratios:
         length, width = (sum(side) / len(ratios) for side in zip(*ratios, strict=True))

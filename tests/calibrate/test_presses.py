@@ -141,13 +141,6 @@ def test_two_processes_at_once_do_no_harm(session: Path, calls: Counter[str]) ->
     assert len(list((session / work.FOLDER).iterdir())) == 3, "no half-written file is left"
 
 
-def test_the_oldest_entries_make_room(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    read(session)
-    monkeypatch.setattr(work, "MAX_BYTES", 1)
-    open_session(session)
-    assert list((session / work.FOLDER).iterdir()) == []
-
-
 def test_a_folder_that_cannot_be_written_does_not_stop_the_work(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: Any, **__: Any) -> None:
         raise OSError(errno.ENOSPC, "no space left")

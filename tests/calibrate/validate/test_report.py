@@ -9,7 +9,6 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-import pyarrow.parquet
 import pytest
 from typer.testing import CliRunner
 
@@ -105,19 +104,9 @@ def test_the_page_has_the_papers_numbers_its_source_and_what_was_refused_and_fet
     assert all(re.match(r"data:image/(png|svg\+xml);base64,", source) for source in sources)
     links = re.findall(r'href="([^"]*)"', page)
     assert all(f'id="{link[1:]}"' in page or (folder / link).is_file() for link in links)
-    assert {"scores.csv", "scores.parquet", "summary.csv", "report.json", "#cell-1"} <= set(links)
+    assert {"scores.csv", "summary.csv", "report.json", "#cell-1"} <= set(links)
     assert "&lt;script&gt;" in page
     assert not re.search(r"<script|url\(|@import|<link|<iframe", page)
-
-
-def test_csv_and_parquet_hold_the_same_scores(folder: Path) -> None:
-    with (folder / "scores.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    table = pyarrow.parquet.read_table(folder / "scores.parquet").to_pylist()
-    assert len(rows) == len(table) > 10 * 4 * 7
-    for text, binary in zip(rows, table, strict=True):
-        assert float(text["csim"]) == pytest.approx(binary["csim"], abs=1e-7)
-        assert all(text[name] == binary[name] for name in ("stroke_id", "model", "alignment", "source"))
 
 
 def test_a_gate_that_holds_passes_and_one_that_is_missed_says_by_how_much_and_exits_5(report: Report) -> None:
