@@ -68,8 +68,7 @@ def verdict(report: Report) -> Iterator[str]:
     """How well the model shown predicts, and how large the marks are."""
     csim, top = _csim(report, report.shown), _csim(report, CEILING)
     if csim is not None:
-        unknown = top is None or csim.below_ceiling is None
-        below = "" if unknown else f", {_points(csim)} below the ceiling of {top.avg:.1f} %"
+        below = f", {_points(csim)} below the ceiling of {top.avg:.1f} %" if top and csim.below_ceiling else ""
         unseen = " from cells that it has not seen" if report.shown == FITTED_HELD_OUT else ""
         label = _label(report, report.shown)
         yield f"{label} predicts presses{unseen} with an average CSIM of {csim.avg:.1f} %{below}."
