@@ -106,7 +106,7 @@ GROUPS = {
 }
 """Groups whose first command runs where no other is named: where the help lists them, and its words."""
 COMMANDS: tuple[tuple[str, str, type[Any], str], ...] = (
-    ("analyse", EVERY_DAY, commands.AnalyseRequest, "calibrate.analysis:analyse"),
+    ("analyse", EVERY_DAY, commands.AnalyseRequest, "calibrate.notebook:analyse"),
     ("calibrate", RESEARCH, commands.CalibrateRequest, "calibrate.calibrated:calibrate_session"),
     ("camera board", "", commands.PrintRequest, "calibrate.board.spec:print_board"),
     ("camera intrinsics", "", commands.LensRequest, "calibrate.calibrated:calibrate_lens"),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +18,14 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from brushloop.calibrate.commands import CalibrateRequest, FitRequest, RecoverRequest, ValidateRequest
+from brushloop.calibrate.commands import (
+    AnalyseRequest,
+    CalibrateRequest,
+    FitRequest,
+    Printable,
+    RecoverRequest,
+    ValidateRequest,
+)
 from brushloop.calibrate.compare import GRAY_MM, brush_of, simulated
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.presses import Refused, read_presses, rectified
@@ -25,11 +33,13 @@ from brushloop.calibrate.remote import local_path
 from brushloop.calibrate.session import Calibration, OpenSession, open_session
 from brushloop.calibrate.stroke import Prepared
 from brushloop.model.ccdbsm import Brush
+from brushloop.model.generator import SHIPPED_GENERATOR
 from brushloop.model.strokes import Prediction
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.events import Begin, StepEvent, StepKind
 from brushloop.sessions.recording import Capture, Recording
 from brushloop.sessions.records import Condition, Header, Quality, Topic, Wrench
+from brushloop.sessions.terminal import Progress, unseen
 
 if TYPE_CHECKING:
     # What only some of the functions need is imported when they are called.
@@ -260,6 +270,35 @@ def validate(*sessions: Place, **options: Any) -> ValidationOutput:
     output = command.validate(ValidateRequest(places, command=f"brushloop.validate{places}", **options))
     output.check()
     return output
+
+
+@dataclass(frozen=True, slots=True)
+class Analysed:
+    """What calibration, fit and validation found."""
+
+    calibrated: Calibrated | None
+    """None for an import, which has its own scale."""
+    fitted: Printable
+    validated: ValidationOutput
+
+    def lines(self) -> Iterator[object]:
+        """What the command prints: lines and tables of each step; the report comes last."""
+        for step in filter(None, (self.calibrated, self.fitted, self.validated)):
+            yield from step.lines()
+
+
+def analyse(request: AnalyseRequest, progress: Progress = unseen) -> Analysed:
+    """Calibrate, fit and validate one session, from photographs to the verdict. Raises as each of these does."""
+    from brushloop.calibrate import calibrated
+    from brushloop.calibrate.fit.fit import fit as fit_strokes
+    from brushloop.calibrate.validate.command import validate as compare_models
+
+    session, known = request.session, None
+    if not Recording(session).header.source.imported:
+        known = calibrated.calibrate_session(CalibrateRequest(session), progress)
+    fitted = fit_strokes(FitRequest(session), progress)
+    wanted = ValidateRequest((str(session),), generators=(SHIPPED_GENERATOR,))
+    return Analysed(known, fitted, compare_models(wanted, progress))
 
 
 def _path(session: Place) -> Path:

@@ -23,8 +23,7 @@ from brushloop.calibrate.remote import URL, local_path
 from brushloop.calibrate.report import data_uri, framed, write_files
 from brushloop.calibrate.scores import scores_csv
 from brushloop.calibrate.session import open_session as open_recording
-from brushloop.calibrate.validate.findings import terminal_lines
-from brushloop.calibrate.validate.page import Curve, page_of, pages_beside, read_curve
+from brushloop.calibrate.validate.page import Curve, page_of, pages_beside, read_curve, terminal_lines
 from brushloop.calibrate.validate.run import FittedSession, Outcome, Refused, validate_presses
 from brushloop.calibrate.validate.tables import Report, check_gates, parse_gate, report_of, summary_csv
 from brushloop.calibrate.work import cluster, threads

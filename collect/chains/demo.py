@@ -120,7 +120,7 @@ class Demo:
 
     def _say_answer(self) -> None:
         """Print how much of the ink is predicted, and what follows."""
-        from brushloop.calibrate.validate.findings import headline, verdict  # slow to import
+        from brushloop.calibrate.validate.page import headline, verdict  # slow to import
 
         if (report := self._validated.report) is None:
             return
