@@ -37,6 +37,7 @@ from bench.prior import BRISTLE
 from brushloop.calibrate.compare import TABLE_2
 from brushloop.calibrate.fit.descent import Prior, fit_presses, learned
 from brushloop.calibrate.fit.heldout import BEZIER, FITTED, Refit, held_out_scores, leave_cell_out, refit
+from brushloop.calibrate.loop import read_loop
 from brushloop.calibrate.presses import read_for_fit
 from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.writing.compare import HEADLINE, REFERENCE, SIMULATED, read_written
@@ -168,12 +169,12 @@ def loop(*, n: int | None = None, seed: int = 1) -> Sequence[Result]:
             with simulated_rig(folder, brush, RATE, seed) as rig:
                 session = collect_grid(folder, rig, LOOP_DEPTHS_MM, LOOP_TILTS_DEG, LOOP_REPEATS, seed)
                 rig.run("repress", session, "--seed", str(seed))
-            outcome: dict[str, Any] = json.loads((session / "loop" / "loop.json").read_text(encoding="utf-8"))
-        lost = [-verdict["difference"] for verdict in outcome["verdicts"]]
-        where = f"{outcome['source']}, {outcome['pairs']} pairs, {len(outcome['refused'])} not compared; {machine()}"
+            record = read_loop(session / "loop")
+        lost = [points for points, *_ in record.lost]
+        where = f"{record.source}, {record.pairs} pairs, {len(record.refused)} not compared; {machine()}"
         for what, points in (("worst of 8", max(lost)), ("mean of 8", statistics.fmean(lost))):
             label = f"loop.{what}.{name}"
-            results.append(at_most(label, points, "points lost", LOOP_POINTS, outcome["pairs"], seed, where))
+            results.append(at_most(label, points, "points lost", LOOP_POINTS, record.pairs, seed, where))
     return results
 
 

@@ -35,18 +35,16 @@ class Written:
         return self.said
 
 
-def check_target(path: Path, ending: str, *inputs: Path | None) -> None:
+def check_target(path: Path, ending: str) -> None:
     """Check before any work that a file may be written to `path`. Raises `CalibrationError`.
 
-    A file with another suffix might be a recording or a photograph; inputs are never overwritten.
+    A file with another suffix might be a recording or a photograph.
     """
     if path.suffix.lower() != ending:
         raise CalibrationError(str(path), f"must end in {ending}")
     if path.is_dir():
         raise CalibrationError(str(path), "is a folder")
     check_writable(path.parent)
-    if any(one is not None and one.exists() and path.exists() and path.samefile(one) for one in inputs):
-        raise CalibrationError(str(path), "is the input; it is not overwritten")
 
 
 @contextmanager

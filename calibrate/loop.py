@@ -12,8 +12,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import numpy as np
-
 from brushloop.calibrate.artefact import made_by
 from brushloop.calibrate.commands import CompareLoopRequest
 from brushloop.calibrate.compare import (
@@ -45,7 +43,7 @@ from brushloop.calibrate.report import (
 )
 from brushloop.calibrate.scores import MEASURES, Scores, Stat, find_stat, scores_csv, similarities, statistics
 from brushloop.calibrate.session import OpenSession, open_session
-from brushloop.calibrate.stats import Floats, Interval, interval_over_groups
+from brushloop.calibrate.stats import Floats, Interval, Summary, is_near
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.similarity import SSIM_SETTINGS
 from brushloop.sessions.disk import check_writable
@@ -73,33 +71,10 @@ class Pair:
     """(len(KEYS), 128, 128): the model's press at the recovered depth and tilt."""
 
 
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """Score of re-pressed minus another press, over the originals that have both, in points (percent)."""
-
-    alignment: Alignment
-    tone: Tone
-    measure: str
-    """`csim` or `ssim`."""
-    again: float
-    another: float
-    difference: float
-    interval: Interval | None
-    """Over the commanded conditions; None with fewer than three."""
-    n: int
-    holds: bool
-    """Whether the difference is at least minus `GOAL_POINTS`."""
-
-    @property
-    def certain(self) -> bool:
-        """Whether the whole interval lies on the same side of the limit."""
-        return self.interval is not None and all((end >= -GOAL_POINTS) == self.holds for end in self.interval)
-
-
 class LoopRecord(Sealed):
     """A closed loop as stored in `loop.json`: everything but the images and the individual scores."""
 
-    FORMAT: ClassVar[str] = "brushloop-loop-3"
+    FORMAT: ClassVar[str] = "brushloop-loop-4"
     MADE_BY: ClassVar[str] = "brushloop repress compare"
 
     source: Source
@@ -118,7 +93,7 @@ class LoopRecord(Sealed):
     pairs: int
     goal_points: float
     stats: tuple[Stat, ...]
-    verdicts: tuple[Verdict, ...]
+    """The ceiling of the re-pressed strokes is how alike other presses of each condition are."""
     refused: tuple[Refused, ...]
     software: str
     command: str
@@ -132,20 +107,33 @@ class LoopRecord(Sealed):
         return find_stat(self.stats, compared, key)
 
     @property
+    def lost(self) -> list[tuple[float, Interval | None, str, Stat]]:
+        """Points below another press with their 95 % interval, the measure, and the statistics that say so.
+
+        Over the originals that have both; empty where no original condition was pressed twice.
+        """
+        lost: list[tuple[float, Interval | None, str, Stat]] = []
+        for row, measure in itertools.product(self.stats, MEASURES):
+            of: Summary = getattr(row, measure)
+            if row.model == AGAIN and of.below_ceiling is not None:
+                lost.append((of.below_ceiling, of.below_interval, measure, row))
+        return lost
+
+    @property
     def answer(self) -> Point:
         """The result in one sentence."""
-        if not self.verdicts:
+        if not self.lost:
             return Point(
                 None, f"{self.again}: no original condition was pressed twice, so its repeatability is unknown."
             )
-        least = min(self.verdicts, key=lambda verdict: verdict.difference)
-        how = f"{least.measure.upper()}, {least.alignment}, {least.tone}"
-        sure = "" if all(verdict.certain for verdict in self.verdicts) else "; so few strokes do not make it certain"
+        points, _, measure, row = max(self.lost, key=lambda lost: lost[0])
+        near = [is_near(below, interval, self.goal_points) if interval else None for below, interval, *_ in self.lost]
+        sure = "; so few strokes do not make it certain" if None in near else ""
         return Point(
-            all(verdict.holds for verdict in self.verdicts),
-            f"Strokes pressed again ({self.again}) are {max(0.0, -least.difference):.1f} points less similar to their "
-            f"originals than other presses of the same condition, at worst ({how}); the goal is at most "
-            f"{self.goal_points:g}{sure}.",
+            points <= self.goal_points,
+            f"Strokes pressed again ({self.again}) are {max(0.0, points):.1f} points less similar to their originals "
+            f"than other presses of the same condition, at worst ({measure.upper()}, {row.alignment}, {row.tone}); the "
+            f"goal is at most {self.goal_points:g}{sure}.",
         )
 
 
@@ -190,7 +178,6 @@ def compare(request: CompareLoopRequest, progress: Progress = unseen) -> Written
         pairs=len(pairs),
         goal_points=GOAL_POINTS,
         stats=tuple(statistics_of(scores)),
-        verdicts=tuple(verdicts(scores)),
         refused=tuple(refused),
         software=made_by(),
         command=request.command,
@@ -241,24 +228,11 @@ def score_pairs(pairs: Sequence[Pair], originals: Iterable[Press]) -> Scores:
 
 
 def statistics_of(scores: Scores) -> Iterator[Stat]:
-    """The statistics of each comparison, in percent."""
+    """The statistics of each comparison, in percent; those of re-pressed strokes say how far below another press."""
+    another = 100.0 * scores.of(ANOTHER)
     for compared in scores.models:
-        yield from statistics(compared, 100.0 * scores.of(compared), scores.cell_of)
-
-
-def verdicts(scores: Scores) -> Iterator[Verdict]:
-    """Verdicts for each alignment, tone and measure; none if no condition was pressed twice."""
-    again, another = 100.0 * scores.of(AGAIN), 100.0 * scores.of(ANOTHER)
-    both = np.isfinite(another[:, 0, 0])
-    if not both.any():
-        return
-    again, another, cells = again[both], another[both], scores.cell_of[both]
-    for (k, key), (j, measure) in itertools.product(enumerate(KEYS), enumerate(MEASURES)):
-        differences = again[:, k, j] - another[:, k, j]
-        points = again[:, k, j], another[:, k, j], differences
-        of_again, of_another, difference = (float(values.mean()) for values in points)
-        interval, holds = interval_over_groups(differences, cells), difference >= -GOAL_POINTS
-        yield Verdict(*key, measure, of_again, of_another, difference, interval, len(cells), holds)
+        percent = 100.0 * scores.of(compared)
+        yield from statistics(compared, percent, scores.cell_of, ceiling=another if compared == AGAIN else None)
 
 
 def _replayed(header: Header) -> str | None:

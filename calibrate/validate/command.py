@@ -23,7 +23,7 @@ from brushloop.calibrate.remote import URL, local_path
 from brushloop.calibrate.report import data_uri, framed, write_files
 from brushloop.calibrate.scores import scores_csv
 from brushloop.calibrate.session import open_session as open_recording
-from brushloop.calibrate.validate.page import Curve, page_of, pages_beside, read_curve, terminal_lines
+from brushloop.calibrate.validate.page import Curve, page_of, read_curve, terminal_lines
 from brushloop.calibrate.validate.run import FittedSession, Outcome, Refused, validate_presses
 from brushloop.calibrate.validate.tables import Report, check_gates, parse_gate, report_of, summary_csv
 from brushloop.calibrate.work import cluster, threads
@@ -196,8 +196,7 @@ def _write(outcome: Outcome, folder: Path, curves: Sequence[Curve], beside: Besi
     files["summary.csv"] = summary_csv(report)
     files["failures.csv"] = csv_text(Refused._fields, report.refused)
     files["report.json"] = report.to_json()
-    pages = list(pages_beside(outcome.sessions, folder))
-    files["report.html"] = page_of(outcome, report, curves, list(files), beside.figures_13, pages)
+    files["report.html"] = page_of(outcome, report, curves, list(files), beside.figures_13)
     write_files(folder, files)
     return report
 

@@ -14,13 +14,10 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from brushloop.calibrate.artefact import FOLDER
 from brushloop.calibrate.compare import KEYS, TABLE_3, Key, shown
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.fit.fit import FOLDER as FITS
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.report import (
-    BLUE,
     COLOURS,
     ORANGE,
     Axis,
@@ -42,7 +39,6 @@ from brushloop.calibrate.validate.run import (
     FITTED_HELD_OUT,
     HELD_OUT,
     PRESSES,
-    FittedSession,
     ModelInfo,
     Outcome,
 )
@@ -85,9 +81,8 @@ def page_of(
     curves: Sequence[Curve],
     beside: Sequence[str],
     figures_13: Sequence[tuple[str, str]] = (),
-    pages: Sequence[tuple[str, str]] = (),
 ) -> str:
-    """The whole page. `beside` names the data files in its folder, `pages` is what `pages_beside` finds.
+    """The whole page. `beside` names the data files in its folder.
 
     `figures_13` are sessions of characters and their pictures as data URIs.
     """
@@ -100,8 +95,7 @@ def page_of(
         name=", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else ""),
         note=source_note(report.source),
         beside=beside,
-        pages=pages,
-        verdict=list(verdict(report)),
+        verdict=verdict(report),
         measured=measured(report),
         trust=list(trust(report)),
         table_one=table_1(report),
@@ -120,24 +114,12 @@ def page_of(
         shown=best_model.label if best_model is not None else "",
         best=[pictured(outcome, k, report.shown) for k in best],
         worst=[pictured(outcome, k, report.shown) for k in worst],
-        steps=by_strokes(report) if report.by_strokes else "",
         curves=losses(curves) if curves else "",
         refused=report.refused[:MAX_REFUSED],
         more_refused=max(0, len(report.refused) - MAX_REFUSED),
         provenance=[(session, provenance(session)) for session in report.sessions],
         software=", ".join(f"{name} {number}" for name, number in report.software.items()),
     )
-
-
-def pages_beside(sessions: Sequence[FittedSession], folder: Path) -> Iterator[tuple[str, str]]:
-    """Name and relative address of the calibration's and the fit's page, where `folder` lies in the session's own."""
-    for session in sessions:
-        home = session.recording.path.parent
-        if folder.resolve().parent != home.resolve():
-            continue
-        for name, artefact, kind in (("calibration", session.calibration, FOLDER), ("brush fit", session.fit, FITS)):
-            if artefact is not None and (home / kind / f"{artefact.digest}.html").is_file():
-                yield f"{name} of {session.header.session_id}", f"../{kind}/{artefact.digest}.html"
 
 
 def _table_three(report: Report) -> Iterator[tuple[str, list[TableRow]]]:
@@ -251,22 +233,6 @@ def distributions(outcome: Outcome, report: Report) -> str:
     return chart_uri(panels, (1060, 120 + 32 * len(models)), report.label)
 
 
-def by_strokes(report: Report) -> str:
-    """CSIM on presses that were not fitted, against the number of presses that were."""
-    marks: list[Marks] = []
-    for name, colour in (("CCD-BSM", ORANGE), ("Bézier", BLUE)):
-        csim: dict[int, list[float]] = {}
-        for step in report.by_strokes:
-            if step.model == name:
-                csim.setdefault(step.strokes, []).append(step.csim)
-        counts = sorted(csim)
-        means = [np.mean(csim[count]) for count in counts]
-        marks.append(Marks(counts, means, colour, f"{name} fitted", dot_px=6.0, line_px=1.5))
-    ticks = {float(step.strokes): str(step.strokes) for step in report.by_strokes}
-    across, up = Axis("presses that were fitted", ticks, log=True), Axis("CSIM on all others, %")
-    return chart_uri([Panel("mm, binary", across, up, marks)], (720, 340), report.label)
-
-
 def losses(curves: Sequence[Curve]) -> str:
     """Validation losses of generators side by side: the paper's figure 9, also for the strokes of figure 12."""
     colours = itertools.cycle(COLOURS)
@@ -300,18 +266,17 @@ def headline(report: Report) -> Iterator[tuple[str, float]]:
             yield label, csim.avg
 
 
-def verdict(report: Report) -> Iterator[str]:
-    """How well the model shown predicts, and how large the marks are."""
+def verdict(report: Report) -> str:
+    """How well the model shown predicts; empty where none was compared."""
     csim, top = _csim(report, report.shown), _csim(report, CEILING)
-    if csim is not None:
-        below = f", {_points(csim)} below the ceiling of {top.avg:.1f} %" if top and csim.below_ceiling else ""
-        unseen = " from cells that it has not seen" if report.shown == FITTED_HELD_OUT else ""
-        label = _label(report, report.shown)
-        yield f"{label} predicts presses{unseen} with an average CSIM of {csim.avg:.1f} %{below}."
-    ratios = [session.size_ratio for session in report.sessions if session.size_ratio is not None]
-    if ratios:
-        length, width = (sum(side) / len(ratios) for side in zip(*ratios, strict=True))
-        yield f"The marks are {length:.2f} times as long and {width:.2f} times as wide as CCD-BSM predicts."
+    if csim is None:
+        return ""
+    below = ""
+    if top is not None and csim.below_ceiling is not None:
+        below = f", {_points(csim)} below the ceiling of {top.avg:.1f} %"
+    unseen = " from cells that it has not seen" if report.shown == FITTED_HELD_OUT else ""
+    label = _label(report, report.shown)
+    return f"{label} predicts presses{unseen} with an average CSIM of {csim.avg:.1f} %{below}."
 
 
 def trust(report: Report) -> Iterator[Point]:
@@ -406,7 +371,7 @@ def terminal_lines(report: Report) -> Iterator[object]:
         for name in record.characters:
             rows = [table_3(record, name, alignment) for alignment in (NORMAL[0], STRICT[0])]
             yield _terminal_table(f"Table 3: {name}, averages, binary, percent ({report.label})", *rows)
-    yield " ".join(verdict(report))
+    yield verdict(report)
     for point in trust(report):
         yield f"{'•' if point.good is None else '✓' if point.good else '✗'} {point.text}"
     for press in report.refused[:MAX_REFUSED_IN_TERMINAL]:

@@ -10,7 +10,6 @@ import itertools
 import platform
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import ClassVar, NamedTuple
@@ -28,11 +27,9 @@ from brushloop.calibrate.compare import (
     Polarity,
     Printed,
     Tone,
-    brush_of,
 )
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.loop import AGAIN, LoopRecord
-from brushloop.calibrate.presses import Press
 from brushloop.calibrate.report import Sealed, load_sealed, source_label
 from brushloop.calibrate.scores import MEASURES, Cell, Scores, Stat, find_stat, statistics
 from brushloop.calibrate.session import Calibration
@@ -47,11 +44,9 @@ from brushloop.calibrate.validate.run import (
     ModelInfo,
     Outcome,
     Refused,
-    Step,
 )
 from brushloop.calibrate.writing.compare import ANOTHER as ANOTHER_WRITING
 from brushloop.calibrate.writing.compare import PAPER_ROWS, PLANNED, REFERENCE, SIMULATED, Table3Row, WrittenRecord
-from brushloop.model.ccdbsm import DomainError
 from brushloop.model.similarity import SSIM_SETTINGS
 from brushloop.sessions.disk import csv_text
 from brushloop.sessions.events import CaptureResult, DipResult, ZeroTouchResult
@@ -114,8 +109,6 @@ class Session(Frozen):
     calibration: Calibration | None
     """None for an import, which brings its own scale."""
     fit: str
-    size_ratio: tuple[float, float] | None
-    """Measured length and width divided by those of CCD-BSM as published, averaged over uncut strokes."""
     deepest_miss: Stroke | None = None
     """The stroke whose reached depth differs most from the commanded one; None where none is recorded."""
     collected: Collected | None = None
@@ -130,7 +123,7 @@ class Session(Frozen):
 class Report(Sealed):
     """All results of a validation."""
 
-    FORMAT: ClassVar[str] = "brushloop-validation-4"
+    FORMAT: ClassVar[str] = "brushloop-validation-5"
     MADE_BY: ClassVar[str] = "brushloop validate"
 
     source: Source
@@ -147,8 +140,6 @@ class Report(Sealed):
     stats: tuple[Stat, ...]
     """Over all cells, and in each unless there are too many different (H, alpha) for a table."""
     refused: tuple[Refused, ...]
-    by_strokes: tuple[Step, ...]
-    """Similarity against number of strokes; empty without --ablations."""
     scores_sha256: str
     """Hash of scores.csv in the same folder."""
     loops: tuple[LoopRecord, ...] = ()
@@ -199,7 +190,6 @@ def report_of(
         shown=next((name for name in order if name in present), ""),
         stats=stats,
         refused=tuple(outcome.refused),
-        by_strokes=tuple(outcome.steps),
         scores_sha256=scores_sha256,
         loops=tuple(loops),
         written=tuple(written),
@@ -240,7 +230,6 @@ def _session(session: FittedSession, scores: Scores) -> Session:
         cut=tuple(press.stroke.stroke_id for press in presses if press.cut),
         calibration=session.calibration,
         fit="" if session.fit is None else session.fit.digest,
-        size_ratio=_size_ratio(session.header, presses),
         deepest_miss=max((press.stroke for press in presses), key=missed_mm, default=None),
         collected=collected_in(session.recording.path.parent),
     )
@@ -269,24 +258,6 @@ def collected_in(folder: Path) -> Collected | None:
         touches=tuple(f"{touch.method} {touch.touch_z_mm:.2f} mm" for touch in touches),
         moved_mm=round(max(heights_mm) - min(heights_mm), 6),
     )
-
-
-def _size_ratio(header: Header, presses: Sequence[Press]) -> tuple[float, float] | None:
-    """Mean ratio of length and width of uncut marks to those of CCD-BSM for a brush of this size."""
-    from brushloop.model.ccdbsm import ccdbsm
-
-    brush = brush_of(header)
-    ratios: list[tuple[float, float]] = []
-    for press in presses:
-        with suppress(DomainError):
-            mark, measured = ccdbsm(brush, press.condition.depth_mm, press.condition.tilt_deg), press.measured
-            if not press.cut:
-                length, width = measured.length_mm / mark.length_mm[0], measured.breadth_mm / mark.width_mm[0]
-                ratios.append((float(length), float(width)))
-    if not ratios:
-        return None
-    length, width = np.mean(ratios, axis=0).tolist()
-    return round(length, 6), round(width, 6)
 
 
 class TableRow(NamedTuple):

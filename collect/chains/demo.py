@@ -127,7 +127,7 @@ class Demo:
         say("", f"How much of the ink is predicted (average CSIM; {report.label}):")
         for label, percent in headline(report):
             say(f"  {label:30} {'█' * round(percent / 100 * BAR):{BAR}} {percent:.1f} %")
-        say(*verdict(report))
+        say(verdict(report))
 
     def _started(self) -> LoopbackRig:
         """The rig of this demo; started, with a blank sheet, where it is first needed. Raises `RigDidNotStart`."""

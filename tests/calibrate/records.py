@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from brushloop.calibrate.compare import KEYS, Tone
-from brushloop.calibrate.loop import AGAIN, ANOTHER, SIMULATED, LoopRecord, statistics_of, verdicts
+from brushloop.calibrate.loop import AGAIN, ANOTHER, SIMULATED, LoopRecord, statistics_of
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.scores import Scores
 from brushloop.calibrate.stroke import Measured
@@ -48,7 +48,6 @@ def loop_record(original: str, original_sha256: str, source: Source = Source.LOO
         pairs=6,
         goal_points=1.0,
         stats=tuple(statistics_of(scores)),
-        verdicts=tuple(verdicts(scores)),
         refused=(),
         software="brushloop test",
         command="brushloop repress compare",

@@ -16,7 +16,7 @@ from brushloop.calibrate.loop import (
     Pair,
     pair_up,
     score_pairs,
-    verdicts,
+    statistics_of,
 )
 from brushloop.calibrate.presses import Press, prepare_job, press_of
 from brushloop.model.ccdbsm import Brush
@@ -26,6 +26,7 @@ from brushloop.sessions.messages import encode_png
 from brushloop.sessions.recording import Capture
 from brushloop.sessions.records import Header, Source, Stroke
 from tests.calibrate.given import CALIBRATION
+from tests.calibrate.records import loop_record
 
 MODEL = stroke_model("ccd-bsm", Brush())
 ANCHOR, CELL = (60.0, 40.0), (30.0, 28.0, 40.0, 24.0)
@@ -82,20 +83,21 @@ def test_a_press_made_again_as_it_was_beats_the_other_press_of_its_cell() -> Non
     assert csim[AGAIN].min() == pytest.approx(1.0)
     assert csim[ANOTHER].max() < 0.98
     assert csim[SIMULATED].mean() > 0.99
-    first, *others = verdicts(scores)
-    assert len(others) == 7
-    assert all(verdict.holds and verdict.n == 2 for verdict in (first, *others))
-    # One cell only: nothing says how sure that is.
-    assert first.interval is None
-    assert not first.certain
+    record = loop_record("grid", "ab", stats=tuple(statistics_of(scores)))
+    assert len(record.lost) == 8
+    assert all(points < 0.0 and row.csim.n == 2 for points, _, _, row in record.lost)
+    assert record.answer.good
+    assert "so few strokes do not make it certain" in record.answer.text, "two presses of one cell"
 
 
 def test_a_press_made_again_too_deep_fails_and_says_so() -> None:
     again = [press("a-r01~1", (18.0, 5.0), (18.0, 5.0), "a-r01")]
     scores = score_pairs(paired(ORIGINALS, again)[0], ORIGINALS)
-    [strict] = [v for v in verdicts(scores) if (v.alignment, v.tone, v.measure) == (*STRICT, "csim")]
-    assert strict.difference < -2.0
-    assert not strict.holds
+    record = loop_record("grid", "ab", stats=tuple(statistics_of(scores)))
+    stat = record.stat(AGAIN, STRICT)
+    assert stat is not None
+    assert stat.csim.below_ceiling > 2.0
+    assert record.answer.good is False
 
 
 def test_what_repeats_nothing_is_named() -> None:
@@ -118,4 +120,5 @@ def test_an_original_alone_in_its_cell_has_no_repeatability() -> None:
     again = [press("b-r01~1", (19.0, 0.0), (19.0, 0.0), "b-r01")]
     scores = score_pairs(paired(ORIGINALS, again)[0], ORIGINALS)
     assert np.isnan(scores.of(ANOTHER)).all()
-    assert list(verdicts(scores)) == []
+    record = loop_record("grid", "ab", stats=tuple(statistics_of(scores)))
+    assert (record.lost, record.answer.good) == ([], None)

@@ -6,7 +6,6 @@ import base64
 import re
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 from xml.etree import ElementTree
 
 import cv2
@@ -20,7 +19,6 @@ from brushloop.calibrate.board.spec import BoardSpec, charuco_board
 from brushloop.calibrate.compare import Tone
 from brushloop.calibrate.loop import Pair, write_loop
 from brushloop.calibrate.report import Axis, Marks, Panel, chart_uri, source_label, source_note
-from brushloop.calibrate.validate.page import pages_beside
 from brushloop.calibrate.writing import Figure, Plan, PlannedBy, as_points
 from brushloop.calibrate.writing.compare import Character, WritingComparison, write_written
 from brushloop.sessions.records import Header, Source
@@ -142,19 +140,6 @@ def test_a_page_of_a_twin_says_whose_twin_on_every_figure(pages: dict[str, str])
         assert pages[name].count("brush twin of 2026-03-02-grid-01") > 5
     assert "a-r02: was not pressed again" in pages["loop"]
     assert "x&lt;u&gt;: is blank" in pages["loop"]
-
-
-def test_a_report_in_the_session_links_to_the_pages_that_are_there_and_one_elsewhere_to_none(tmp_path: Path) -> None:
-    home = tmp_path / "2026-03-02-grid-01"
-    page = home / "calibration" / f"{CALIBRATION.digest}.html"
-    page.parent.mkdir(parents=True)
-    recording, header = SimpleNamespace(path=home / "x.mcap"), SimpleNamespace(session_id=home.name)
-    session: Any = SimpleNamespace(recording=recording, header=header, calibration=CALIBRATION, fit=None)
-    assert list(pages_beside([session], home / "validation")) == []
-    page.touch()
-    expected = [(f"calibration of {home.name}", f"../calibration/{page.name}")]
-    assert list(pages_beside([session], home / "validation")) == expected
-    assert list(pages_beside([session], tmp_path / "elsewhere")) == []
 
 
 def test_the_remark_of_a_described_brush_is_part_of_the_label() -> None:

@@ -22,7 +22,7 @@ from brushloop.sessions.records import Source
 from tests.calibrate.records import loop_record, table_of, written_record
 
 FAST = ("--model", "line", "--no-held-out")
-HALF = '{"format": "brushloop-loop-3", "digest": "\\ud800"}'
+HALF = '{"format": "brushloop-loop-4", "digest": "\\ud800"}'
 """Half a surrogate: JSON, but no text that a page could hold."""
 PICTURE = cv2.imencode(".png", np.full((20, 40), 200, np.uint8))[1].tobytes()
 
@@ -94,7 +94,7 @@ def test_a_loop_in_the_session_is_the_third_row_of_table_1(place: Path) -> None:
     [
         (("imported photographs", "real capture"), "was edited: its digest does not match its contents"),
         (('"digest"', '"digested"'), "is not a report with a digest: write it with `brushloop repress compare`"),
-        (("brushloop-loop-3", "brushloop-loop-9"), "format is 'brushloop-loop-9', expected 'brushloop-loop-3'"),
+        (("brushloop-loop-4", "brushloop-loop-9"), "format is 'brushloop-loop-9', expected 'brushloop-loop-4'"),
     ],
 )
 def test_an_edited_loop_is_refused_by_name(place: Path, edit: tuple[str, str], words: str) -> None:

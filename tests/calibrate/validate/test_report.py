@@ -146,19 +146,15 @@ def test_a_capture_that_a_person_marked_bad_is_left_out_by_name(session: Path, t
         assert ("&lt;b&gt;hair" in (tmp_path / "out" / "report.html").read_text()) == bad
 
 
-def test_ablations_show_lambda_and_the_number_of_strokes(session: Path, tmp_path: Path) -> None:
+def test_ablations_show_lambda_and_curves_the_losses_of_trainings(session: Path, tmp_path: Path) -> None:
     curve = tmp_path / "training"
     curve.mkdir()
     (curve / "validation.csv").write_text("step,mse,iou,csim\n10,0.1,0.5,0.6\n20,0.01,0.9,0.95\n")
     given = ("--model", "ccd-bsm", "--model", "ccd-bsm-lambda-1", "--model", "ccd-bsm-lambda-pi/2")
     run(session, "--out", tmp_path / "out", *given, "--ablations", "--curves", f"QBC={curve}")
-    report = load_report(tmp_path / "out" / "report.json")
-    assert report.stat("ccd-bsm-lambda-1") is not None
-    by_count = {step.strokes: step.csim for step in report.by_strokes if step.model == "CCD-BSM"}
-    assert sorted(by_count) == [1, 2, 3, 5]
-    assert by_count[5] > by_count[1]
+    assert load_report(tmp_path / "out" / "report.json").stat("ccd-bsm-lambda-1") is not None
     page = (tmp_path / "out" / "report.html").read_text()
-    for words in ("λ = π/2", "similarity against the number of fitted presses", "validation losses"):
+    for words in ("λ = π/2", "validation losses"):
         assert words in page
 
 
