@@ -19,7 +19,6 @@ from brushloop.calibrate.board.lens import FITTED
 from brushloop.calibrate.calibrated import calibrate_session
 from brushloop.calibrate.commands import CalibrateRequest
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.files import check_target
 from brushloop.calibrate.session import Calibration, open_session
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.config import SimConfig, Table, View
@@ -182,17 +181,6 @@ def test_a_pointer_that_leads_nowhere_is_refused_and_never_guessed_around(
 
 
 # Nothing that was recorded or is being read is ever overwritten
-
-
-def test_a_target_has_the_ending_of_what_is_written_and_is_not_what_is_read(tmp_path: Path) -> None:
-    photograph, recording, folder = tmp_path / "a.png", tmp_path / "s.mcap", tmp_path / "folder.png"
-    photograph.write_bytes(b"ink")
-    folder.mkdir()
-    check_target(tmp_path / "new.PNG", ".png", photograph, None)
-    check_target(photograph, ".png")
-    for path, why in ((recording, r"must end in \.png"), (photograph, "is the input"), (folder, "is a folder")):
-        with pytest.raises(CalibrationError, match=why):
-            check_target(path, ".png", photograph)
 
 
 @pytest.mark.parametrize(
