@@ -95,12 +95,11 @@ def test_the_loop_is_closed_and_goes_on_after_kill_nine(bench: Bench) -> None:
     originals = sorted(stroke.stroke_id for stroke in Recording(session).stroke_records())
     assert sorted(str(stroke.again_of) for stroke in Recording(replay).stroke_records()) == originals
 
-    report: dict[str, Any] = json.loads((session / "loop" / "loop.json").read_text(encoding="utf-8"))
-    assert (report["source"], report["pairs"], report["refused"]) == ("loopback rig", 6, [])
+    record = read_loop(session / "loop")
+    assert (record.source, record.pairs, record.refused) == ("loopback rig", 6, ())
     # No patch was pressed twice: the brush's repeatability is not known, and nothing is claimed.
-    assert report["verdicts"] == []
-    rows = read_loop(session / "loop").stats
-    assert {row.model for row in rows} == {"re-pressed", "recovered, simulated"}
+    assert record.lost == []
+    assert {row.model for row in record.stats} == {"re-pressed", "recovered, simulated"}
     with (session / "loop" / "loop.csv").open(encoding="utf-8") as file:
         single = [row for row in csv.DictReader(file) if row["model"] == "re-pressed" and row["tone"] == "binary"]
     assert len(single) == 12
