@@ -16,8 +16,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from brushloop.calibrate.errors import CalibrationError, invalid
 from brushloop.calibrate.files import read_bounded, write_whole
 
-FOLDER = "calibration"
-"""Folder of a session that holds its calibrations."""
+FOLDER, FITS = "calibration", "brushfit"
+"""Folders of a session that hold its calibrations, and the fits of its brush."""
 HASH_CHARS = 16
 POINTER = "current"
 NAME = re.compile(rb"([0-9a-f]{%d}\.json)\n?" % HASH_CHARS)

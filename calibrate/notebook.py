@@ -29,8 +29,7 @@ from brushloop.calibrate.commands import (
 from brushloop.calibrate.compare import GRAY_MM, brush_of, simulated
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.presses import Refused, read_presses, rectified
-from brushloop.calibrate.remote import local_path
-from brushloop.calibrate.session import Calibration, OpenSession, open_session
+from brushloop.calibrate.session import Calibration, OpenSession, local_path, open_session
 from brushloop.calibrate.stroke import Prepared
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.generator import SHIPPED_GENERATOR

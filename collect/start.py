@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from brushloop.calibrate.artefact import current
+from brushloop.calibrate.artefact import FITS, current
 from brushloop.calibrate.commands import CalibrateRequest, FitRequest, show_work
 from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.open_or_resume import CollectRequest, Opening, find_resumable
@@ -214,9 +214,9 @@ def calibrated(session: Path) -> None:
 
 def fitted(session: Path) -> Path:
     """The brush fit in use of a session, made if there is none. Raises `CalibrationError`, `SessionError`."""
-    from brushloop.calibrate.fit.fit import FOLDER, fit_presses  # slow to import
+    from brushloop.calibrate.fit.fit import fit_presses  # slow to import
 
-    fit = current(session, FOLDER)
+    fit = current(session, FITS)
     if fit is None:
         say(f"fit {session}")
         fit = show_work(fit_presses, FitRequest(session)).path

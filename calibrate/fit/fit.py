@@ -17,7 +17,7 @@ from typing import Any, Self
 import numpy as np
 from pydantic import model_validator
 
-from brushloop.calibrate.artefact import SessionFit, load_artefact, made_by, put_to_use
+from brushloop.calibrate.artefact import FITS, SessionFit, load_artefact, made_by, put_to_use
 from brushloop.calibrate.commands import FitRequest
 from brushloop.calibrate.compare import MM_PER_PX, brush_of
 from brushloop.calibrate.errors import CalibrationError
@@ -53,8 +53,6 @@ from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Header
 from brushloop.sessions.terminal import Progress, unseen
 
-FOLDER = "brushfit"
-"""Folder of a session that holds its fits."""
 FEWEST_CELLS = 5
 MARGIN_MM = 1.5
 SMOOTH_POINTS = 24
@@ -243,7 +241,7 @@ def fit_presses(request: FitRequest, progress: Progress = unseen) -> FitResult:
         ends_mm=press.ends.tolist(),
         csim_percent={row.model: row.csim for row in held_out},
     )
-    path = put_to_use(fit, session.recording.path.parent, FOLDER)
+    path = put_to_use(fit, session.recording.path.parent, FITS)
     result = FitResult(session, presses, refused, fit, sizes_of(presses), held_out, path)
     _write_page(result, press)
     return result

@@ -9,19 +9,18 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from brushloop.calibrate.artefact import current, load_artefact
+from brushloop.calibrate.artefact import FITS, current, load_artefact
 from brushloop.calibrate.commands import ValidateRequest
 from brushloop.calibrate.drags.report import DragValidation, validate_drags, write_drags
 from brushloop.calibrate.drags.report import summary as drag_summary
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_bounded
-from brushloop.calibrate.fit.fit import FOLDER as FITS
 from brushloop.calibrate.fit.fit import BrushFit
 from brushloop.calibrate.loop import FILE as LOOP_FILE
 from brushloop.calibrate.loop import LoopRecord, read_loop
-from brushloop.calibrate.remote import URL, local_path
 from brushloop.calibrate.report import data_uri, framed, write_files
 from brushloop.calibrate.scores import scores_csv
+from brushloop.calibrate.session import URL, local_path
 from brushloop.calibrate.session import open_session as open_recording
 from brushloop.calibrate.validate.page import Curve, page_of, read_curve, terminal_lines
 from brushloop.calibrate.validate.run import FittedSession, Outcome, Refused, validate_presses

@@ -19,11 +19,10 @@ from textual.content import Content
 from textual.screen import Screen
 from textual.widgets import Footer, OptionList
 
-from brushloop.calibrate.artefact import current, load_artefact
+from brushloop.calibrate.artefact import FITS, current, load_artefact
 from brushloop.calibrate.board.pix2len import Plane, see_board
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.fit.fit import FOLDER as FITS
 from brushloop.calibrate.fit.fit import BrushFit
 from brushloop.calibrate.session import rig_of
 from brushloop.calibrate.stats import odd_waits, waits_of

@@ -8,10 +8,10 @@ import pytest
 from typer.testing import CliRunner
 
 from brushloop.__main__ import app
-from brushloop.calibrate.artefact import current, load_artefact
+from brushloop.calibrate.artefact import FITS, current, load_artefact
 from brushloop.calibrate.commands import FitRequest
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.fit.fit import FOLDER, BrushFit, fit_presses
+from brushloop.calibrate.fit.fit import BrushFit, fit_presses
 from brushloop.calibrate.session import open_session
 from brushloop.calibrate.validate.tables import load_report
 from brushloop.model.fitted import NAME, NAMES
@@ -35,7 +35,7 @@ def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> Non
         assert words in said
     assert "…" not in said, "a size is cut in 60 columns"
     assert not any(name in said for name in NAMES), "a parameter alone says nothing about another brush"
-    path = current(session, FOLDER)
+    path = current(session, FITS)
     assert path is not None
     fit = load_artefact(path, BrushFit)
     assert fit.strokes == 5

@@ -19,10 +19,10 @@ from typing import Any
 import fsspec
 import pytest
 
-from brushloop.calibrate import remote
+from brushloop.calibrate import session as sessions
 from brushloop.calibrate.artefact import current
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.remote import local_path
+from brushloop.calibrate.session import local_path
 from brushloop.calibrate.validate.command import open_session
 from tests.calibrate.given import CALIBRATION
 
@@ -132,7 +132,7 @@ def test_a_web_server_is_a_place_like_any_other(tmp_path: Path) -> None:
 def test_a_web_server_that_stalls_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """It accepts the connection and never answers."""
     pytest.importorskip("aiohttp", reason="needs the extra [remote]")
-    monkeypatch.setattr(remote, "STALL_S", 0.05)
+    monkeypatch.setattr(sessions, "STALL_S", 0.05)
     with socket.create_server(("127.0.0.1", 0)) as silent, pytest.raises(CalibrationError, match="cannot be read"):
         local_path(f"http://127.0.0.1:{silent.getsockname()[1]}/x.mcap#sha256={'0' * 64}")
 
