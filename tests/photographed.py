@@ -28,12 +28,19 @@ def photograph(path: Path, mark: Footprint, size_px: tuple[int, int], touch_px: 
 
 
 def imported(
-    photos: Path, lines: Sequence[str], out: Path, kind: Literal["press", "drag"], *, simulated: bool = False
+    photos: Path,
+    lines: Sequence[str],
+    out: Path,
+    kind: Literal["press", "drag"],
+    *,
+    simulated: bool = False,
+    origin: str = "",
 ) -> Path:
     """The session of these photographs; `lines` are those of their table, its head first."""
     table = photos / "strokes.csv"
     table.write_text("\n".join(lines) + "\n")
-    import_photographs(photos, table, out, ImportOptions(kind=kind, simulated=simulated), "test", lambda: 1)
+    options = ImportOptions(kind=kind, simulated=simulated, origin=origin)
+    import_photographs(photos, table, out, options, "test", lambda: 1)
     return out
 
 

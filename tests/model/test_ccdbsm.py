@@ -86,14 +86,6 @@ def test_the_area_matches_quadrature(press: tuple[Brush, float, float], lam: flo
     assert mark.area_mm2.item() == pytest.approx(2 * (tip + heel), rel=1e-6)
 
 
-@given(presses())
-def test_the_half_width_is_greatest_at_the_brush_axis_and_ends_at_both_ends(press: tuple[Brush, float, float]) -> None:
-    mark = ccdbsm(*press)
-    places = np.stack((1.5 * mark.x_min_mm, mark.x_min_mm, np.zeros(1), mark.x_max_mm), axis=-1)
-    peak = mark.half_width_mm.item()
-    assert mark.half_width(places)[0].tolist() == pytest.approx([0.0, 0.0, peak, 0.0], abs=1e-6 * peak)
-
-
 def test_a_batch_is_its_presses_one_by_one_also_in_scalars() -> None:
     mark = ccdbsm(BRUSH, np.array([11.0, 20.0]), 5)
     assert mark.o3a_mm.shape == mark.lam.shape == (2,)

@@ -67,14 +67,6 @@ def test_any_model_inverts_its_own_marks(model: str) -> None:
     assert np.abs(recovered.tilt_deg - tilt).max() < 0.05
 
 
-def test_binary_images_give_the_depth_to_a_fiftieth_of_a_millimetre() -> None:
-    depth, tilt, place, images = anchored(100, 2)
-    recovered = INVERT((images > 0.5).astype(np.float32), place)
-    assert np.abs(recovered.depth_mm - depth).mean() < 0.02
-    assert inside(recovered, "depth_mm", depth) >= 0.85
-    assert inside(recovered, "tilt_deg", tilt) >= 0.75
-
-
 def test_intervals_under_sensor_noise_keep_their_word() -> None:
     depth, tilt, place, images = anchored(200, 3, (1.0, 10.0))
     noisy = images + np.random.default_rng(4).normal(0, 0.05, images.shape)

@@ -129,22 +129,6 @@ def test_a_plane_is_fitted_and_needs_three_cells() -> None:
         fit_plane(DEPTHS, np.zeros(3), {"tip_mm": DEPTHS})
 
 
-def test_an_ellipse_arc_has_the_area_and_the_extent_of_its_ellipse() -> None:
-    # One third of a circle of radius 2 as a conic, closed by its chord.
-    a = math.radians(60)
-    ends = [2 * math.cos(a), -2 * math.sin(a)], [2 * math.cos(a), 2 * math.sin(a)]
-    arc = [ends[0], [2 / math.cos(a), 0.0], ends[1]]
-    chord = [ends[1], [2 * math.cos(a), 0.0], ends[0]]
-    outline = Outline(np.array([[arc, chord]]), np.array([[0.5, 1.0]]))
-    assert outline.area_mm2.item() == pytest.approx(0.5 * 4 * (2 * a - math.sin(2 * a)))
-    assert outline.x_max_mm.item() == pytest.approx(2.0)
-    assert outline.x_min_mm.item() == pytest.approx(1.0)
-    assert outline.width_mm.item() == pytest.approx(4 * math.sin(a))
-    assert np.hypot(*outline.polyline(8)[0, :9].T).tolist() == pytest.approx([2.0] * 9)
-    with pytest.raises(ValueError, match="per_arc = 0"):
-        outline.polyline(0)
-
-
 def test_models_are_drawn_without_torch() -> None:
     code = "import sys; from brushloop import predict, Condition, models; [predict(Condition(15.0, 5.0), model=m) "
     code += "for m in models()]; assert 'torch' not in sys.modules"

@@ -23,14 +23,12 @@ from brushloop.twin.run import LEAST_MISPLACED_MM, Estimate, fit_twin, sound_hea
 from brushloop.twin.search import (
     Solution,
     Target,
-    agreement,
     choose_individual,
     fit_spread,
     of_parts,
     off,
     search,
     start,
-    statistics,
 )
 
 GRID = Grid(np.arange(-20.0, 6.0, 0.4), np.arange(8.0, -8.0, -0.4))
@@ -118,14 +116,6 @@ def test_what_the_parts_disagree_on_is_not_determined() -> None:
     assert of_parts(points[:1]) == 0.0
     errors = np.sqrt(of_parts(points))
     assert [Estimate.of(SHAPE[k], 1.0, float(errors[k])).determined for k in (0, 1)] == [True, False]
-
-
-def test_equal_repeats_agree_wholly_and_moved_ones_deviate_by_as_much_as_they_were_moved() -> None:
-    one, moved = (draw(BrushSpec(), place, CELLS, GRID)[:, 0] for place in (HERE, (0.0, 0.8, 0.0)))
-    assert agreement([np.stack([a, a]) for a in one]) == pytest.approx(100.0)
-    pairs = [np.stack([a, b]) for a, b in zip(one, moved, strict=True)]
-    assert agreement(pairs) < 97.0
-    assert np.exp(statistics(pairs, GRID)[1]) == pytest.approx(0.8 / np.sqrt(2.0), abs=0.15)
 
 
 @pytest.mark.parametrize(("name", "value", "least"), [("place_wander_mm", 0.4, 0.25), ("reach_wander_mm", 1.0, 0.2)])
