@@ -118,7 +118,7 @@ COMMANDS: tuple[tuple[str, str, type[Any], str], ...] = (
     ("train tune", "", commands.TuneRequest, "calibrate.training:tune"),
     ("twin", RESEARCH, commands.TwinRequest, "twin.run:twin"),
     ("validate sessions", "", commands.ValidateRequest, "calibrate.validate.command:validate"),
-    ("validate diff", "", commands.DiffRequest, "calibrate.validate.diff:compare"),
+    ("validate diff", "", commands.DiffRequest, "calibrate.validate.command:compare"),
     ("write plan", "", commands.PlanRequest, "calibrate.writing:plan"),
     ("write compare", "", commands.CompareWrittenRequest, "calibrate.writing.compare:compare"),
     ("write learn", "", commands.LearnRequest, "calibrate.writing.learn:learn"),

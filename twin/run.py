@@ -127,11 +127,11 @@ def twin(request: TwinRequest, progress: Progress = unseen) -> Written:
             fitted = fit_twin(presses.near_ink(), pool, progress, session.store)
         except ValueError as error:
             raise CalibrationError(str(recording.path), str(error)) from None
-    text = twin_toml(fitted, header.session_id, noise_gray(recording))
-    write_whole(target, text)
+    lines = list(twin_toml(fitted, header.session_id, noise_gray(recording)))
+    write_whole(target, "\n".join(lines) + "\n")
     said = [f"{source_note(header.source, header.brush)}; twin of {len(presses)} presses"]
     said += (f"left out: {name}: {why}" for name, why in refused)
-    said += (*text.splitlines(), f"Twin: {target}", f"next: brushloop sim --brush {quote(str(target))}")
+    said += (*lines, f"Twin: {target}", f"next: brushloop sim --brush {quote(str(target))}")
     return Written(target, said)
 
 
@@ -280,15 +280,11 @@ def _head_mm(image: Images, grid: Grid) -> float | None:
     return float(-left if abs(left) < abs(right) else right)
 
 
-def twin_toml(twin: Twin, session_id: str, noise_gray: float | None) -> str:
-    """The text of `twin.toml`: every constant of the brush, and what is known of it as a comment.
+def twin_toml(twin: Twin, session_id: str, noise_gray: float | None) -> Iterator[str]:
+    """Yield the lines of `twin.toml`: every constant of the brush, and what is known of it as a comment.
 
     `noise_gray` is that of the camera, None where it was not measured.
     """
-    return "\n".join(_lines(twin, session_id, noise_gray)) + "\n"
-
-
-def _lines(twin: Twin, session_id: str, noise_gray: float | None) -> Iterator[str]:
     plain = "".join(char if char.isprintable() and char not in '"\\' else "?" for char in session_id)
     yield f"# Made by `brushloop twin` ({made_by()}); press with it: brushloop sim --brush FILE."
     yield "# Everything that it presses is simulated. Intervals hold about 95 %: docs/loopback-brush.md."
@@ -296,16 +292,12 @@ def _lines(twin: Twin, session_id: str, noise_gray: float | None) -> Iterator[st
     if noise_gray is None:
         yield "# The camera's noise was not measured: no two stills show the same view."
     else:
-        yield ""
-        yield "[camera]"
-        yield f"noise = {noise_gray:.2f}    # gray levels, from pairs of stills"
+        yield from ("", "[camera]", f"noise = {noise_gray:.2f}    # gray levels, from pairs of stills")
     if twin.head is not None:
-        yield ""
-        yield "[quality]"
+        yield from ("", "[quality]")
         yield f"head_mm = {twin.head.head_mm:g}    # where its marks begin behind the point of touch, in the middle"
         yield f"misplaced_mm = {twin.head.misplaced_mm:g}    # the farthest from there, and a margin"
-    yield ""
-    yield "[brush]"
+    yield from ("", "[brush]")
     yield f"radius_mm = {twin.spec.radius_mm:g}    # as recorded with the session"
     yield f"length_mm = {twin.spec.length_mm:g}    # as recorded with the session"
     yield f"seed = {twin.spec.seed}    # of the individuals tried, the one nearest to the captures"

@@ -1,16 +1,26 @@
-"""`brushloop validate`: from the locations of sessions to the files of a report."""
+"""`brushloop validate`: from the locations of sessions to the files of a report; and `diff`, two reports compared.
+
+A difference is tested in pairs. These are, in order of preference: the same stroke of the same recording (two software
+versions, or two sets of options); the averages of the same cell in two sessions.
+"""
 
 from __future__ import annotations
 
+import csv
 import hashlib
+import shlex
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from statistics import fmean
 
+import numpy as np
 from filelock import FileLock, Timeout
+from rich.table import Table
 
 from brushloop.calibrate.artefact import FITS, current, load_artefact
-from brushloop.calibrate.commands import ValidateRequest
+from brushloop.calibrate.commands import DiffRequest, ValidateRequest
 from brushloop.calibrate.drags.report import DragValidation, validate_drags, write_drags
 from brushloop.calibrate.drags.report import summary as drag_summary
 from brushloop.calibrate.errors import CalibrationError
@@ -19,16 +29,17 @@ from brushloop.calibrate.fit.fit import BrushFit
 from brushloop.calibrate.loop import FILE as LOOP_FILE
 from brushloop.calibrate.loop import LoopRecord, read_loop
 from brushloop.calibrate.report import data_uri, framed, write_files
-from brushloop.calibrate.scores import scores_csv
+from brushloop.calibrate.scores import MEASURES, scores_csv
 from brushloop.calibrate.session import URL, local_path
 from brushloop.calibrate.session import open_session as open_recording
+from brushloop.calibrate.stats import Paired, holm, paired
 from brushloop.calibrate.validate.page import Curve, page_of, read_curve, terminal_lines
 from brushloop.calibrate.validate.run import FittedSession, Outcome, Refused, validate_presses
-from brushloop.calibrate.validate.tables import Report, check_gates, parse_gate, report_of, summary_csv
+from brushloop.calibrate.validate.tables import Report, check_gates, load_report, parse_gate, report_of, summary_csv
 from brushloop.calibrate.work import cluster, threads
 from brushloop.calibrate.writing.compare import FILE as WRITTEN_FILE
 from brushloop.calibrate.writing.compare import PICTURE, WrittenRecord, read_written
-from brushloop.sessions.disk import check_writable, csv_text
+from brushloop.sessions.disk import as_text, check_writable, csv_text, file_sha256
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.records import Source
@@ -39,6 +50,11 @@ LOCK = ".lock"
 LOOP, WRITTEN = "loop", "written"
 """Folders of a session, where its loop and its characters are looked for; `written` also beside all sessions."""
 MAX_PICTURE_BYTES = 16 * 1024 * 1024
+SIGNIFICANT = 0.05
+Series = tuple[str, str, str, str]
+"""Model, alignment, tone, measure."""
+Strokes = dict[tuple[str, ...], float]
+"""Scores by (H, alpha) and, where the same strokes are compared, recording and stroke."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,3 +235,115 @@ def _folder(request: ValidateRequest) -> Path:
         path = Path(request.places[0])
         return (path if path.is_dir() else path.parent) / FOLDER
     return Path(FOLDER)
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """One series, `after` minus `before` in points (percent)."""
+
+    series: Series
+    before: float
+    after: float
+    test: Paired
+    p_holm: float
+    """p-value corrected for the number of series compared."""
+
+    @property
+    def verdict(self) -> str:
+        """`better`, `worse` or `no significant difference`, by `p_holm`."""
+        if self.p_holm > SIGNIFICANT:
+            return "no significant difference"
+        return "better" if self.test.mean > 0 else "worse"
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """Two reports compared."""
+
+    before: Report
+    after: Report
+    by_stroke: bool
+    """Whether the same strokes are paired; else the averages of the same cells."""
+    changes: list[Change]
+
+    def lines(self) -> Iterator[object]:
+        """What the command prints: what is compared, and the changes."""
+        for words, side in (("Before", self.before), ("After", self.after)):
+            names = ", ".join(session.session_id for session in side.sessions[:4])
+            yield f"{words}: {names}, brushloop {side.software['brushloop']}."
+        what = "the same stroke" if self.by_stroke else "the average of the same (H, α)"
+        test = self.changes[0].test
+        yield (
+            f"Paired by {what}, n = {test.n} in {test.groups} cells; p by flipping the signs of whole cells, corrected "
+            f"by Holm for {len(self.changes)} series ({self.before.label})."
+        )
+        if not self.by_stroke:
+            yield "Two sessions also differ in things that were not meant to change: brush, ink, paper, zero touch."
+        title = f"after minus before, points of percent ({self.before.label})"
+        table = Table("model", "images", "", "before", "after", "change", "95 %", "p", "", title=title)
+        for change in self.changes:
+            name, alignment, tone, measure = change.series
+            span = change.test.interval
+            table.add_row(
+                *(name, f"{alignment}, {tone}", measure.upper(), f"{change.before:.2f}", f"{change.after:.2f}"),
+                *(f"{change.test.mean:+.3f}", "" if span is None else f"{span[0]:+.2f} to {span[1]:+.2f}"),
+                *(f"{change.p_holm:.3f}", change.verdict),
+            )
+        yield table
+
+
+def compare(request: DiffRequest, _progress: Progress = unseen) -> Difference:
+    """Compare two reports, or two validated sessions. Raises `CalibrationError` if they are not comparable."""
+    paths = report_path(request.before), report_path(request.after)
+    old, new = (load_report(path) for path in paths)
+    if old.source != new.source:
+        what = f"is of {new.source}, {paths[0]} of {old.source}: they cannot be compared"
+        raise CalibrationError(str(paths[1]), what)
+    by_stroke = bool({s.recording_sha256 for s in old.sessions} & {s.recording_sha256 for s in new.sessions})
+    first, last = (_scores(path, side, by_stroke=by_stroke) for path, side in zip(paths, (old, new), strict=True))
+    found: list[tuple[Series, float, float, Paired]] = []
+    for series in (series for series in first if series in last):
+        both = sorted(first[series].keys() & last[series].keys())
+        values = 100.0 * np.array([[side[series][key] for key in both] for side in (first, last)])
+        # The error of a model is common to all strokes of a cell.
+        cells = np.unique([",".join(key[:2]) for key in both], return_inverse=True)[1]
+        if both and (test := paired(values[0], values[1], cells)) is not None:
+            found.append((series, float(values[0].mean()), float(values[1].mean()), test))
+    if not found:
+        raise CalibrationError(str(paths[1]), f"has no stroke, cell or model in common with {paths[0]}")
+    corrected = holm([test.p for *_, test in found])
+    return Difference(old, new, by_stroke, [Change(*change, p) for change, p in zip(found, corrected, strict=True)])
+
+
+def report_path(place: Path) -> Path:
+    """Find report.json: the file given, or the one in a report's or session's folder, or next to a recording.
+
+    If there is none, raises `CalibrationError` that names the command to run.
+    """
+    if not place.exists():
+        raise CalibrationError(str(place), "does not exist: give a report.json, or a session that was validated")
+    if place.is_file() and place.suffix == ".json":
+        return place
+    # Search only a recording's own folder: a report next to a session's folder may be about several sessions.
+    folder = place.parent if place.is_file() else place
+    for path in (folder / "report.json", folder / "validation" / "report.json"):
+        if path.is_file():
+            return path
+    why = f"was not validated: run `brushloop validate {shlex.quote(str(place))}` first, or give a report.json"
+    raise CalibrationError(str(place), why)
+
+
+def _scores(path: Path, report: Report, *, by_stroke: bool) -> dict[Series, Strokes]:
+    """Read scores by cell, recording and stroke, or averaged by cell. Raises `CalibrationError` for an edited table."""
+    table = path.with_name("scores.csv")
+    if not table.is_file() or file_sha256(table) != report.scores_sha256:
+        raise CalibrationError(str(table), f"is not the table of {path.name}: its SHA-256 differs")
+    recordings = {s.session_id: s.recording_sha256 for s in report.sessions}
+    scores: defaultdict[Series, defaultdict[tuple[str, ...], list[float]]] = defaultdict(lambda: defaultdict(list))
+    with table.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            cell = (row["depth_mm"], row["tilt_deg"])
+            key = (*cell, recordings[row["session_id"]], as_text(row["stroke_id"])) if by_stroke else cell
+            for measure in MEASURES:
+                scores[row["model"], row["alignment"], row["tone"], measure][key].append(float(row[measure]))
+    return {series: {key: fmean(of_key) for key, of_key in keys.items()} for series, keys in scores.items()}

@@ -87,7 +87,7 @@ def test_a_twin_is_read_back_and_what_is_not_determined_has_no_interval(tmp_path
     estimates = tuple(Estimate(one, float(getattr(spec, one.name)), 0.1, 0.4, one.name != "set_deg") for one in SHAPE)
     fitted = Twin(spec, estimates, None, (HeldOut("twin", 95.1, 90.2, 45),), SoundHead(2.2, 4.0))
     path = tmp_path / "twin.toml"
-    path.write_text(twin_toml(fitted, 'session "1"\n', 1.234))
+    path.write_text("\n".join(twin_toml(fitted, 'session "1"\n', 1.234)))
     found = load_brush(path)
     assert (found.brush, found.camera, found.quality) == (spec, CameraNoise(noise=1.23), SoundHead(2.2, 4.0))
     assert found.name == "simulated bristle bundle (twin of session ?1??, simulated)"

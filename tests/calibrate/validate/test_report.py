@@ -21,8 +21,7 @@ from brushloop.calibrate.fit.fit import fit_presses
 from brushloop.calibrate.fit.heldout import BEZIER, FITTED
 from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.validate import run as validation
-from brushloop.calibrate.validate.command import validate
-from brushloop.calibrate.validate.diff import compare
+from brushloop.calibrate.validate.command import compare, validate
 from brushloop.calibrate.validate.page import provenance, trust
 from brushloop.calibrate.validate.run import BEZIER_REFITTED, FITTED_HELD_OUT
 from brushloop.calibrate.validate.tables import Collected, GateMissed, Report, check_gates, collected_in, load_report
