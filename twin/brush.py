@@ -108,11 +108,6 @@ SPREAD = (
 """Constants by which presses of one cell differ."""
 
 
-def brush_at(point: Vector, base: BrushSpec) -> BrushSpec:
-    """The brush at a point (len(SHAPE) + 3,) of the search, with the size and the individual of `base`."""
-    return with_values(base, SHAPE, point)
-
-
 def with_values(base: BrushSpec, constants: Sequence[Constant], point: Sequence[float] | Vector) -> BrushSpec:
     """`base` with these constants moved from their defaults by this many scales each."""
     values = {one.name: one.value(float(scales)) for one, scales in zip(constants, point, strict=False)}
@@ -148,11 +143,6 @@ def draw(
             mark = brush.print_descent(descent, ink_load=1.0, press_seed=seed, px_per_mm=PX_PER_MM)
             ink[c, r] = _on_grid(mark, place, grid)
     return ink
-
-
-def still(spec: BrushSpec) -> BrushSpec:
-    """The same brush without the spread of its presses."""
-    return replace(spec, **STILL)
 
 
 def mechanics(spec: BrushSpec) -> BrushSpec:

@@ -29,15 +29,14 @@ from brushloop.twin.brush import (
     HERE,
     SHAPE,
     SPREAD,
+    STILL,
     Cell,
     Images,
     Place,
     Vector,
-    brush_at,
     draw,
     place_at,
     search_bounds,
-    still,
     with_values,
 )
 
@@ -97,7 +96,7 @@ class Target:
 
     def brush(self, solution: Solution) -> BrushSpec:
         """The brush of a search."""
-        return brush_at(solution.point, replace(self.base, seed=solution.seed))
+        return with_values(replace(self.base, seed=solution.seed), SHAPE, solution.point)
 
     def only(self, kept: Sequence[int]) -> Target:
         """The same with some of the cells."""
@@ -120,7 +119,8 @@ def start() -> Solution:
 
 def off(target: Target, seed: int, blur_mm: float, point: Vector) -> Vector:
     """Residuals: differences of blurred pixels between brush and captures over `IMAGE_SD`, then those of the prior."""
-    drawn = draw(still(target.brush(Solution(point, seed))), place_at(point), target.cells, target.grid)[:, 0]
+    still = replace(target.brush(Solution(point, seed)), **STILL)
+    drawn = draw(still, place_at(point), target.cells, target.grid)[:, 0]
     apart = blurred(drawn - target.mean, blur_mm, target.grid)
     return np.concatenate([apart.ravel() / IMAGE_SD, point / PRIOR_SD])
 

@@ -57,7 +57,7 @@ from brushloop.calibrate.validate.tables import (
 from brushloop.calibrate.writing.compare import Table3Row
 
 CELL_COLUMNS = ("ccd-bsmg", "ccd-bsm", FITTED_HELD_OUT, BEZIER_REFITTED, CEILING)
-MAX_REFUSED, MAX_REFUSED_IN_TERMINAL = 200, 20
+MAX_REFUSED_IN_TERMINAL = 20
 MAX_SAMPLES = 15
 WIDE_SCALE = 0.005
 """Relative width of pix2len's interval above which it matters: half a percent of every length."""
@@ -115,8 +115,6 @@ def page_of(
         best=[pictured(outcome, k, report.shown) for k in best],
         worst=[pictured(outcome, k, report.shown) for k in worst],
         curves=losses(curves) if curves else "",
-        refused=report.refused[:MAX_REFUSED],
-        more_refused=max(0, len(report.refused) - MAX_REFUSED),
         provenance=[(session, provenance(session)) for session in report.sessions],
         software=", ".join(f"{name} {number}" for name, number in report.software.items()),
     )
