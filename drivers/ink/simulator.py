@@ -212,7 +212,7 @@ REQUEST_BYTES = 8
 
 
 class PumpFirmware:
-    """A simulated pump, unit 1 on its line; the pumped volume can be read at any time."""
+    """A simulated pump, unit 1 on its line."""
 
     def __init__(
         self,
@@ -234,12 +234,6 @@ class PumpFirmware:
     def running(self) -> bool:
         """Whether the rotor turns."""
         return self._run != STOP
-
-    @property
-    def pumped_ml(self) -> float:
-        """Volume pumped so far."""
-        self._settle()
-        return self._pumped_ml
 
     def take(self, buffer: bytearray) -> bytes | None:
         """Take eight bytes, the length of every known request; None if there are fewer."""

@@ -82,7 +82,6 @@ ROBOT = "rob1"
 IK_NO_CONVERGE = -23
 HARD_STOP_M_S2 = 10.0
 SOFT_STOP_M_S2 = 2.0
-POSE_OUT_OF_REACH = 30047
 BLEND_M = (0.001, 1.0)
 MOST_MOVES = 64
 
@@ -238,15 +237,11 @@ class Cabinet:
         return ReturnCode.QUEUE_FULL if self.motion.size >= MOST_MOVES else ReturnCode.OK
 
     def _out_of_reach(self) -> int:
-        """Accept a move that then proves to be out of reach: the arm stops and a message says why."""
+        """Accept a move that then proves to be out of reach: the arm stops, and a message for `Trace.peek` says why."""
         self.stop(SOFT_STOP_M_S2, SOFT_STOP_M_S2)
-        self.tell(POSE_OUT_OF_REACH)
-        return ReturnCode.OK
-
-    def tell(self, code: int) -> None:
-        """Put a message where `Trace.peek` finds it."""
         stamp = max(int(self.now_s() * 1e9), self.messages[-1]["timestamp"] + 1 if self.messages else 1)
-        self.messages.append({"code": code, "level": "ERROR", "source": ROBOT, "args": [], "timestamp": stamp})
+        self.messages.append({"code": 30047, "level": "ERROR", "source": ROBOT, "args": [], "timestamp": stamp})
+        return ReturnCode.OK
 
     def queue_size(self) -> int:
         """Number of moves that are not over."""

@@ -175,7 +175,7 @@ class UnknownLab(LoopbackRig):
             await self._push(index)
             return {"reached": True, "says": "I pushed the tip for a second."}
         aim = self.aim(to, index, corner)
-        if (trouble := await self._take_hold()) is not None:
+        if (trouble := self._take_hold()) is not None:
             return {"reached": False, "says": trouble}
         short_mm = await self.guide(aim, along_brush=to == "pin")
         if to in TOUCHED:
@@ -289,17 +289,14 @@ class UnknownLab(LoopbackRig):
         finally:
             self.world.push_n = (0.0, 0.0, 0.0)
 
-    async def _take_hold(self) -> str | None:
+    def _take_hold(self) -> str | None:
         """Power the arm at the pendant; return why it cannot be guided."""
         world, power = self.world, self.arcs.cabinet.power
         if power.safety not in MOVING_ALLOWED:
             return f"The pendant shows {power.safety.value}: that has to be ended first."
         if world.target() is not None or world.motion.held:
             return "The arm moves by itself; I keep my hands off."
-        while power.mode != RobotMode.RUNNING:
-            power.power_on()
-            power.start_up()
-            await asyncio.sleep(LOOK_S)
+        power.then((0.0, RobotMode.RUNNING))
         return None
 
     async def guide(self, aim: Pose, *, along_brush: bool = False) -> float:

@@ -68,7 +68,13 @@ class LoopbackRig:
             noise_n, noise_nm = config.force_noise_n, config.force_noise_nm
             board = ForceBoard(self._wrench, noise_n=noise_n, noise_nm=noise_nm, seed=config.seed)
             self.force = SocketcandServer(board, self.world.clock.now_s, rate_hz=config.force_hz)
-        self.ink = _ink(self.world)
+        self.ink: PtyLine | None = None
+        if config.ink_device == "station":
+            self.ink = PtyLine(StationFirmware(self.world.well))
+        elif config.ink_device == "pump":
+            pumped = self.world.well.add
+            pump = PumpFirmware(ml_per_revolution=PUMP_ML, reservoir_ml=100.0, on_pumped=pumped)
+            self.ink = PtyLine(pump)
         missing = {Device.INK: self.ink, Device.FORCE: self.force}
         self.faults = FaultBoard(self.world, [device for device, server in missing.items() if server is None])
         """One board for all servers."""
@@ -162,17 +168,6 @@ class LoopbackRig:
             if any(server.clients for server in self.servers):
                 since = loop.time()
             await asyncio.sleep(0.2)
-
-
-def _ink(world: World) -> PtyLine | None:
-    match world.config.ink_device:
-        case "station":
-            return PtyLine(StationFirmware(world.well))
-        case "pump":
-            pumped = world.well.add
-            return PtyLine(PumpFirmware(ml_per_revolution=PUMP_ML, reservoir_ml=100.0, on_pumped=pumped))
-        case "none":
-            return None
 
 
 USAGE = (
