@@ -119,7 +119,7 @@ class SocketcandServer(LoopbackServer):
         finally:
             self._listeners.discard(writer)
 
-    async def _sent(self, frame: CanFrame) -> None:
+    async def _sent(self, frame: can.Message) -> None:
         self.board.obey(frame)
         if self._streaming is None or self._streaming.done():
             self._streaming = asyncio.create_task(self._stream(), name="force rounds")

@@ -80,6 +80,7 @@ class Power:
 
 ROBOT = "rob1"
 IK_NO_CONVERGE = -23
+POSE_OUT_OF_REACH = 30047
 HARD_STOP_M_S2 = 10.0
 SOFT_STOP_M_S2 = 2.0
 BLEND_M = (0.001, 1.0)
@@ -240,7 +241,9 @@ class Cabinet:
         """Accept a move that then proves to be out of reach: the arm stops, and a message for `Trace.peek` says why."""
         self.stop(SOFT_STOP_M_S2, SOFT_STOP_M_S2)
         stamp = max(int(self.now_s() * 1e9), self.messages[-1]["timestamp"] + 1 if self.messages else 1)
-        self.messages.append({"code": 30047, "level": "ERROR", "source": ROBOT, "args": [], "timestamp": stamp})
+        self.messages.append(
+            {"code": POSE_OUT_OF_REACH, "level": "ERROR", "source": ROBOT, "args": [], "timestamp": stamp}
+        )
         return ReturnCode.OK
 
     def queue_size(self) -> int:
