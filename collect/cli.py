@@ -130,11 +130,11 @@ def plan(
     import asyncio
     import json
 
-    from brushloop.collect.plan import make_plan, plan_table
+    from brushloop.collect.plan import draw_plan, make_plan, plan_table
     from brushloop.collect.protocols.config import load_protocol
     from brushloop.collect.rig.config import load_rig
     from brushloop.collect.rig.paper import PaperPlane
-    from brushloop.collect.walk import all_poses, check_protocol
+    from brushloop.collect.walk import all_poses, ask_reach, check_protocol
 
     if picture is not None:
         _check_output("--picture", picture, *PICTURES)
@@ -145,13 +145,9 @@ def plan(
     planned = make_plan(rig, wanted)
     asked = None
     if ask:
-        from brushloop.collect.walk import ask_reach
-
         poses = all_poses(rig, wanted, PaperPlane(rig.paper.touch_z_mm), every_patch=True)
         asked = asyncio.run(ask_reach(config, rig, poses))
     if picture is not None:
-        from brushloop.collect.plan import draw_plan
-
         draw_plan(rig, wanted, planned, picture)
     if as_json:
         say(json.dumps(planned.as_json() | {"poses_in_reach": asked}))
@@ -174,16 +170,25 @@ def doctor(
 
     from brushloop.collect.errors import ConfigError
     from brushloop.collect.rig.config import load_rig
-    from brushloop.collect.rig.doctor import doctor_table, examine, write_report
-    from brushloop.drivers.host import HostClock
 
     if report is not None:
+        from brushloop.collect.commission.visit import Notebook, notebook_path
+
         _check_output("--report", report, ".zip")
         if report.exists():
             raise ConfigError("--report", "", f"{report} exists and is not overwritten: choose another name")
-        if not config.exists() and _first_report(config, report):
+        if not config.exists() and (taught := notebook_path(config)).exists():
+            from brushloop.collect.commission.arm import write_first_report
+
+            asyncio.run(write_first_report(report, Notebook.load(config)))
+            known = f"{report} holds what {taught} knows and what the arm answered"
+            say(f"There is no {config} yet: {known}. Read it first.")
             return
     rig = load_rig(config)
+
+    from brushloop.collect.rig.doctor import doctor_table, examine, write_report  # slow to import
+    from brushloop.drivers.host import HostClock
+
     findings = asyncio.run(examine(rig, HostClock()))
     say(doctor_table(findings))
     if report is not None:
@@ -191,21 +196,6 @@ def doctor(
         say(f"{report} holds what was asked and answered. Read it before you send it.")
     if not all(finding.well for finding in findings):
         raise typer.Exit(4)
-
-
-def _first_report(config: Path, report: Path) -> bool:
-    """Write the archive from what was taught so far, where there is no rig.toml yet; False if nothing was."""
-    import asyncio
-
-    from brushloop.collect.commission.arm import write_first_report
-    from brushloop.collect.commission.visit import Notebook, notebook_path
-
-    path = notebook_path(config)
-    if not path.exists():
-        return False
-    asyncio.run(write_first_report(report, Notebook.load(config)))
-    say(f"There is no {config} yet: {report} holds what {path} knows and what the arm answered. Read it first.")
-    return True
 
 
 @rig_app.command()

@@ -205,12 +205,6 @@ class TouchConfig(Config):
     """Speed of every move at or below the start of the approach."""
     force: ForceTouchConfig = ForceTouchConfig()
 
-    def check_points(self, size_mm: tuple[float, float]) -> None:
-        """Raise ValueError where a point does not lie on a sheet of that size; for the validator of `rig.toml`."""
-        for x, y in self.points_mm:
-            if not (0.0 <= x <= size_mm[0] and 0.0 <= y <= size_mm[1]):
-                raise ValueError(f"touch.points_mm: [{x:g}, {y:g}] does not lie on the sheet")
-
     @model_validator(mode="after")
     def _points(self) -> TouchConfig:
         if self.method == "camera" and len(self.points_mm) < 3:
@@ -335,10 +329,11 @@ class RigConfig(Config):
                 f"ink.wipe.z_mm = {wipe.z_mm:g} is outside [{self.ink.dip_z_mm:g}, {self.motion.safe_z_mm:g}): "
                 "between the dip and travel"
             )
-        self.touch.check_points(self.paper.size_mm)
-        x, y = self.paper.touch_point_mm
-        if not (0.0 <= x <= width and 0.0 <= y <= height):
-            raise ValueError(f"paper.touch_point_mm = [{x:g}, {y:g}] does not lie on the sheet")
+        touched = {"touch.points_mm": self.touch.points_mm, "paper.touch_point_mm": [self.paper.touch_point_mm]}
+        for name, points_mm in touched.items():
+            for x, y in points_mm:
+                if not (0.0 <= x <= width and 0.0 <= y <= height):
+                    raise ValueError(f"{name}: [{x:g}, {y:g}] does not lie on the sheet")
         return self
 
 
