@@ -50,20 +50,6 @@ def test_an_offset_of_each_descent_is_no_force() -> None:
     assert abs(together.z_mm - 120.0) > 0.05
 
 
-def test_the_standard_error_is_what_repeats_scatter_by() -> None:
-    rng = np.random.default_rng(3)
-    z_mm, samples = np.linspace(120.4, 119.6, 17), np.full(17, 400)
-    found = [
-        find_contact(
-            z_mm, hinge(z_mm, 120.013, 0.003) + rng.normal(0.0, HINGE_NOISE_N, 17) / 20.0, samples, HINGE_NOISE_N
-        )
-        for _ in range(300)
-    ]
-    errors = np.array([f.z_mm - 120.013 for f in found])
-    assert errors.std() == pytest.approx(float(np.mean([f.sigma_mm for f in found])), rel=0.15)
-    assert abs(errors.mean()) < 3.0 * errors.std() / np.sqrt(300)
-
-
 @pytest.mark.parametrize(
     "force_n", [np.linspace(1.0, 0.0, 8), np.zeros(8)], ids=["falls on the way down", "does not change"]
 )
