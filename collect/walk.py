@@ -52,7 +52,7 @@ from brushloop.collect.rig.devices import limits_of
 from brushloop.collect.rig.paper import PaperPlane, Patch, Sheet
 from brushloop.collect.touch.camera import SPOTS_PER_DIP
 from brushloop.collect.touch.heights import EXTENT_MM, lowest_z_mm, patch_spots, touch_rects
-from brushloop.collect.touch.selfcheck import partners, triangle_in, triangle_on
+from brushloop.collect.touch.selfcheck import partners, triangle_on
 from brushloop.drivers.arcs.controller import only_asking
 from brushloop.drivers.arcs.wire import numbers
 from brushloop.drivers.devices import Pose
@@ -282,7 +282,7 @@ def _check_sheet(rig_path: Path, path: Path, rig: RigConfig, protocol: ProtocolC
         raise ConfigError(where, field, f"{sheet.cell_mm} does not fit on {rig.paper.size_mm}")
     if rig.self_check.enabled:
         try:
-            triangle_in(sheet.patch(0), rig.self_check)
+            triangle_on((sheet.patch(0),), rig.self_check)
         except StepError as error:
             what = f"{error}; --arm switches the self-check on, `enabled = false` switches it off for a new session"
             raise ConfigError(rig_path, "self_check.legs_mm", what) from None

@@ -44,15 +44,6 @@ MIRRORS: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
 }
 
 
-def triangle_in(patch: Patch, config: SelfCheckConfig) -> Triangle:
-    """Three places in the middle of one spare patch; too close together to show a small error of scale."""
-    x_mm, y_mm = config.legs_mm
-    if x_mm > patch.size_x_mm or y_mm > patch.size_y_mm:
-        raise StepError(f"a triangle of {x_mm:g} by {y_mm:g} mm does not fit into patch {patch.index}")
-    left, bottom = patch.x_mm + 0.5 * (patch.size_x_mm - x_mm), patch.y_mm + 0.5 * (patch.size_y_mm - y_mm)
-    return (left, bottom), (left + x_mm, bottom), (left, bottom + y_mm)
-
-
 def partners(sheet: Sheet, patch: Patch, used: Set[int]) -> tuple[Patch, ...]:
     """Two free patches that make a wide triangle with this one, along its row and its column; empty without room.
 
@@ -79,11 +70,18 @@ def partners(sheet: Sheet, patch: Patch, used: Set[int]) -> tuple[Patch, ...]:
 
 
 def triangle_on(patches: Sequence[Patch], config: SelfCheckConfig) -> Triangle:
-    """One place in each of three patches, as far apart as the corners of the sheet, or three within the only one."""
-    if len(patches) == 1:
-        return triangle_in(patches[0], config)
-    a, b, c = (patch.anchor_mm for patch in patches)
-    return a, b, c
+    """One place in each of three patches, as far apart as the corners of the sheet, or three within the only one.
+
+    Those within one patch are too close together to show a small error of scale. Raises `StepError` if they do not fit.
+    """
+    if len(patches) > 1:
+        a, b, c = (patch.anchor_mm for patch in patches)
+        return a, b, c
+    [patch], (x_mm, y_mm) = patches, config.legs_mm
+    if x_mm > patch.size_x_mm or y_mm > patch.size_y_mm:
+        raise StepError(f"a triangle of {x_mm:g} by {y_mm:g} mm does not fit into patch {patch.index}")
+    left, bottom = patch.x_mm + 0.5 * (patch.size_x_mm - x_mm), patch.y_mm + 0.5 * (patch.size_y_mm - y_mm)
+    return (left, bottom), (left + x_mm, bottom), (left, bottom + y_mm)
 
 
 async def self_check(procedures: Procedures, places_mm: Triangle, dip: Dip) -> SelfCheckResult:

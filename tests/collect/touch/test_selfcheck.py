@@ -23,7 +23,6 @@ from brushloop.collect.touch.selfcheck import (
     judge,
     partners,
     self_check,
-    triangle_in,
     triangle_on,
 )
 from brushloop.sessions.events import SelfCheckResult
@@ -134,7 +133,7 @@ def test_a_sheet_with_room_is_checked_over_three_corners_and_a_small_one_in_one_
     assert partners(sheet, first, set(range(sheet.capacity)) - {1, 6}) == (), "what is left is too near"
     small = Sheet(paper(110.0, 80.0))
     assert partners(small, small.patch(0), set()) == ()
-    assert triangle((small.patch(0),)) == triangle_in(small.patch(0), CONFIG)
+    assert np.ptp(triangle((small.patch(0),)), axis=0).tolist() == pytest.approx(CONFIG.legs_mm)
 
 
 @given(width=st.floats(40.0, 600.0), height=st.floats(24.0, 600.0), used=st.sets(st.integers(0, 60)))
@@ -165,7 +164,7 @@ async def test_a_camera_that_is_2_percent_wrong_is_seen_over_three_corners_but_n
     wrong_board = board.model_copy(update={"square_mm": 1.02 * board.square_mm, "marker_mm": 1.02 * board.marker_mm})
     bench.rig = replace(bench.rig, config=bench.rig.config.model_copy(update={"board": wrong_board}))
     near_origin = Sheet(bench.rig.config.paper).patch(36)
-    await checked(bench, triangle_in(near_origin, CONFIG))
+    await checked(bench, triangle((near_origin,)))
     with pytest.raises(
         StepError, match=r"lengths are off by \+(1\.[7-9]|2\.[0-3]).* along x and \+(1\.[7-9]|2\.[0-3])"
     ):
