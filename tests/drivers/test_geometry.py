@@ -63,14 +63,6 @@ def test_angles_make_the_rotation_and_the_second_is_at_most_a_right_angle(q: Qua
     assert rotation.angle_rad(rotation.product(rotation.inverse(q), back)) < (1e-10 if abs(ry) < 1.57 else 1e-6)
 
 
-@pytest.mark.parametrize("ry", [math.pi / 2.0, -math.pi / 2.0])
-def test_where_the_angles_are_not_determined_the_first_is_0(ry: float) -> None:
-    q = rotation.of_angles(0.4, ry, 0.3)
-    rx, same, rz = rotation.angles(q)
-    assert (rx, same) == (0.0, pytest.approx(ry, abs=1e-7))
-    assert rotation.angle_rad(rotation.product(rotation.inverse(q), rotation.of_angles(rx, same, rz))) < 1e-7
-
-
 lengths = st.floats(-900.0, 900.0)
 headings = st.floats(-180.0, 180.0)
 tilts = st.floats(0.0, 30.0)
