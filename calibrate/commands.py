@@ -154,7 +154,9 @@ class ValidateRequest:
     gates: Annotated[
         tuple[str, ...], Option("--gate", help="Like 'csim_avg>=0.90', quoted; exit code 5 if missed.")
     ] = ()
-    ablations: Annotated[bool, Option("--ablations", help="Other lambdas, for figure 3.")] = False
+    ablations: Annotated[
+        bool, Option("--ablations", help="Other lambdas, and similarity by number of fitted presses.")
+    ] = False
     curves: Annotated[tuple[str, ...], Option(help="NAME=FOLDER of a training, for figures 9 and 12.")] = ()
     held_out: Annotated[bool, Option(help="Fit to other cells, each cell left out in turn.")] = True
     scheduler: Annotated[str, Option(help="An existing Dask cluster, as tcp://host:8786.")] = ""

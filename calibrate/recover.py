@@ -39,6 +39,10 @@ ANCHOR_SD_MM = 0.1
 """Standard deviation of the zero-touch point."""
 NO_MODEL_ERROR = "no_model_error"
 """Flag of a press whose standard deviations leave out the error of the model."""
+NOT_INFORMATIVE = {"H": "depth_not_informative", "alpha": "tilt_not_informative"}
+"""Flags of a value whose 95 % interval covers most of the range that was commanded in the session."""
+MOST = 0.8
+"""Share of that range from which on an interval is not informative."""
 USELESS = frozenset({Flag.BLANK, Flag.DID_NOT_CONVERGE, Flag.CUT})
 """Flags that exclude a stroke: it is listed with the reason and not pressed again."""
 Floats = NDArray[np.float64]
@@ -112,6 +116,9 @@ class Recovered:
                 f"warning: the intervals of {bare} presses leave out the error of the model: fewer than "
                 f"{LEAST_CONDITIONS} other combinations of H and alpha were pressed"
             )
+        for name, flag in NOT_INFORMATIVE.items():
+            if vague := self._flagged(flag):
+                yield f"warning: {vague} presses do not tell {name}: the interval covers most of the commanded range"
         if 2 * (bound := self._flagged(Flag.AT_BOUND)) > many:
             yield f"warning: {bound} presses end at a bound: the model does not fit this brush; do not repeat these"
         for stroke_id, why in self.refused:
@@ -192,7 +199,7 @@ def _row(press: Press, inverter: Inverter, refused: list[Refused]) -> Row | None
 
 
 def with_model_error(rows: Sequence[Row], fitted: Collection[Condition] = ()) -> list[Row]:
-    """The rows with the model error added to their standard deviations, and a flag where it is unknown.
+    """The rows with the model error added to their standard deviations, and flags for unknown or wide intervals.
 
     `fitted` are the conditions that the model was fitted to.
     """
@@ -206,12 +213,24 @@ def with_model_error(rows: Sequence[Row], fitted: Collection[Condition] = ()) ->
     more_deg = model_sd(shown * depth, tilted_sd * depth, commanded, fitted) / depth
     out: list[Row] = []
     for row, mm, deg in zip(rows, more_mm.tolist(), more_deg.tolist(), strict=True):
+        flags = set(row.flags)
         if math.isnan(mm) or math.isnan(deg):
-            out.append(replace(row, flags=row.flags | {NO_MODEL_ERROR}))
-        else:
-            sd = {"depth_sd_mm": math.hypot(row.depth_sd_mm, mm), "tilt_sd_deg": math.hypot(row.tilt_sd_deg, deg)}
-            out.append(replace(row, **sd))
+            flags.add(NO_MODEL_ERROR)
+            mm = deg = 0.0
+        depth_sd_mm, tilt_sd_deg = math.hypot(row.depth_sd_mm, mm), math.hypot(row.tilt_sd_deg, deg)
+        if covers_most(row.depth_mm, depth_sd_mm, [at.depth_mm for at in commanded]):
+            flags.add(NOT_INFORMATIVE["H"])
+        if covers_most(row.tilt_deg, tilt_sd_deg, [at.tilt_deg for at in commanded]):
+            flags.add(NOT_INFORMATIVE["alpha"])
+        out.append(replace(row, depth_sd_mm=depth_sd_mm, tilt_sd_deg=tilt_sd_deg, flags=frozenset(flags)))
     return out
+
+
+def covers_most(value: float, sd: float, commanded: Sequence[float]) -> bool:
+    """Whether a 95 % interval, cut to the range of the commanded values, covers most of that range."""
+    low, high = min(commanded), max(commanded)
+    covered = min(value + NORMAL_95 * sd, high) - max(value - NORMAL_95 * sd, low)
+    return high > low and covered > MOST * (high - low)
 
 
 def model_sd(off: Floats, sd: Floats, conditions: Sequence[Condition], fitted: Collection[Condition] = ()) -> Floats:

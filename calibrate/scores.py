@@ -5,21 +5,26 @@ Tables 1 and 2, gates and figures are queries on it.
 
 from __future__ import annotations
 
+import importlib
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.compare import KEYS, Alignment, Key, Pixels, Tone, similarity
+from brushloop.calibrate.files import replacing
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.stats import CEILING, Cell, Floats, Integers, Summary, summarise
 from brushloop.sessions.disk import csv_text
 from brushloop.sessions.records import Condition
 
 MEASURES = ("csim", "ssim")
+NUMBERS = ("depth_mm", "reached_mm", "tilt_deg", *MEASURES)
 
 
 class Score(NamedTuple):
@@ -89,6 +94,19 @@ def scores_csv(scores: Scores) -> str:
     """Every score, as the text of a CSV file."""
     rows = ((*score[:-3], f"{score.csim:.8f}", f"{score.ssim:.8f}", score.source) for score in scores)
     return csv_text(Score._fields, rows)
+
+
+def write_parquet(scores: Scores, label: str, path: Path) -> list[str]:
+    """Write the same rows as Parquet; returns the file's name, or nothing where pyarrow is not installed."""
+    if find_spec("pyarrow") is None:
+        return []
+    pa: Any = importlib.import_module("pyarrow")  # without type stubs
+    pq: Any = importlib.import_module("pyarrow.parquet")
+    kinds = [(name, pa.float64() if name in NUMBERS else pa.string()) for name in Score._fields]
+    rows = [score._asdict() for score in scores]
+    with replacing(path) as part:
+        pq.write_table(pa.Table.from_pylist(rows, schema=pa.schema(kinds, metadata={"source": label})), part)
+    return [path.name]
 
 
 class Stat(Frozen):

@@ -29,7 +29,7 @@ from brushloop.calibrate.fit.fit import BrushFit
 from brushloop.calibrate.loop import FILE as LOOP_FILE
 from brushloop.calibrate.loop import LoopRecord, read_loop
 from brushloop.calibrate.report import data_uri, framed, write_files
-from brushloop.calibrate.scores import MEASURES, scores_csv
+from brushloop.calibrate.scores import MEASURES, scores_csv, write_parquet
 from brushloop.calibrate.session import URL, local_path
 from brushloop.calibrate.session import open_session as open_recording
 from brushloop.calibrate.stats import Paired, holm, paired
@@ -211,7 +211,8 @@ def _write(outcome: Outcome, folder: Path, curves: Sequence[Curve], beside: Besi
     files["summary.csv"] = summary_csv(report)
     files["failures.csv"] = csv_text(Refused._fields, report.refused)
     files["report.json"] = report.to_json()
-    files["report.html"] = page_of(outcome, report, curves, list(files), beside.figures_13)
+    names = [*files, *write_parquet(outcome.scores, report.label, folder / "scores.parquet")]
+    files["report.html"] = page_of(outcome, report, curves, names, beside.figures_13)
     write_files(folder, files)
     return report
 

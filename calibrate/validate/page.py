@@ -18,6 +18,7 @@ from brushloop.calibrate.compare import KEYS, TABLE_3, Key, shown
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.report import (
+    BLUE,
     COLOURS,
     ORANGE,
     Axis,
@@ -57,7 +58,7 @@ from brushloop.calibrate.validate.tables import (
 from brushloop.calibrate.writing.compare import Table3Row
 
 CELL_COLUMNS = ("ccd-bsmg", "ccd-bsm", FITTED_HELD_OUT, BEZIER_REFITTED, CEILING)
-MAX_REFUSED_IN_TERMINAL = 20
+MAX_REFUSED, MAX_REFUSED_IN_TERMINAL = 200, 20
 MAX_SAMPLES = 15
 WIDE_SCALE = 0.005
 """Relative width of pix2len's interval above which it matters: half a percent of every length."""
@@ -114,7 +115,10 @@ def page_of(
         shown=best_model.label if best_model is not None else "",
         best=[pictured(outcome, k, report.shown) for k in best],
         worst=[pictured(outcome, k, report.shown) for k in worst],
+        steps=by_strokes(report) if report.by_strokes else "",
         curves=losses(curves) if curves else "",
+        refused=report.refused[:MAX_REFUSED],
+        more_refused=max(0, len(report.refused) - MAX_REFUSED),
         provenance=[(session, provenance(session)) for session in report.sessions],
         software=", ".join(f"{name} {number}" for name, number in report.software.items()),
     )
@@ -229,6 +233,22 @@ def distributions(outcome: Outcome, report: Report) -> str:
         labels = {float(place): model.label for place, model in enumerate(models)}
         panels.append(Panel(f"{key[0]}, binary", Axis("CSIM, %"), Axis(ticks=labels), marks))
     return chart_uri(panels, (1060, 120 + 32 * len(models)), report.label)
+
+
+def by_strokes(report: Report) -> str:
+    """CSIM on presses that were not fitted, against the number of presses that were."""
+    marks: list[Marks] = []
+    for name, colour in (("CCD-BSM", ORANGE), ("Bézier", BLUE)):
+        csim: dict[int, list[float]] = {}
+        for step in report.by_strokes:
+            if step.model == name:
+                csim.setdefault(step.strokes, []).append(step.csim)
+        counts = sorted(csim)
+        means = [np.mean(csim[count]) for count in counts]
+        marks.append(Marks(counts, means, colour, f"{name} fitted", dot_px=6.0, line_px=1.5))
+    ticks = {float(step.strokes): str(step.strokes) for step in report.by_strokes}
+    across, up = Axis("presses that were fitted", ticks, log=True), Axis("CSIM on all others, %")
+    return chart_uri([Panel("mm, binary", across, up, marks)], (720, 340), report.label)
 
 
 def losses(curves: Sequence[Curve]) -> str:

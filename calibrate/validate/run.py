@@ -13,10 +13,11 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.commands import ValidateRequest
-from brushloop.calibrate.compare import Pixels, brush_of, images_of
+from brushloop.calibrate.compare import KEYS, Alignment, Pixels, Tone, brush_of, images_of, similarity
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.fit import BrushFit
 from brushloop.calibrate.fit.heldout import Refit, leave_out, refits
@@ -49,6 +50,13 @@ ORDER = (
     *("ellipse", "line", "circle"),
 )
 """Of the paper's tables, calibrated next to uncalibrated."""
+COUNTS = (1, 2, 3, 5, 9, 15, 30, 60)
+"""Numbers of fitted presses for which similarity is told."""
+DRAWS = 2
+"""Random draws to average, since a fit from few presses depends on which are drawn."""
+MAX_SCORED, MIN_LEFT = 200, 5
+"""Most and fewest other presses that such a fit is scored on."""
+MM_BINARY = KEYS.index((Alignment.MM, Tone.BINARY))
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,6 +136,17 @@ class Refused(NamedTuple):
     why: str
 
 
+class Step(NamedTuple):
+    """Scores, in percent, of a fit from this many presses on all other presses of the session."""
+
+    session_id: str
+    strokes: int
+    model: str
+    csim: float
+    ssim: float
+    n: int
+
+
 @dataclass(frozen=True, slots=True)
 class Outcome:
     """Every score of a run, and the models that were compared."""
@@ -139,6 +158,8 @@ class Outcome:
     scores: Scores
     """Of every model of any session, then of the comparisons with presses."""
     refused: Sequence[Refused]
+    steps: Sequence[Step]
+    """Similarity by number of fitted presses; empty without ablations."""
 
     def predicted(self, press: Press) -> dict[str, Pixels]:
         """(len(KEYS), 128, 128) of a press by the models that predict it."""
@@ -176,7 +197,10 @@ def validate_presses(
     scores = Scores(presses, (*names, ANOTHER))
     for session in sessions:
         _score(scores, session, models[session.header.session_id], refused, scheduler, progress)
-    return Outcome(sessions, request, models, scores, refused)
+    steps: list[Step] = []
+    for number, session in enumerate(sessions if request.ablations else ()):
+        steps += _similarity_by_strokes(session, number, scores, scheduler)
+    return Outcome(sessions, request, models, scores, refused, steps)
 
 
 def in_order(models: Sequence[Model]) -> list[Model]:
@@ -316,3 +340,44 @@ def _score(
     what, count = f"{session.header.session_id}: compared", sum(map(len, cells))
     for key, arrays in counted(scheduler.finished(score_job, jobs(), session.store), what, count, progress):
         scores.values[np.ix_(numbers[key], columns)] = arrays["values"]
+
+
+def _similarity_by_strokes(session: FittedSession, number: int, scores: Scores, scheduler: Scheduler) -> Iterator[Step]:
+    """Yield scores of fits from few presses on others of the session; none for a session with too few presses."""
+    name = session.header.session_id
+    trials = [(for_fit(few, session.header), others) for few, others in _trials(name, number, scores)]
+    fits = refits([Refit(few) for few, _ in trials], session.store, scheduler, "fits from few strokes")
+    values: dict[tuple[int, str], list[NDArray[np.float64]]] = {}
+    for (few, others), fit in zip(trials, fits, strict=True):
+        for label, model in (("CCD-BSM", fit.outline), ("Bézier", refit_bezier(few))):
+            if model is not None:
+                values.setdefault((len(few), label), []).extend(_on_others(model, others))
+    for (count, label), of_model in sorted(values.items()):
+        csim, ssim = (round(float(value), 6) for value in 100.0 * np.mean(of_model, axis=0))
+        yield Step(name, count, label, csim, ssim, len(of_model))
+
+
+def _on_others(outline: Draw, presses: Sequence[Press]) -> Iterator[NDArray[np.float64]]:
+    """Yield CSIM and SSIM in millimetres, binary, of each press."""
+    conditions = {press.condition for press in presses}
+    images = {at: images_of(outline(at.depth_mm, at.tilt_deg), 0.0) for at in conditions}
+    for press in presses:
+        seen, drawn = (stack[MM_BINARY] / 255.0 for stack in (press.images, images[press.condition]))
+        yield similarity(seen, drawn[None], Alignment.MM)[0]
+
+
+def _trials(name: str, number: int, scores: Scores) -> Iterator[tuple[list[Press], list[Press]]]:
+    """Yield the presses to fit and those to score on, of session `number`."""
+    presses = scores.presses
+    cells = [[k for k in cell if presses[k].session == name and not presses[k].cut] for cell in scores.cells]
+    for draw in range(DRAWS):
+        rng = np.random.default_rng([draw, number])
+        # Every cell once before any cell twice, as a person would choose.
+        groups = [[int(k) for k in rng.permutation(cell)] for cell in cells if cell]
+        groups = [groups[int(g)] for g in rng.permutation(len(groups))]
+        order = [k for turn in itertools.zip_longest(*groups) for k in turn if k is not None]
+        for count in COUNTS:
+            left = order[count:]
+            if len(left) >= MIN_LEFT:
+                others = sorted(left[:: max(1, -(-len(left) // MAX_SCORED))])
+                yield [presses[k] for k in order[:count]], [presses[k] for k in others]

@@ -44,6 +44,7 @@ from brushloop.calibrate.validate.run import (
     ModelInfo,
     Outcome,
     Refused,
+    Step,
 )
 from brushloop.calibrate.writing.compare import ANOTHER as ANOTHER_WRITING
 from brushloop.calibrate.writing.compare import PAPER_ROWS, PLANNED, REFERENCE, SIMULATED, Table3Row, WrittenRecord
@@ -140,6 +141,8 @@ class Report(Sealed):
     stats: tuple[Stat, ...]
     """Over all cells, and in each unless there are too many different (H, alpha) for a table."""
     refused: tuple[Refused, ...]
+    by_strokes: tuple[Step, ...]
+    """Similarity against number of strokes; empty without --ablations."""
     scores_sha256: str
     """Hash of scores.csv in the same folder."""
     loops: tuple[LoopRecord, ...] = ()
@@ -190,6 +193,7 @@ def report_of(
         shown=next((name for name in order if name in present), ""),
         stats=stats,
         refused=tuple(outcome.refused),
+        by_strokes=tuple(outcome.steps),
         scores_sha256=scores_sha256,
         loops=tuple(loops),
         written=tuple(written),

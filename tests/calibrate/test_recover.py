@@ -17,10 +17,12 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.presses import prepare_job
 from brushloop.calibrate.recover import (
     NO_MODEL_ERROR,
+    NOT_INFORMATIVE,
     PROTOCOL,
     Recovered,
     Row,
     common_variance,
+    covers_most,
     model_sd,
     recover,
     with_model_error,
@@ -164,9 +166,14 @@ def test_a_press_that_its_image_hardly_determines_counts_little() -> None:
     assert common_variance(np.array([0.1, 0.1]), np.array([0.5, 0.5])) == 0.0
 
 
-def test_too_few_cells_are_flagged() -> None:
+def test_too_few_cells_and_intervals_over_most_of_the_commanded_range_are_flagged() -> None:
     assert all(NO_MODEL_ERROR in row.flags for row in with_model_error(rows(CELLS[:3], 0.3, 2.0)))
-    assert not any(row.flags for row in with_model_error(rows(CELLS, 0.3, 2.0)))
+    vague, sharp = (with_model_error(rows(CELLS, 0.3, error_deg)) for error_deg in (4.0, 0.5))
+    assert any(NOT_INFORMATIVE["alpha"] in row.flags and row.tilt_sd_deg > 3.0 for row in vague)
+    assert not any(row.flags & set(NOT_INFORMATIVE.values()) for row in sharp)
+    for value, sd, most in ((5.0, 2.5, True), (5.0, 1.5, False), (0.0, 2.5, False)):
+        assert covers_most(value, sd, [0.0, 5.0, 10.0]) is most
+        assert not covers_most(value, sd, [5.0, 5.0]), "one tilt only: there is no range to compare with"
 
 
 def test_upright_presses_recovered_at_0_do_not_count_as_exact() -> None:

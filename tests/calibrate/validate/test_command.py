@@ -28,7 +28,7 @@ from brushloop.sessions.recording import Recording
 from tests.command import brushloop
 from tests.waiting import PATIENCE_S, wait_until
 
-FILES = ("report.json", "report.html", "scores.csv", "summary.csv", "failures.csv")
+FILES = ("report.json", "report.html", "scores.csv", "summary.csv", "failures.csv", "scores.parquet")
 COMMAND = ("validate", "presses", "--out", "out", "--workers", "1", "--model", "ccd-bsm", "--model", "bezier-refitted")
 
 

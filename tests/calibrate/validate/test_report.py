@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+import pyarrow.parquet
 import pytest
 from typer.testing import CliRunner
 
@@ -102,9 +103,19 @@ def test_the_page_has_the_papers_numbers_its_source_and_what_was_refused_and_fet
     assert all(re.match(r"data:image/(png|svg\+xml);base64,", source) for source in sources)
     links = re.findall(r'href="([^"]*)"', page)
     assert all(f'id="{link[1:]}"' in page or (folder / link).is_file() for link in links)
-    assert {"scores.csv", "summary.csv", "report.json", "#cell-1"} <= set(links)
+    assert {"scores.csv", "scores.parquet", "summary.csv", "report.json", "#cell-1"} <= set(links)
     assert "&lt;script&gt;" in page
     assert not re.search(r"<script|url\(|@import|<link|<iframe", page)
+
+
+def test_csv_and_parquet_hold_the_same_scores(folder: Path) -> None:
+    with (folder / "scores.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    table = pyarrow.parquet.read_table(folder / "scores.parquet").to_pylist()
+    assert len(rows) == len(table) > 10 * 4 * 7
+    for text, binary in zip(rows, table, strict=True):
+        assert float(text["csim"]) == pytest.approx(binary["csim"], abs=1e-7)
+        assert all(text[name] == binary[name] for name in ("stroke_id", "model", "alignment", "source"))
 
 
 def test_a_gate_that_holds_passes_and_one_that_is_missed_says_by_how_much_and_exits_5(report: Report) -> None:
@@ -145,15 +156,19 @@ def test_a_capture_that_a_person_marked_bad_is_left_out_by_name(session: Path, t
         assert ("&lt;b&gt;hair" in (tmp_path / "out" / "report.html").read_text()) == bad
 
 
-def test_ablations_show_lambda_and_curves_the_losses_of_trainings(session: Path, tmp_path: Path) -> None:
+def test_ablations_show_lambda_and_the_number_of_strokes(session: Path, tmp_path: Path) -> None:
     curve = tmp_path / "training"
     curve.mkdir()
     (curve / "validation.csv").write_text("step,mse,iou,csim\n10,0.1,0.5,0.6\n20,0.01,0.9,0.95\n")
     given = ("--model", "ccd-bsm", "--model", "ccd-bsm-lambda-1", "--model", "ccd-bsm-lambda-pi/2")
     run(session, "--out", tmp_path / "out", *given, "--ablations", "--curves", f"QBC={curve}")
-    assert load_report(tmp_path / "out" / "report.json").stat("ccd-bsm-lambda-1") is not None
+    report = load_report(tmp_path / "out" / "report.json")
+    assert report.stat("ccd-bsm-lambda-1") is not None
+    by_count = {step.strokes: step.csim for step in report.by_strokes if step.model == "CCD-BSM"}
+    assert sorted(by_count) == [1, 2, 3, 5]
+    assert by_count[5] > by_count[1]
     page = (tmp_path / "out" / "report.html").read_text()
-    for words in ("λ = π/2", "validation losses"):
+    for words in ("λ = π/2", "similarity against the number of fitted presses", "validation losses"):
         assert words in page
 
 
