@@ -34,6 +34,18 @@ SETTLE_S, LIVE_S = 2.0, 0.3
 VIEW = "aside.lens_view_"
 """Beginning of the fields for the photographs of the held board: the names of their files."""
 MOST_VIEWS = 20
+HOLD = (
+    "flat in the middle of the picture",
+    "slanted to the left",
+    "slanted to the right",
+    "slanted away from the camera",
+    "slanted toward the camera",
+    "in the upper left of the picture",
+    "in the upper right of the picture",
+    "in the lower right of the picture",
+    "in the lower left of the picture",
+    "turned by a quarter and slanted",
+)
 MIRRORED = (
     "Switch mirroring (`flip`) off in the camera's own set-up, or take the mirror out of its way; then try again."
 )
@@ -160,10 +172,8 @@ class CameraStep(Step):
 
     async def _held(self, visit: Visit, camera: OpenCvCamera, folder: Path, index: int, views: list[BoardView]) -> bool:
         """Take one photograph of the held board, so that a resumed session does not; False if the person skips it."""
-        how = (
-            f"Photograph {index + 1}: cover the sheet, and hold the board before the camera, all of it sharp; keep "
-            "still. First flat in the middle of the picture, then slanted to each side, in each corner, and turned."
-        )
+        where = HOLD[index] if index < len(HOLD) else "where it is still missing"
+        how = f"Cover the sheet, and hold the board before the camera, {where}, all of it sharp; keep still."
         async with shown_live(visit, camera):
             if not await visit.brought(f"hold-board {index}", how, may_skip=True):
                 return False
