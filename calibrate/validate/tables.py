@@ -336,7 +336,8 @@ def summary_csv(report: Report) -> str:
         of: Summary = getattr(stat, measure)
         interval = of.avg_interval or (None, None)
         place = model, stat.alignment, stat.tone, measure, *(stat.cell or (None, None))
-        rows.append((*place, of.n, of.max, of.min, of.avg, *interval, of.median, of.below_ceiling, source))
+        below = None if stat.model == AGAIN else of.below_ceiling  # that of a loop is below another press
+        rows.append((*place, of.n, of.max, of.min, of.avg, *interval, of.median, below, source))
     return csv_text(SUMMARY_COLUMNS, rows)
 
 

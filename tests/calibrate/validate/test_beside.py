@@ -84,7 +84,7 @@ def test_a_loop_in_the_session_is_the_third_row_of_table_1(place: Path) -> None:
     with (place / "validation" / "summary.csv").open() as file:
         rows = [r for r in csv.DictReader(file) if r["model"] == f"robot writing ({place.name}-replay)"]
     assert len(rows) == 2 * 2 * 2
-    assert {r["source"] for r in rows} == {"imported photographs"}
+    assert {(r["source"], r["below_ceiling"]) for r in rows} == {("imported photographs", "")}
     assert f"{place.name} pressed again as {place.name}-replay" in page
     assert report.loops[0].digest in page
 
