@@ -31,19 +31,19 @@ SPLIT = "split"
 RATE = 40.0
 
 
+@dataclass(frozen=True, slots=True)
 class Operator:
     """Somebody at the keyboard, who waits for what the screen shows."""
 
-    def __init__(self, app: OperatorApp, pilot: Pilot[None]) -> None:
-        self.app = app
-        self.pilot = pilot
+    app: OperatorApp
+    pilot: Pilot[None]
 
     def now(self) -> Snapshot:
         assert self.app.engine is not None
         return self.app.engine.snapshot()
 
-    async def until(self, condition: Callable[[], bool], what: str, timeout_s: float = PATIENCE_S) -> None:
-        deadline, looked_s = time.monotonic() + timeout_s, time.thread_time()
+    async def until(self, condition: Callable[[], bool], what: str) -> None:
+        deadline, looked_s = time.monotonic() + PATIENCE_S, time.thread_time()
         while not condition():
             assert time.monotonic() < deadline, f"{what}; the screen shows:\n{shown(self.app)}"
             await self._answer_what_this_test_is_not_about()
@@ -103,21 +103,10 @@ enabled = true
 """
 
 
-@dataclass(frozen=True, slots=True)
-class Day:
-    """A folder with rig.toml and protocol.toml, and the rig that they are of."""
-
-    folder: Path
-    rig: Process
-
-    @property
-    def sessions(self) -> Path:
-        return self.folder / "sessions"
-
-
 @pytest.fixture
-def day(tmp_path: Path) -> Iterator[Day]:
-    """A camera sharp enough to judge by, and a force sensor that may have to wait for the rest of a busy machine."""
+def rig(tmp_path: Path) -> Iterator[Process]:
+    """A rig with its files: a camera sharp enough to judge by, and a force sensor that may have to wait for the rest of
+    a busy machine."""
     rig_toml = tmp_path / "rig.toml"
     with started("tests.collect.tui.rig_process", str(rig_toml), str(RATE)) as rig:
         text = rig_toml.read_text(encoding="utf-8").replace("latency_ms = 250.0", "latency_ms = 1500.0")
@@ -125,12 +114,12 @@ def day(tmp_path: Path) -> Iterator[Day]:
         rig_toml.write_text(text + MEASURED, encoding="utf-8")
         grid = 'kind = "grid"\ndepths_mm = [11.0, 15.0]\ntilts_deg = [0.0, 10.0]\nrepeats = 1\n'
         (tmp_path / "protocol.toml").write_text(grid, encoding="utf-8")
-        yield Day(tmp_path, rig)
+        yield rig
 
 
 @pytest.mark.timeout(400)
-async def test_a_day_at_the_rig(day: Day) -> None:
-    browser = SessionBrowser(engine_for, day.sessions, day.folder / "rig.toml", day.folder / "protocol.toml")
+async def test_a_day_at_the_rig(rig: Process, tmp_path: Path) -> None:
+    browser = SessionBrowser(engine_for, tmp_path / "sessions", tmp_path / "rig.toml", tmp_path / "protocol.toml")
     app = OperatorApp(browser.engine, browser=browser)
     async with app.run_test(size=(80, 24)) as pilot:
         operator = Operator(app, pilot)
@@ -144,7 +133,7 @@ async def test_a_day_at_the_rig(day: Day) -> None:
         await operator.accept("Camera, board, scale")
         await operator.accept("Zero touch and plane")
         await operator.reads("Self-check: all within limits")
-        day.rig.ask("split")
+        rig.ask("split")
         await operator.accept("Self-check")
 
         # a stroke comes out badly: the question has its picture, and the answer presses it again
@@ -157,9 +146,9 @@ async def test_a_day_at_the_rig(day: Day) -> None:
         # a protective stop in the middle of a press holds the run until a person has released it
         await operator.until(lambda: operator.now().strokes_done > bad.strokes_done, "waited for the retake")
         await operator.until(lambda: operator.now().step.startswith("press"), "waited for a press")
-        day.rig.ask("stop")
+        rig.ask("stop")
         await operator.reads("ProtectiveStop")
-        day.rig.ask("release")
+        rig.ask("release")
         await operator.press("g")
         await operator.on(RunScreen)
 
@@ -211,7 +200,7 @@ async def test_a_day_at_the_rig(day: Day) -> None:
     assert app.engine is not None
     wait_for_end(app.engine)  # pyright: ignore[reportArgumentType]
 
-    [folder] = day.sessions.iterdir()
+    [folder] = (tmp_path / "sessions").iterdir()
     assert verify_session(folder).sound
     strokes = [capture.stroke.stroke_id for capture in Recording(folder).captures()]
     assert len(strokes) == len(set(strokes)) == STROKES
