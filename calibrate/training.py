@@ -107,34 +107,27 @@ def _trained(config: TrainConfig, folder: Path, progress: Progress, captures: Ca
 
     progress("training", 0, config.steps)
     path = run_training(config, folder, lambda step: progress("training", step, config.steps), captures)
-    page = write_training(path, captures)
-    return Written(path, (f"Generator: {path}, its card: {path.with_suffix('.md')}", f"Page: {page}"))
-
-
-def write_training(path: Path, captures: Captures | None = None) -> Path:
-    """Write card and page of a generator that `run_training` has finished; returns the page's path.
-
-    Raises TrainError for captures that it was not tuned on, and OSError.
-    """
     file = read_generator(path)
     losses, checks = (
         np.loadtxt(path.with_name(name), delimiter=",", skiprows=1, ndmin=2) for name in ("loss.csv", "validation.csv")
     )
-    label = file.config.tuning.source if file.config.tuning else "exact images of a stroke model"
+    label = config.tuning.source if config.tuning else "exact images of a stroke model"
     facts, trust = list(_facts(file, path)), list(_trust(file, checks))
-    write_whole(path.with_suffix(".md"), _card(path.name, facts, trust))
-    return write_page(
+    card = path.with_suffix(".md")
+    write_whole(card, _card(path.name, facts, trust))
+    page = write_page(
         path.with_name(PAGE),
         "training.html.j2",
         label=label,
         note="captured strokes: tuned on some of them, judged by the others"
-        if file.config.tuning
+        if config.tuning
         else "the network learns to draw what a closed-form model draws: no ink, neither real nor simulated",
         samples=sorted(_samples(file, captures), key=lambda sample: sample["csim"]),
         trust=trust,
         losses=_losses(losses, checks, label),
         facts=facts,
     )
+    return Written(path, (f"Generator: {path}, its card: {card}", f"Page: {page}"))
 
 
 def _samples(file: GeneratorFile, captures: Captures | None) -> Iterator[dict[str, Any]]:
