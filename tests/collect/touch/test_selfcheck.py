@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from brushloop.collect.errors import StepError
 from brushloop.collect.rig.config import PaperConfig, SelfCheckConfig
-from brushloop.collect.rig.paper import Patch, Sheet
+from brushloop.collect.rig.paper import Patch, Sheet, to_base
 from brushloop.collect.touch.selfcheck import (
     Triangle,
     judge,
@@ -25,6 +25,7 @@ from brushloop.collect.touch.selfcheck import (
     self_check,
     triangle_on,
 )
+from brushloop.drivers.devices import Pose
 from brushloop.sessions.events import SelfCheckResult
 
 if TYPE_CHECKING:
@@ -92,6 +93,35 @@ def test_no_turn_passes_for_a_mirror_nor_a_mirror_for_a_turn(noise: int, turn_de
 async def checked(bench: Bench, places: Triangle = PLACES) -> SelfCheckResult:
     bench.effector.rig = bench.rig  # with the board that the test gave it
     return await self_check(bench.effector, places, bench.effector.dip)
+
+
+def in_paper(bench: Bench, change: Any) -> Any:
+    """An arm that goes to `change(x, y)` of the paper frame when (x, y) is asked for, over the sheet only."""
+
+    def bent(pose: Pose) -> Pose:
+        x, y = bench.world.config.table.to_paper(pose.x_mm, pose.y_mm)
+        if not (0.0 <= x <= 110.0 and 0.0 <= y <= 80.0):
+            return pose
+        base_x, base_y = to_base(bench.rig.config.paper, *change(x, y))
+        return replace(pose, x_mm=base_x, y_mm=base_y)
+
+    return bent
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda x, y: (110.0 - x, y), "mirrored in x"),
+        (lambda x, y: (x + 3.0, y - 4.0), "the marks lie off by"),
+    ],
+    ids=["mirrored x", "displaced"],
+)
+async def test_an_arm_that_goes_elsewhere_is_refused(make_bench: MakeBench, change: Any, why: str) -> None:
+    bench = make_bench()
+    bench.bent = in_paper(bench, change)
+    with pytest.raises(StepError, match=why):
+        await checked(bench)
+    assert bench.lifted
 
 
 async def test_a_dry_brush_leaves_no_marks(make_bench: MakeBench) -> None:
