@@ -1,5 +1,24 @@
 """Errors of devices. Each names the device, the operation, the physical state that it leaves, and what to do.
 
+DeviceError
+ +-- NotConnected           never connected, or closed
+ +-- ConnectionLost         the peer went away during an operation
+ +-- DeviceTimeout          no answer in time
+ |    +-- Stale             the newest sample is too old to act on
+ +-- Stuck                  samples come, and all are the same
+ +-- ProtocolViolation      bytes outside the wire format
+ +-- WrongGeneration        the cabinet runs software that this driver does not speak
+ +-- RpcError               the controller answered with an error object
+ +-- LimitExceeded          refused before anything moved
+ +-- MotionError
+      +-- MotionRefused     the controller did not accept the command
+      +-- MotionFailed      accepted, but the arm did not arrive
+      +-- RobotNotSafe      protective, safeguard or emergency stop, violation or fault
+      +-- NotPowered        somebody has switched the arm off
+      +-- ArmMoved          another client or a person has moved the arm, or is moving it
+      +-- PathDisturbed     another client interfered with lines that were being carried out
+      +-- SettingsChanged   the tool offset, or another setting that a press depends on, has changed
+
 On a computer that is too busy, frames, forces and replies come late and no device is at fault: `too_busy` says so.
 """
 
@@ -164,10 +183,13 @@ class SettingsChanged(MotionError):
     remedy = "Find out who changed it, the pendant or another client. Enabling the arm again restores it."
 
 
+LOAD_PER_CORE = 2.0
+"""Mean load of the last minute from which on the computer is too busy: each program then waits as long as it runs."""
+
+
 def too_busy() -> str:
     """A sentence for the message of anything that came late, with its evidence; empty if this computer is not busy."""
     cores = os.cpu_count() or 1
-    # At two for each core, each program waits as long as it runs.
-    if not hasattr(os, "getloadavg") or (load := os.getloadavg()[0]) < 2.0 * cores:
+    if not hasattr(os, "getloadavg") or (load := os.getloadavg()[0]) < LOAD_PER_CORE * cores:
         return ""
     return f"This computer is too busy (load {load:.1f} on {cores} cores): end other programs first."

@@ -130,6 +130,12 @@ MIN_BIAS_ROUNDS = 10
 NO_BIAS: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
+MOST_STALE_MS = 100.0
+"""Longest silence allowed: at 20 mm/s the brush goes down 2 mm in this time without being felt."""
+MOST_STALE_LOOPBACK_MS = 2000.0
+"""The same on the loopback rig's bus, where simulated time may run faster than the sensor's rounds arrive."""
+
+
 class ForceTable(BaseModel, frozen=True, extra="forbid"):
     """The table `[force]` of `rig.toml`: a sensor between flange and brush (docs/zero-touch.md)."""
 
@@ -152,9 +158,7 @@ class ForceTable(BaseModel, frozen=True, extra="forbid"):
     def _coherent(self) -> ForceTable:
         if (self.interface == "socketcand") != (self.host is not None and self.port is not None):
             raise ValueError("host and port belong to the interface socketcand, and to no other")
-        # At 20 mm/s the brush goes down 2 mm in 100 ms without being felt. On the loopback rig's bus simulated time may
-        # run faster than the sensor's rounds arrive.
-        most_ms = 2000.0 if self.channel == LOOPBACK_CHANNEL else 100.0
+        most_ms = MOST_STALE_LOOPBACK_MS if self.channel == LOOPBACK_CHANNEL else MOST_STALE_MS
         if self.stale_ms > most_ms:
             raise ValueError(
                 f"stale_ms = {self.stale_ms:g}: must be from 20 to {most_ms:g}; the brush is blind that long"
