@@ -1,4 +1,4 @@
-"""How well a fit predicts cells that it has not seen, compared with the ceiling and with other models."""
+"""How well a fit predicts conditions that it has not seen, compared with the ceiling and with other models."""
 
 from __future__ import annotations
 

@@ -269,9 +269,10 @@ def measured(report: Report) -> str:
     at = f" at {len(report.cells)} combinations of press depth H and brush tilt α" if report.cells else ""
     left = f", {strokes - compared} more could not be used" if strokes > compared else ""
     models = sum(model.basis != PRESSES for model in report.models)
+    sessions = f"{len(report.sessions)} sessions" if len(report.sessions) > 1 else "one session"
     return (
-        f"{compared} brush presses{at} (sessions: {len(report.sessions)}) were compared with what {models} stroke "
-        f"models predict for them{left}. Each press is one vertical dab of {brush} ({report.label})."
+        f"{compared} brush presses{at}, from {sessions}, were compared with what {models} stroke models predict for "
+        f"them{left}. Each press is one vertical dab of {brush} ({report.label})."
     )
 
 
@@ -292,7 +293,7 @@ def verdict(report: Report) -> str:
     below = ""
     if top is not None and csim.below_ceiling is not None:
         below = f", {_points(csim)} below the ceiling of {top.avg:.1f} %"
-    unseen = " from cells that it has not seen" if report.shown == FITTED_HELD_OUT else ""
+    unseen = " from conditions that it has not seen" if report.shown == FITTED_HELD_OUT else ""
     label = _label(report, report.shown)
     return f"{label} predicts presses{unseen} with an average CSIM of {csim.avg:.1f} %{below}."
 
