@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+import can
 import pytest
 
 from brushloop.collect import start
@@ -314,8 +315,8 @@ class LoopRounds(force_driver.RoundStream):
     async def _read(self) -> None:
         while self.loss is None:
             for frame in self._board.round(self._rig.clock.now_s()):
-                frame.timestamp = self._rig.time.now_s
-                self._take(frame)
+                at_s, is_error = self._rig.time.now_s, frame.error
+                self._take(can.Message(at_s, frame.can_id, False, False, is_error, data=frame.data))
             await asyncio.sleep(1.0 / self._rig.config.force_hz)
 
 

@@ -16,8 +16,7 @@ import math
 import random
 import time
 from collections.abc import Callable, Iterator
-
-import can
+from dataclasses import dataclass
 
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.force.sri_m8123 import BUS_OFF, COMMAND_ID, LOOPBACK_CHANNEL, START, STOP, Wrench, encode_round
@@ -25,6 +24,15 @@ from brushloop.drivers.loopback import LoopbackServer
 
 BUS_ERROR = 0x04
 """Class of an error frame: the controller has a problem but is on the bus."""
+
+
+@dataclass(frozen=True, slots=True)
+class CanFrame:
+    """One frame on the bus, 11-bit id; an error frame where `error` is set."""
+
+    can_id: int
+    data: bytes
+    error: bool = False
 
 
 class ForceBoard:
@@ -43,14 +51,14 @@ class ForceBoard:
         """Asked for the fault of each round."""
         self._before: Wrench | None = None
 
-    def obey(self, frame: can.Message) -> None:
+    def obey(self, frame: CanFrame) -> None:
         """Carry out a command frame from the bus; ignore other frames."""
-        if frame.arbitration_id == COMMAND_ID and not frame.is_error_frame:
-            self.commands.append(command := bytes(frame.data))
-            if command in (START, STOP):
-                self.streaming = command == START
+        if frame.can_id == COMMAND_ID and not frame.error:
+            self.commands.append(frame.data)
+            if frame.data in (START, STOP):
+                self.streaming = frame.data == START
 
-    def round(self, t_s: float) -> Iterator[can.Message]:
+    def round(self, t_s: float) -> Iterator[CanFrame]:
         """The frames of the round that is due at `t_s`; none while the board is stopped."""
         if not self.streaming:
             return
@@ -59,8 +67,7 @@ class ForceBoard:
             return
         if fault in ("bus-off", "bus-error"):
             self.streaming = fault != "bus-off"
-            kind = BUS_OFF if fault == "bus-off" else BUS_ERROR
-            yield can.Message(arbitration_id=kind, is_error_frame=True, data=bytes(8))
+            yield CanFrame(BUS_OFF if fault == "bus-off" else BUS_ERROR, bytes(8), error=True)
             return
         values = self._force(t_s)
         fx, fy, fz, mx, my, mz = (v + self._random.gauss(0.0, s) for v, s in zip(values, self._noise, strict=True))
@@ -70,7 +77,7 @@ class ForceBoard:
         wrench = (fx, fy, math.nan if fault == "nan" else fz, mx, my, mz)
         for place, (can_id, data) in enumerate(encode_round(wrench)):
             if fault != "no-second" or place != 1:
-                yield can.Message(arbitration_id=can_id, is_extended_id=False, data=data)
+                yield CanFrame(can_id, data)
 
 
 FRAME_S = 0.0002
@@ -119,7 +126,7 @@ class SocketcandServer(LoopbackServer):
         finally:
             self._listeners.discard(writer)
 
-    async def _sent(self, frame: can.Message) -> None:
+    async def _sent(self, frame: CanFrame) -> None:
         self.board.obey(frame)
         if self._streaming is None or self._streaming.done():
             self._streaming = asyncio.create_task(self._stream(), name="force rounds")
@@ -151,17 +158,17 @@ async def _command(reader: asyncio.StreamReader) -> str:
     return raw.decode().strip(" \r\n<>")
 
 
-def _frame(can_id: str, length: str, data: list[str]) -> can.Message:
+def _frame(can_id: str, length: str, data: list[str]) -> CanFrame:
     try:
-        frame = can.Message(arbitration_id=int(can_id, 16), data=[int(byte, 16) for byte in data])
-        if frame.dlc != int(length, 16):
+        frame = CanFrame(int(can_id, 16), bytes(int(byte, 16) for byte in data))
+        if len(frame.data) != int(length, 16):
             raise ValueError("length")
     except ValueError:
         raise ProtocolViolation("socketcand", "send", f"not a frame: {can_id} {length} {data[:8]}") from None
     return frame
 
 
-def _ascii(frame: can.Message, at_s: float) -> str:
-    if frame.is_error_frame:
-        return f"< error {frame.arbitration_id:03X} {at_s:.6f} >"
-    return f"< frame {frame.arbitration_id:03X} {at_s:.6f} {frame.data.hex().upper()} >"
+def _ascii(frame: CanFrame, at_s: float) -> str:
+    if frame.error:
+        return f"< error {frame.can_id:03X} {at_s:.6f} >"
+    return f"< frame {frame.can_id:03X} {at_s:.6f} {frame.data.hex().upper()} >"

@@ -166,6 +166,8 @@ class RtdeServer(LoopbackServer):
         super().__init__()
         self.faults = faults or FaultBoard(cabinet.world)
         self._cabinet = cabinet
+        self.pings = 0
+        """Keep-alives seen, for tests."""
 
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Greet the client, then serve its topics until it disconnects."""
@@ -175,6 +177,7 @@ class RtdeServer(LoopbackServer):
         pushes: dict[int, asyncio.Task[None]] = {}
         try:
             while data := await reader.read(65536):
+                self.pings += data.count(PING)
                 for payload in decoder.feed(data):
                     chanel, hz, names = topic_of(payload)
                     if (old := pushes.pop(chanel, None)) is not None:

@@ -146,8 +146,8 @@ class SimConfig:
     sensor_sign: Literal[1, -1] = 1
     """-1 for a sensor that reports the push of the tool on the paper instead of the paper's on the tool."""
     brush: BrushSpec = field(default_factory=BrushSpec)
-    brush_name: str = "simulated bristle bundle, seed 1"
-    """Name of the brush in recordings."""
+    brush_name: str = ""
+    """Name of the brush in recordings; if empty, "simulated bristle bundle" and its seed."""
     head: SoundHead | None = None
     """Where sound marks of the brush begin; None for the default of `rig.toml`."""
     table: Table = field(default_factory=Table)

@@ -19,7 +19,7 @@ from can.interfaces.virtual import VirtualBus
 from brushloop.drivers.devices import ForceSample, ForceSensor
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected, Stale, Stuck
 from brushloop.drivers.force import sri_m8123
-from brushloop.drivers.force.simulator import ForceBoard
+from brushloop.drivers.force.simulator import CanFrame, ForceBoard
 from brushloop.drivers.force.sri_m8123 import FIRST_ID, ForceTable, RoundAssembler, SriM8123, Wrench, encode_round
 from brushloop.drivers.host import HostClock
 from tests.drivers.failing import fail_rounds
@@ -45,11 +45,18 @@ def served(channel: str, board: ForceBoard, rate_hz: float = 200.0) -> Iterator[
         began_s = due_s = time.monotonic()
         while not over.is_set():
             if (message := bus.recv(max(0.0, due_s - time.monotonic()))) is not None:
-                board.obey(message)
+                board.obey(CanFrame(message.arbitration_id, bytes(message.data), message.is_error_frame))
             elif time.monotonic() >= due_s:
                 due_s = max(due_s + 1.0 / rate_hz, time.monotonic())
                 for frame in board.round(due_s - began_s):
-                    bus.send(frame)
+                    bus.send(
+                        can.Message(
+                            arbitration_id=frame.can_id,
+                            is_extended_id=frame.error,
+                            is_error_frame=frame.error,
+                            data=frame.data,
+                        )
+                    )
 
     thread = threading.Thread(target=stream, daemon=True)
     thread.start()
@@ -269,10 +276,20 @@ async def test_closing_while_averaging_ends_in_an_error(sensor: SriM8123):
 # ---------------------------------------------------------------- the rounds of the force board
 
 
-def feed(parts: RoundAssembler, wrench: Sequence[float], at_s: float = 0.0) -> list[Wrench]:
+def feed(parts: RoundAssembler, wrench: Sequence[float], leave_out: int = -1, at_s: float = 0.0) -> list[Wrench]:
     fx, fy, fz, mx, my, mz = wrench
-    frames = encode_round((fx, fy, fz, mx, my, mz))
+    frames = [frame for place, frame in enumerate(encode_round((fx, fy, fz, mx, my, mz))) if place != leave_out]
     return [whole for can_id, data in frames if (whole := parts.feed(can_id, data, at_s)) is not None]
+
+
+@pytest.mark.parametrize("leave_out", [0, 1, 2])
+def test_each_round_without_one_frame_is_dropped_and_counted_once(leave_out: int):
+    parts = RoundAssembler()
+    assert feed(parts, WRENCH) == [WRENCH]
+    for _ in range(5):
+        assert feed(parts, WRENCH, leave_out) == []
+    assert feed(parts, WRENCH) == [WRENCH]
+    assert (parts.torn, parts.refused) == (5, 0)
 
 
 def test_joining_in_mid_round_is_no_fault_and_a_frame_of_the_wrong_size_tears_its_round():
