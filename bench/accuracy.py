@@ -36,7 +36,7 @@ from bench.harness import BenchError, Result, at_most, brushloop, machine, round
 from bench.prior import BRISTLE
 from brushloop.calibrate.compare import TABLE_2
 from brushloop.calibrate.fit.descent import Prior, fit_presses, learned
-from brushloop.calibrate.fit.heldout import BEZIER, FITTED, Refit, held_out_scores, leave_cell_out, refit
+from brushloop.calibrate.fit.heldout import BEZIER, FITTED, Refit, held_out_scores, leave_condition_out, refit
 from brushloop.calibrate.loop import read_loop
 from brushloop.calibrate.presses import read_for_fit
 from brushloop.calibrate.stats import CEILING
@@ -70,7 +70,7 @@ def fit(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     """Points below the ceiling of the fitted brush, each condition predicted from all others: `n` brushes (seven)."""
     results: list[Result] = []
     for name, presses, prior in _pressed(n, seed):
-        rows = leave_cell_out(presses, fit_presses(presses, prior=prior), prior)
+        rows = leave_condition_out(presses, fit_presses(presses, prior=prior), prior)
         csim = {row.model: row.csim for row in rows}
         where = f"simulated; ceiling {csim[CEILING]:.2f}, refitted Bezier {csim[BEZIER]:.2f} %; {machine()}"
         gap = csim[CEILING] - csim[FITTED]

@@ -158,7 +158,7 @@ class ValidateRequest:
         bool, Option("--ablations", help="Other lambdas, and similarity by number of fitted presses.")
     ] = False
     curves: Annotated[tuple[str, ...], Option(help="NAME=FOLDER of a training, for figures 9 and 12.")] = ()
-    held_out: Annotated[bool, Option(help="Fit to other cells, each cell left out in turn.")] = True
+    held_out: Annotated[bool, Option(help="Fit to other conditions, each condition left out in turn.")] = True
     scheduler: Annotated[str, Option(help="An existing Dask cluster, as tcp://host:8786.")] = ""
     workers: Annotated[int | None, Option(min=1, max=1024, help="Threads; all cores by default.")] = None
     command: str = field(default_factory=_command_line)

@@ -33,7 +33,7 @@ SIZE_PX = 128
 MM_PER_PX = 0.3
 """Scale of the millimetre field, wherever a press is shown, fitted, compared or inverted.
 
-38.4 mm hold an anchored stroke of any cell of the grid; 0.2 mm/px would not.
+38.4 mm hold an anchored stroke of any condition of the grid; 0.2 mm/px would not.
 """
 FIELD_MM = SIZE_PX * MM_PER_PX
 """Width and height of the millimetre field around the zero-touch point."""

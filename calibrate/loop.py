@@ -232,7 +232,7 @@ def statistics_of(scores: Scores) -> Iterator[Stat]:
     another = 100.0 * scores.of(ANOTHER)
     for compared in scores.models:
         percent = 100.0 * scores.of(compared)
-        yield from statistics(compared, percent, scores.cell_of, ceiling=another if compared == AGAIN else None)
+        yield from statistics(compared, percent, scores.group_of, ceiling=another if compared == AGAIN else None)
 
 
 def _replayed(header: Header) -> str | None:

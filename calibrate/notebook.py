@@ -91,7 +91,7 @@ class RecordedPress:
     def crop(self) -> tuple[Gray, NDArray[np.bool_], Prepared]:
         """`image`, `mask`, and what else was found in them. Raises `CaptureRefused`.
 
-        The ink of a press is its largest connected ink; that of a stroke that travels is all in its cell.
+        The ink of a press is its largest connected ink; that of a stroke that travels is all in its patch.
         """
         raster, prepared = rectified(self.capture, self._session.calibration)
         return raster, prepared.ink if self.capture.stroke.kind == "drag" else prepared.mask, prepared

@@ -72,7 +72,7 @@ class Press:
     """The zero-touch point, from the field's left and top edge."""
     measured: Measured
     cut: bool
-    """Whether the stroke reaches the edge of its photograph, cell or field."""
+    """Whether the stroke reaches the edge of its photograph, patch or field."""
 
     @property
     def condition(self) -> Condition:
@@ -91,7 +91,7 @@ def uncommanded(press: Press) -> str:
 
 def cut(press: Press) -> str:
     """Refuse a press of which a part is missing."""
-    return "is cut by the edge of its photograph, cell or field" if press.cut else ""
+    return "is cut by the edge of its photograph, patch or field" if press.cut else ""
 
 
 def too_thin(press: Press) -> str:
@@ -191,7 +191,7 @@ def press_of(header: Header, stroke: Stroke, arrays: Arrays) -> Press:
 def rectified(capture: Capture, calibration: Calibration | None) -> tuple[Gray, Prepared]:
     """The surroundings of a stroke at 20 px/mm, (h, w) gray, and what was found in them.
 
-    A press is cropped to the field around its zero-touch point, a stroke that travels to its paper cell. A press in an
+    A press is cropped to the field around its zero-touch point, a stroke that travels to its patch. A press in an
     imported photograph keeps the surroundings that the light is estimated from; without that point, or of a stroke that
     travels, the photograph is rescaled whole. Raises `CaptureRefused` for a capture that cannot be used,
     `SessionDamaged` for a picture that cannot be read.
@@ -203,9 +203,9 @@ def rectified(capture: Capture, calibration: Calibration | None) -> tuple[Gray, 
             window = x_mm, y_mm, _, tall_mm = stroke.cell_mm
             left_mm, top_mm = stroke.anchor_mm[0] - x_mm, y_mm + tall_mm - stroke.anchor_mm[1]
         raster = rectify_by(image, calibration, window, capture.where)
-        cell_px = None if stroke.cell_mm is None else on_window(stroke.cell_mm, window)
+        patch_px = None if stroke.cell_mm is None else on_window(stroke.cell_mm, window)
         anchor = (left_mm * PX_PER_MM, top_mm * PX_PER_MM)
-        return raster, prepare(raster, anchor, capture.where, cell_px)
+        return raster, prepare(raster, anchor, capture.where, patch_px)
     if stroke.px_per_mm is None:
         raise CaptureRefused(stroke.stroke_id, "has neither a calibration nor a scale of its own")
     anchor_px = stroke.anchor_px
@@ -252,13 +252,13 @@ def _cropped(prepared: Prepared, anchor_px: tuple[float, float]) -> Prepared:
     return replace(prepared, mask=mask, soft=soft, anchor_px=(anchor_px[0] - left, anchor_px[1] - top), cut=cut)
 
 
-def prepare_cell(capture: Capture, calibration: Calibration) -> Prepared:
-    """Rectify a whole paper cell: all ink in it belongs to its figure, however far apart the strokes are.
+def prepare_patch(capture: Capture, calibration: Calibration) -> Prepared:
+    """Rectify a whole patch: all ink in it belongs to its figure, however far apart the strokes are.
 
-    Raises `CaptureRefused` for a stroke without a cell, or without ink in it.
+    Raises `CaptureRefused` for a stroke without a patch, or without ink in it.
     """
     cell_mm = capture.stroke.cell_mm
     if cell_mm is None:
-        raise CaptureRefused(capture.stroke.stroke_id, "has no paper cell")
+        raise CaptureRefused(capture.stroke.stroke_id, "has no patch")
     raster = rectify_by(capture.image(), calibration, cell_mm, capture.where)
     return prepare(raster, None, capture.where, join_mm=math.hypot(*cell_mm[2:]), speck_share=SPECK_SHARE)

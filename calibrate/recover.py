@@ -177,7 +177,7 @@ def _inverter(request: RecoverRequest, session: OpenSession) -> tuple[Inverter, 
     model, fit = BrushFit.model_of(request.fit, session.header)
     # A fitted brush marks nothing above its zero offset.
     least_mm = 0.0 if fit is None else 0.5 - fit.parameters["h0_mm"]
-    fitted = set[Condition]() if fit is None else {Condition(*cell) for cell in fit.cells}
+    fitted = set[Condition]() if fit is None else {Condition(*pair) for pair in fit.cells}
     low_mm, high_mm = request.depth_range_mm
     try:
         within = Range((max(low_mm, least_mm), high_mm), request.tilt_range_deg)

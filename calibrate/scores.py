@@ -19,7 +19,7 @@ from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.compare import KEYS, Alignment, Key, Pixels, Tone, similarity
 from brushloop.calibrate.files import replacing
 from brushloop.calibrate.presses import Press
-from brushloop.calibrate.stats import CEILING, Cell, Floats, Integers, Summary, summarise
+from brushloop.calibrate.stats import CEILING, DepthTilt, Floats, Integers, Summary, summarise
 from brushloop.sessions.disk import csv_text
 from brushloop.sessions.records import Condition
 
@@ -54,16 +54,16 @@ class Scores:
         self.presses, self.models = tuple(presses), tuple(models)
         """Presses by session and order of capture, and names of models."""
         self.values = np.full((len(presses), len(models), len(KEYS), 2), np.nan)
-        cells: dict[tuple[int, Condition], list[int]] = {}
+        groups: dict[tuple[int, Condition], list[int]] = {}
         order = {name: number for number, name in enumerate(dict.fromkeys(press.session for press in presses))}
         for number, press in enumerate(presses):
-            cells.setdefault((order[press.session], press.condition), []).append(number)
-        self.cells = [cells[key] for key in sorted(cells)]
-        """Numbers of the presses of each cell, which is one condition in one session, by session and condition."""
-        self.cell_of: Integers = np.zeros(len(presses), np.int64)
-        """(presses,) number of each press's cell."""
-        for number, cell in enumerate(self.cells):
-            self.cell_of[cell] = number
+            groups.setdefault((order[press.session], press.condition), []).append(number)
+        self.groups = [groups[key] for key in sorted(groups)]
+        """Numbers of the presses of each group, which is one condition in one session, by session and condition."""
+        self.group_of: Integers = np.zeros(len(presses), np.int64)
+        """(presses,) number of each press's group."""
+        for number, group in enumerate(self.groups):
+            self.group_of[group] = number
 
     def __iter__(self) -> Iterator[Score]:
         """The scores by session, order of capture and model; those that are missing are left out."""
@@ -85,8 +85,8 @@ class Scores:
     def conditions(self) -> dict[Condition, list[int]]:
         """Numbers of the presses of each condition in any session, sorted by condition."""
         numbers: dict[Condition, list[int]] = {}
-        for cell in self.cells:
-            numbers.setdefault(self.presses[cell[0]].condition, []).extend(cell)
+        for group in self.groups:
+            numbers.setdefault(self.presses[group[0]].condition, []).extend(group)
         return dict(sorted(numbers.items()))
 
 
@@ -110,35 +110,37 @@ def write_parquet(scores: Scores, label: str, path: Path) -> list[str]:
 
 
 class Stat(Frozen):
-    """CSIM and SSIM of one model in one alignment and tone, in percent, over all cells or in one."""
+    """CSIM and SSIM of one model in one alignment and tone, in percent, over all conditions or in one."""
 
     model: str
     alignment: Alignment
     tone: Tone
-    cell: Cell | None
+    cell: DepthTilt | None
+    """The condition; None for all."""
     csim: Summary
     ssim: Summary
 
 
-def find_stat(stats: Sequence[Stat], model: str, key: Key, cell: Cell | None = None) -> Stat | None:
+def find_stat(stats: Sequence[Stat], model: str, key: Key, condition: DepthTilt | None = None) -> Stat | None:
     """The statistics of one model, or None if it has none."""
-    wanted = (model, *key, cell)
+    wanted = (model, *key, condition)
     return next((stat for stat in stats if (stat.model, stat.alignment, stat.tone, stat.cell) == wanted), None)
 
 
 def statistics(
-    model: str, percent: Floats, cells: Integers, cell: Cell | None = None, ceiling: Floats | None = None
+    model: str, percent: Floats, groups: Integers, condition: DepthTilt | None = None, ceiling: Floats | None = None
 ) -> Iterator[Stat]:
     """Yield the statistics of a model's scores, (rows, KEYS, 2) percent, for each of `KEYS` in which it has any.
 
-    `cells` (rows,) are numbers of cells. With a `ceiling` of the same shape, each statistic says how far below it is.
+    `groups` (rows,) are numbers of conditions. With a `ceiling` of the shape of `percent`, each statistic says how far
+    below it is.
     """
 
     def summary(values: Floats, top: Floats | None) -> Summary | None:
-        summary = summarise(values, cells)
+        summary = summarise(values, groups)
         if summary is not None and model == CEILING:
             return replace(summary, max=None, min=None, median=None)
-        below = None if top is None else summarise(top - values, cells)
+        below = None if top is None else summarise(top - values, groups)
         if summary is None or below is None:
             return summary
         return replace(summary, below_ceiling=below.avg, below_interval=below.avg_interval)
@@ -146,7 +148,7 @@ def statistics(
     for k, (alignment, tone) in enumerate(KEYS):
         csim, ssim = (summary(percent[:, k, j], None if ceiling is None else ceiling[:, k, j]) for j in (0, 1))
         if csim is not None and ssim is not None:
-            yield Stat(model=model, alignment=alignment, tone=tone, cell=cell, csim=csim, ssim=ssim)
+            yield Stat(model=model, alignment=alignment, tone=tone, cell=condition, csim=csim, ssim=ssim)
 
 
 def similarities(press: Pixels, compared: Sequence[Sequence[Pixels]]) -> Floats:

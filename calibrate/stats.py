@@ -2,13 +2,14 @@
 
 Equal scores give equal numbers.
 
-The ceiling is the score of a perfect model, that is of the best image of each cell on a fresh press of it. Presses of a
-cell stray from each other. Two of them differ by the strays of both, a press and the best image only by those of one.
+The ceiling is the score of a perfect model, that is of the best image of each condition on a fresh press of it.
+Presses of a condition stray from each other. Two of them differ by the strays of both, a press and the best image only
+by those of one.
 Strays displace the edges of a mark, and what a score loses grows with the distance between two edges. If the strays are
 independent from press to press and about normal, their mean distance is sqrt 2 times that of one press from the best
-image. So the ceiling is 100 - (100 - pairs) / sqrt 2, where `pairs` is the mean score of two presses of a cell in
-percent: a U-statistic, which two presses of each cell suffice for. No template takes its place: one of a few presses
-has strays of its own.
+image. So the ceiling is 100 - (100 - pairs) / sqrt 2, where `pairs` is the mean score of two presses of a condition in
+percent: a U-statistic, which two presses of each condition suffice for. No template takes its place: one of a few
+presses has strays of its own.
 """
 
 from __future__ import annotations
@@ -91,7 +92,7 @@ class Summary:
     min: float | None = None
     median: float | None = None
     below_ceiling: float | None = None
-    """Points below the ceiling; None where no cell was pressed twice."""
+    """Points below the ceiling; None where no condition was pressed twice."""
     below_interval: Interval | None = None
 
     @property
@@ -100,19 +101,19 @@ class Summary:
         return self.max, self.min, self.avg
 
 
-def summarise(values: Floats, cells: Integers | None = None) -> Summary | None:
-    """Summarise (n,) scores without NaN; None if none is left. An interval needs the numbers of their cells, (n,).
+def summarise(values: Floats, groups: Integers | None = None) -> Summary | None:
+    """Summarise (n,) scores without NaN; None if none is left. An interval needs `groups`, (n,) numbers of conditions.
 
-    The interval is that of whole cells drawn anew, since the error of a model is common to the presses of a cell. For
-    fewer than three cells it holds for these cells only: then single presses are drawn.
+    The interval is that of whole conditions drawn anew, since the error of a model is common to the presses of a
+    condition. For fewer than three conditions it holds for these conditions only: then single presses are drawn.
     """
     known = np.isfinite(values)
     values = values[known]
     if not len(values):
         return None
     interval = None
-    if cells is not None:
-        interval = interval_over_groups(values, cells[known]) or interval_over_groups(values, np.arange(len(values)))
+    if groups is not None:
+        interval = interval_over_groups(values, groups[known]) or interval_over_groups(values, np.arange(len(values)))
     avg, high, low, median = (_round(value) for value in (values.mean(), values.max(), values.min(), np.median(values)))
     return Summary(len(values), avg, interval, high, low, median)
 
@@ -137,12 +138,12 @@ def _round(value: float) -> float:
 
 
 def others_of(press: int, count: int) -> list[int]:
-    """Numbers of the presses of a cell, or writings of a character, that one of `count` is compared with."""
+    """Numbers of the presses of a condition, or writings of a character, that one of `count` is compared with."""
     return [(press + step) % count for step in range(1, min(MAX_OTHERS, count - 1) + 1)]
 
 
 def pair_means(count: int, scores: Callable[[int, list[int]], Floats]) -> Floats:
-    """(count, measures) mean scores of each press of one cell with the others; NaN for a single press.
+    """(count, measures) mean scores of each press of one condition with the others; NaN for a single press.
 
     `scores` gives the (others, measures) scores of a press with others, all by their numbers.
     """
@@ -151,16 +152,16 @@ def pair_means(count: int, scores: Callable[[int, list[int]], Floats]) -> Floats
     return np.array([scores(k, others_of(k, count)).mean(axis=0) for k in range(count)])
 
 
-def ceiling_values(pairs: Floats, cells: Integers) -> Floats:
-    """(n,) percent, one for each press, whose mean is the ceiling; NaN for a press without another of its cell.
+def ceiling_values(pairs: Floats, groups: Integers) -> Floats:
+    """(n,) percent, one for each press, whose mean is the ceiling; NaN for a press without another of its condition.
 
-    `pairs` holds the mean score of each press with the others of its cell, `cells` the number of that cell. As pairs
-    share presses, the values are jackknife pseudo-values: presses, or whole cells, can be resampled with them. Those of
-    a cell of two presses are equal.
+    `pairs` holds the mean score of each press with the others of its condition, `groups` the number of that condition.
+    As pairs share presses, the values are jackknife pseudo-values: presses, or whole conditions, can be resampled with
+    them. Those of a condition of two presses are equal.
     """
     values = np.full(len(pairs), np.nan)
-    for cell in np.unique(cells):
-        at = np.flatnonzero((cells == cell) & np.isfinite(pairs))
+    for group in np.unique(groups):
+        at = np.flatnonzero((groups == group) & np.isfinite(pairs))
         if not len(at):
             continue
         mean = pairs[at].mean()
@@ -191,8 +192,8 @@ class Paired:
 def paired(before: Floats, after: Floats, groups: Integers) -> Paired | None:
     """`after` minus `before`, pair by pair, NaN left out; None where no pair is left.
 
-    Pairs of one group, (n,) numbers, share an error, such as that of a model in one cell: they are flipped and drawn
-    together.
+    Pairs of one group, (n,) numbers, share an error, such as that of a model in one condition: they are flipped and
+    drawn together.
     """
     difference = after - before
     known = np.isfinite(difference)
@@ -219,8 +220,8 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return p.tolist()
 
 
-Cell = tuple[float, float]
-"""Depth in mm and tilt in deg."""
+DepthTilt = tuple[float, float]
+"""A condition of the grid: depth in mm and tilt in deg."""
 
 
 def farthest_first(places: Floats, first: int, count: int) -> list[int]:
@@ -237,16 +238,16 @@ def farthest_first(places: Floats, first: int, count: int) -> list[int]:
     return order
 
 
-def spread_out(depths_mm: Sequence[float], tilts_deg: Sequence[float]) -> list[Cell]:
-    """Every cell once, each as far as possible from those before it: the first few already describe any brush well.
+def spread_out(depths_mm: Sequence[float], tilts_deg: Sequence[float]) -> list[DepthTilt]:
+    """Every condition once, each as far as possible from those before it: the first few describe any brush well.
 
-    Both axes are scaled to the range of the grid. The first cell is the shallowest at the least tilt.
+    Both axes are scaled to the range of the grid. The first condition is the shallowest at the least tilt.
     """
-    cells = list(itertools.product(depths_mm, tilts_deg))
-    places = np.array(cells)
+    conditions = list(itertools.product(depths_mm, tilts_deg))
+    places = np.array(conditions)
     range_of = np.ptp(places, axis=0)
     places = (places - places.min(axis=0)) / np.where(range_of > 0.0, range_of, 1.0)
-    return [cells[k] for k in farthest_first(places, cells.index(min(cells)), len(cells))]
+    return [conditions[k] for k in farthest_first(places, conditions.index(min(conditions)), len(conditions))]
 
 
 def waits_of(state: RunState) -> dict[int, float]:

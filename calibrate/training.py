@@ -222,7 +222,7 @@ def _plain(text: str) -> str:
 def _placed(prepared: Prepared, target: Target) -> Image:
     """(N, N) share of ink in each pixel of the generator. Raises `CaptureRefused` for a stroke that is cut or large."""
     if prepared.cut:
-        raise CaptureRefused("capture", "is cut by the edge of its photograph or cell")
+        raise CaptureRefused("capture", "is cut by the edge of its photograph or patch")
     step_px = target.px_mm * PX_PER_MM
     side_px = target.size_px * step_px
     assert prepared.anchor_px is not None  # prepare_press aligns every press with its point of touch

@@ -191,19 +191,19 @@ class Drawn:
         return np.einsum("yx,nyx->nx", self.by_width, residuals) @ self.widths.T
 
 
-def draw(press: FittedPress, cells: Floats, grid: Grid, free: Sequence[int] = ALL) -> list[Drawn]:
+def draw(press: FittedPress, conditions: Floats, grid: Grid, free: Sequence[int] = ALL) -> list[Drawn]:
     """Draw presses at C depths and tilts (C, 2), with derivatives by the free parameters over their spreads."""
     moved = press.values + np.concatenate([np.zeros((1, len(NAMES))), STEP * np.diag(spreads())[list(free)]])
     batch = replace(press, values=moved[:, None])
-    width, *others = batch.half_width(batch.sizes(*cells.T), grid.x_mm)
+    width, *others = batch.half_width(batch.sizes(*conditions.T), grid.x_mm)
     by_parameter = (np.stack(others, axis=1) - width[:, None]) / STEP
-    return [Drawn.of(*of_cell, grid.y_mm) for of_cell in zip(width, by_parameter, strict=True)]
+    return [Drawn.of(*of_condition, grid.y_mm) for of_condition in zip(width, by_parameter, strict=True)]
 
 
 def _minimise(press: FittedPress, free: Sequence[int], presses: Presses, prior: Prior) -> tuple[FittedPress, float]:
     """Levenberg-Marquardt from `press`, and the cost where it ends; a parameter one standard deviation off the prior
     costs as much as a pixel of wrong ink."""
-    inks = {cell: presses.ink[numbers] for cell, numbers in presses.cells.items()}
+    inks = {condition: presses.ink[numbers] for condition, numbers in presses.cells.items()}
     at = list(free)
     low, high = (np.array([getattr(PARAMETERS[k], end) for k in at]) for end in ("low", "high"))
 
@@ -249,7 +249,7 @@ def _normal(
 ) -> tuple[Floats, Floats, float]:
     """J'J (P, P) and J'r (P,) by the P parameters `at`, and half the sum of squares, over all strokes.
 
-    `inks` (n, len(y_mm), len(x_mm)) are the strokes of each cell. Strays are integrated out.
+    `inks` (n, len(y_mm), len(x_mm)) are the strokes of each condition. Strays are integrated out.
     """
     strays = [NAMES.index(name) for name in STRAYS]
     sizes = np.array(list(STRAYS.values())) / spreads()[strays]

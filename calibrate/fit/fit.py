@@ -1,8 +1,8 @@
 """`brushloop fit SESSION` for presses: the fitted brush, its immutable file, its tables, and its page.
 
-The page shows the fitted outline over the ink of each cell, the sizes of the marks, and the held-out scores. The
-intervals of the sizes are those of the jackknife: each cell is left out in turn, so they hold the differences between
-presses and how far the brush is from a plane.
+The page shows the fitted outline over the ink of each condition, the sizes of the marks, and the held-out scores. The
+intervals of the sizes are those of the jackknife: each condition is left out in turn, so they hold the differences
+between presses and how far the brush is from a plane.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written
 from brushloop.calibrate.fit.descent import SPREAD_MM, Floats
 from brushloop.calibrate.fit.descent import fit_presses as fit_parameters
-from brushloop.calibrate.fit.heldout import FITTED, HeldOut, leave_cell_out
+from brushloop.calibrate.fit.heldout import FITTED, HeldOut, leave_condition_out
 from brushloop.calibrate.presses import Refused, read_for_fit
 from brushloop.calibrate.report import (
     COLOURS,
@@ -53,7 +53,7 @@ from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Header
 from brushloop.sessions.terminal import Progress, unseen
 
-FEWEST_CELLS = 5
+FEWEST_CONDITIONS = 5
 MARGIN_MM = 1.5
 SMOOTH_POINTS = 24
 
@@ -65,14 +65,14 @@ class BrushFit(SessionFit):
     length_mm: float
     strokes: int
     cells: tuple[tuple[float, float], ...]
-    """Depth in mm and tilt in deg of the strokes, each cell once."""
+    """Depth in mm and tilt in deg of the strokes, each condition once."""
     mm_per_px: float
     parameters: dict[str, float]
     """They describe a mark together; on its own none is comparable between brushes. See docs/brushfit.md."""
     edges_mm: tuple[tuple[tuple[float, ...], ...], ...]
     ends_mm: tuple[tuple[float, ...], ...]
     csim_percent: dict[str, float]
-    """Leave-cell-out CSIM by model."""
+    """Leave-condition-out CSIM by model."""
 
     def press(self) -> FittedPress:
         """The fitted brush."""
@@ -131,10 +131,10 @@ class Size:
 
 
 def sizes_of(presses: Presses) -> list[Size]:
-    """Every size; empty where the cells are too few for an interval, or do not span depth and tilt without one."""
+    """Every size; empty where the conditions are too few for an interval, or do not span depth and tilt without one."""
     inked = presses.pick(np.flatnonzero((presses.ink > 0.5).any(axis=(1, 2))).tolist())
-    cells = list(inked.cells.values())
-    if len(cells) < FEWEST_CELLS:
+    groups = list(inked.cells.values())
+    if len(groups) < FEWEST_CONDITIONS:
         return []
     measured = np.array([measure(ink, inked.grid) for ink in inked.ink])
 
@@ -143,11 +143,11 @@ def sizes_of(presses: Presses) -> list[Size]:
 
     every = range(len(inked))
     try:
-        whole, without = plane(every), np.array([plane([k for k in every if k not in cell]) for cell in cells])
+        whole, without = plane(every), np.array([plane([k for k in every if k not in group]) for group in groups])
     except ValueError:
         return []
-    variance = (1.0 - 1.0 / len(cells)) * ((without - whole) ** 2).sum(axis=0)
-    factor = student_95(len(cells) - 1)
+    variance = (1.0 - 1.0 / len(groups)) * ((without - whole) ** 2).sum(axis=0)
+    factor = student_95(len(groups) - 1)
     return [
         Size(name, *(Estimate.of(float(v), float(s), factor) for v, s in zip(values, squares, strict=True)))
         for name, values, squares in zip(SIZES, whole.T, variance.T, strict=True)
@@ -165,9 +165,9 @@ class FitResult:
     fit: BrushFit
     """The contents of the file."""
     sizes: list[Size]
-    """Empty where the session has too few cells for an interval."""
+    """Empty where the session has too few conditions for an interval."""
     held_out: list[HeldOut]
-    """Empty with one cell only."""
+    """Empty with one condition only."""
     path: Path
 
     @property
@@ -192,7 +192,7 @@ class FitResult:
                 sizes.add_row(size.name, str(size.here), str(size.by_depth), str(size.by_tilt))
             yield sizes
         else:
-            yield f"Intervals of the sizes of the marks need {FEWEST_CELLS} combinations of depth and tilt."
+            yield f"Intervals of the sizes of the marks need {FEWEST_CONDITIONS} combinations of depth and tilt."
         if self.held_out:
             scores = Table(
                 "model", "n", "CSIM", "SSIM", title=f"on combinations left out of the fit in turn, percent ({label})"
@@ -201,7 +201,7 @@ class FitResult:
                 scores.add_row(row.model, str(row.n), f"{row.csim:.2f}", f"{row.ssim:.2f}")
             yield scores
         else:
-            yield "Only one cell: nothing can be held out."
+            yield "Only one condition: nothing can be held out."
         yield f"Fit: {self.path}"
         yield f"Page: {self.page}"
 
@@ -220,7 +220,7 @@ def fit(request: FitRequest, progress: Progress = unseen) -> FitResult | Written
 
 
 def fit_presses(request: FitRequest, progress: Progress = unseen) -> FitResult:
-    """Fit the brush to the presses of a session, leave each cell out in turn, and measure the marks.
+    """Fit the brush to the presses of a session, leave each condition out in turn, and measure the marks.
 
     The session uses the fit from now on, and its page is written. Raises `CalibrationError`.
     """
@@ -228,7 +228,7 @@ def fit_presses(request: FitRequest, progress: Progress = unseen) -> FitResult:
         raise CalibrationError("--prior", "adapts a fit of drags, and this session holds presses")
     session, presses, refused = read_for_fit(request.session, progress)
     press = fit_parameters(presses)
-    held_out = leave_cell_out(presses, press, progress=progress, store=session.store)
+    held_out = leave_condition_out(presses, press, progress=progress, store=session.store)
     fit = BrushFit(
         **session.provenance,
         radius_mm=presses.radius_mm,
@@ -257,7 +257,7 @@ def _write_page(result: FitResult, press: FittedPress) -> None:
         **about(header),
         session=session,
         window=_window(presses, (press, published)),
-        cells=[_cell(presses, cell, numbers, press, published) for cell, numbers in presses.cells.items()],
+        conditions=[_picture(presses, at, numbers, press, published) for at, numbers in presses.cells.items()],
         verdict=list(_verdict(result)),
         trust=[source_point(header.source), *_trust(result)],
         chart=_chart(presses, press, header),
@@ -275,7 +275,7 @@ def _window(presses: Presses, brushes: tuple[FittedPress, ...]) -> tuple[float, 
     grid, inked = presses.grid, np.any(presses.ink > 0.5, axis=0)
     x, y = grid.x_mm[inked.any(axis=0)], -grid.y_mm[inked.any(axis=1)]
     low, high = np.array([x[0], y[0]]), np.array([x[-1], y[-1]])
-    for loop in (_outline(brush, cell) for brush in brushes for cell in presses.cells):
+    for loop in (_outline(brush, condition) for brush in brushes for condition in presses.cells):
         if loop is not None:
             points = loop.points.reshape(-1, 2) * np.array([1.0, -1.0])
             low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
@@ -283,40 +283,40 @@ def _window(presses: Presses, brushes: tuple[FittedPress, ...]) -> tuple[float, 
     return round(left, 3), round(top, 3), round(width, 3), round(height, 3)
 
 
-def _cell(
-    presses: Presses, cell: Cell, numbers: list[int], press: FittedPress, published: FittedPress
+def _picture(
+    presses: Presses, condition: Cell, numbers: list[int], press: FittedPress, published: FittedPress
 ) -> dict[str, Any]:
-    """One picture: the mean ink of the cell's presses, and both outlines as SVG paths in mm."""
+    """One picture: the mean ink of the condition's presses, and both outlines as SVG paths in mm."""
     grid, ink = presses.grid, presses.ink[numbers]
     left, top = float(grid.x_mm[0]) - 0.5 * grid.px_mm, -float(grid.y_mm[0]) - 0.5 * grid.px_mm
     across, down = len(grid.x_mm) * grid.px_mm, len(grid.y_mm) * grid.px_mm
     alike: list[float] = []
     with contextlib.suppress(DomainError):  # so light that the brush leaves no mark
-        drawn = np.asarray(press.chance(*cell, grid.x_mm, grid.y_mm, SPREAD_MM) > 0.5, np.float32)
+        drawn = np.asarray(press.chance(*condition, grid.x_mm, grid.y_mm, SPREAD_MM) > 0.5, np.float32)
         if drawn.any():
             alike = [csim(drawn, seen) for seen in np.asarray(ink > 0.5, np.float32) if seen.any()]
     return {
-        "depth_mm": f"{cell[0]:g}",
-        "tilt_deg": f"{cell[1]:g}",
+        "depth_mm": f"{condition[0]:g}",
+        "tilt_deg": f"{condition[1]:g}",
         "presses": len(numbers),
         "ink": ink_uri(ink.mean(axis=0).astype(np.float32)),
         "place": (round(left, 3), round(top, 3), round(across, 3), round(down, 3)),
-        "fitted": _path(press, cell),
-        "published": _path(published, cell),
+        "fitted": _path(press, condition),
+        "published": _path(published, condition),
         "csim": f"{100.0 * np.mean(alike):.1f}" if alike else "",
     }
 
 
-def _outline(press: FittedPress, cell: Cell) -> Outline | None:
+def _outline(press: FittedPress, condition: Cell) -> Outline | None:
     try:
-        return press.outline(*cell)
+        return press.outline(*condition)
     except DomainError:  # so light that the brush leaves no mark
         return None
 
 
-def _path(press: FittedPress, cell: Cell) -> str:
+def _path(press: FittedPress, condition: Cell) -> str:
     """The outline as an SVG path, x to the right and y downward in mm; empty where the brush leaves no mark."""
-    loop = _outline(press, cell)
+    loop = _outline(press, condition)
     if loop is None:
         return ""
     points = np.round(np.asarray(loop.points[0], np.float64) * [1.0, -1.0], 2)
@@ -355,8 +355,8 @@ def _fitted(press: FittedPress, depth_mm: float, tilt_deg: float, x_mm: Floats) 
 
 def _verdict(result: FitResult) -> Iterator[str]:
     brush = result.session.header.brush or "a brush without a name"
-    presses, cells = len(result.presses), len(result.presses.cells)
-    yield f"The stroke model was fitted to {presses} presses at {cells} combinations of H and α: {brush}."
+    presses, conditions = len(result.presses), len(result.presses.cells)
+    yield f"The stroke model was fitted to {presses} presses at {conditions} combinations of H and α: {brush}."
     if result.held_out:
         scores = ", ".join(f"{row.model} {row.csim:.1f} %" for row in result.held_out)
         yield f"On combinations that were left out of the fit, the CSIM is: {scores}."

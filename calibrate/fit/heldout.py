@@ -21,9 +21,9 @@ from brushloop.sessions.terminal import Progress, counted, unseen
 FITTED, BEZIER, UNCALIBRATED = "fitted", "refitted Bezier", "uncalibrated"
 Images = NDArray[np.floating]
 MAX_FOLDS = 15
-"""Most folds: the paper's grid leaves out one cell at a time, a larger grid several."""
-PER_CELL = 3
-"""Presses of each other cell that a fit uses; more did not change it."""
+"""Most folds: the paper's grid leaves out one condition at a time, a larger grid several."""
+PER_CONDITION = 3
+"""Presses of each other condition that a fit uses; more did not change it."""
 MAX_STROKES = 60
 
 
@@ -36,22 +36,22 @@ class HeldOut:
     ssim: float
     n: int
     below: Summary | None = None
-    """Points of CSIM below the ceiling; None for the ceiling itself, and where no cell was pressed twice."""
+    """Points of CSIM below the ceiling; None for the ceiling itself, and where no condition was pressed twice."""
 
 
 Predicted = tuple[Floats, Mapping[str, Images]]
-"""The ink of the presses of one cell, (n, rows, columns), and what each model predicts there without them."""
+"""The ink of the presses of one condition, (n, rows, columns), and what each model predicts there without them."""
 
 
-def leave_out(cells: Mapping[Cell, Sequence[int]]) -> list[tuple[list[Cell], list[int]]]:
-    """Cells that are left out together, and the presses of all others that a fit uses; none if no press is left."""
-    cells = dict(sorted(cells.items()))
-    folds = [list(cells)[k::MAX_FOLDS] for k in range(min(len(cells), MAX_FOLDS))]
-    return [(fold, others) for fold in folds if (others := _without(cells, fold))]
+def leave_out(conditions: Mapping[Cell, Sequence[int]]) -> list[tuple[list[Cell], list[int]]]:
+    """Conditions left out together, and the presses of all others that a fit uses; none if no press is left."""
+    conditions = dict(sorted(conditions.items()))
+    folds = [list(conditions)[k::MAX_FOLDS] for k in range(min(len(conditions), MAX_FOLDS))]
+    return [(fold, others) for fold in folds if (others := _without(conditions, fold))]
 
 
-def _without(cells: Mapping[Cell, Sequence[int]], fold: Sequence[Cell]) -> list[int]:
-    others = [press for cell, group in cells.items() if cell not in fold for press in group[:PER_CELL]]
+def _without(conditions: Mapping[Cell, Sequence[int]], fold: Sequence[Cell]) -> list[int]:
+    others = [press for at, group in conditions.items() if at not in fold for press in group[:PER_CONDITION]]
     return others[:: max(1, -(-len(others) // MAX_STROKES))]
 
 
@@ -90,36 +90,36 @@ def refits(
     return [FittedPress(*brush, **results[key]) for key, brush in zip(keys, brushes, strict=True)]
 
 
-def leave_cell_out(
+def leave_condition_out(
     presses: Presses,
     press: FittedPress,
     prior: Prior | None = None,
     progress: Progress = unseen,
     store: Store | None = None,
 ) -> list[HeldOut]:
-    """Score each cell as predicted by fits to other cells; empty for a single cell.
+    """Score each condition as predicted by fits to other conditions; empty for a single condition.
 
-    The fits descend from `press`, the fit to all cells. `brushloop validate` uses the same fits, which the store keeps.
-    Models without enough data are left out: the ceiling needs two strokes of a cell, a regressed Bezier two depths and
-    two tilts among the others.
+    The fits descend from `press`, the fit to all conditions. `brushloop validate` uses the same fits, which the store
+    keeps. Models without enough data are left out: the ceiling needs two strokes of a condition, a regressed Bezier two
+    depths and two tilts among the others.
     """
-    cells = presses.cells
+    conditions = presses.cells
     published = FittedPress(presses.radius_mm, presses.length_mm)
-    left_out = [(fold, presses.pick(others)) for fold, others in leave_out(cells)]
+    left_out = [(fold, presses.pick(others)) for fold, others in leave_out(conditions)]
     jobs = [Refit(others, prior, press.values) for _, others in left_out]
     with threads(1) as scheduler:  # a fit holds Python's lock nearly all the time: two at once take half as long again
-        brushes = refits(jobs, store, scheduler, "cells left out in turn", progress)
+        brushes = refits(jobs, store, scheduler, "conditions left out in turn", progress)
     predicted: list[Predicted] = []
     for (fold, others), refitted in zip(left_out, brushes, strict=True):
         outlines: dict[str, Draw] = {FITTED: refitted.outline, UNCALIBRATED: published.outline}
         if (of_others := refit_bezier(others)) is not None:
             outlines[BEZIER] = of_others
-        for cell in fold:
+        for condition in fold:
             images: dict[str, Images] = {}
             for name, outline in outlines.items():
                 with contextlib.suppress(DomainError):  # so light that the brush leaves no mark
-                    images[name] = image_of(outline(*cell), presses.grid)
-            predicted.append((presses.ink[cells[cell]], images))
+                    images[name] = image_of(outline(*condition), presses.grid)
+            predicted.append((presses.ink[conditions[condition]], images))
     return held_out_scores(predicted, (FITTED, BEZIER, UNCALIBRATED))
 
 
@@ -138,14 +138,14 @@ def held_out_scores(predicted: Sequence[Predicted], models: Sequence[str]) -> li
             values[name].append(similarity(drawn, inks, Alignment.MM))
     if not predicted:
         return []
-    cells = np.repeat(np.arange(len(predicted)), [len(ink) for ink, _ in predicted])
+    groups = np.repeat(np.arange(len(predicted)), [len(ink) for ink, _ in predicted])
     percent = {name: 100.0 * np.concatenate(scores) for name, scores in values.items()}
-    ceiling = np.stack([ceiling_values(pairs, cells) for pairs in percent[CEILING].T], axis=1)
+    ceiling = np.stack([ceiling_values(pairs, groups) for pairs in percent[CEILING].T], axis=1)
     rows: list[HeldOut] = []
     for name, scores in (percent | {CEILING: ceiling}).items():
         known = np.isfinite(scores[:, 0])
         if known.any():
-            below = summarise(ceiling[:, 0] - scores[:, 0], cells) if name != CEILING else None
+            below = summarise(ceiling[:, 0] - scores[:, 0], groups) if name != CEILING else None
             csim, ssim = scores[known].mean(axis=0).tolist()
             rows.append(HeldOut(name, csim, ssim, int(known.sum()), below))
     return rows

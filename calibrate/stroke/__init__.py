@@ -116,9 +116,9 @@ def rectify_by(image: Gray, plane: Plane, window_mm: Rect, where: str) -> Gray:
     return cast("Gray", sampled)
 
 
-def on_window(cell_mm: Rect, window_mm: Rect) -> tuple[int, int, int, int]:
-    """Convert a paper cell (x, y, width, height in mm) to pixels of a window's raster: x, y, width, height."""
-    x, y, width, height = cell_mm
+def on_window(patch_mm: Rect, window_mm: Rect) -> tuple[int, int, int, int]:
+    """Convert a patch (x, y, width, height in mm) to pixels of a window's raster: x, y, width, height."""
+    x, y, width, height = patch_mm
     top = window_mm[1] + window_mm[3] - (y + height)
     scaled = ((x - window_mm[0]) * PX_PER_MM, top * PX_PER_MM, width * PX_PER_MM, height * PX_PER_MM)
     return round(scaled[0]), round(scaled[1]), round(scaled[2]), round(scaled[3])
@@ -137,7 +137,7 @@ class Prepared:
     anchor_px: tuple[float, float] | None
     """The zero-touch point: (x, y), pixel j covers [j, j + 1)."""
     cut: bool
-    """Whether the stroke reaches the edge of its photograph or cell; length and area are then lower bounds."""
+    """Whether the stroke reaches the edge of its photograph or patch; length and area are then lower bounds."""
     flags: tuple[str, ...] = ()
     """Defects of the capture, although a stroke was found."""
 
@@ -183,17 +183,17 @@ def prepare(
     raster: Gray,
     anchor_px: tuple[float, float] | None,
     where: str,
-    cell_px: tuple[int, int, int, int] | None = None,
+    patch_px: tuple[int, int, int, int] | None = None,
     join_mm: float = JOIN_MM,
     speck_share: float = SPECK_SHARE,
 ) -> Prepared:
-    """Find the stroke on a 20 px/mm raster. `cell_px` (x, y, w, h) hides everything outside the paper cell.
+    """Find the stroke on a 20 px/mm raster. `patch_px` (x, y, w, h) hides everything outside the patch.
 
     `join_mm` and `speck_share` say which components belong to the stroke. Raises `CaptureRefused` if the raster is
     blank or nothing is left after cleaning.
     """
-    window = _cell_window(raster, cell_px, where)
-    # Only the cell: neighbours' ink and the table's edge would distort the estimated lighting.
+    window = _patch_window(raster, patch_px, where)
+    # Only the patch: neighbours' ink and the table's edge would distort the estimated lighting.
     reflectance = np.ones(raster.shape, np.float32)
     reflectance[window] = flatten(raster[window])
     # The darkest GATE_MM2 is an area rather than a share, so that the picture's size does not matter.
@@ -231,7 +231,7 @@ def _flags(raster: Gray, mask: Mask, others_mm2: Sequence[float]) -> tuple[str, 
     if saturated > MOST_SATURATED:
         flags.append(f"saturated: {100 * saturated:.0f} % of the pixels are white, the light cannot be judged")
     if touches_edge(mask):
-        flags.append("cut: the stroke reaches the edge of its photograph or cell")
+        flags.append("cut: the stroke reaches the edge of its photograph or patch")
     others = [area for area in others_mm2 if area >= OTHER_MM2]
     if others:
         flags.append(f"others: {len(others)} more strokes of {sum(others):.0f} mm2 in the crop")
@@ -244,13 +244,13 @@ def _flags(raster: Gray, mask: Mask, others_mm2: Sequence[float]) -> tuple[str, 
     return tuple(flags)
 
 
-def _cell_window(raster: Gray, cell_px: tuple[int, int, int, int] | None, where: str) -> tuple[slice, slice]:
-    """Rows and columns of the raster that show the paper cell; all of them without a cell. Raises `CaptureRefused`."""
+def _patch_window(raster: Gray, patch_px: tuple[int, int, int, int] | None, where: str) -> tuple[slice, slice]:
+    """Rows and columns of the raster that show the patch; all of them without a patch. Raises `CaptureRefused`."""
     height, width = raster.shape
-    x, y, w, h = cell_px if cell_px is not None else (0, 0, width, height)
+    x, y, w, h = patch_px if patch_px is not None else (0, 0, width, height)
     rows, columns = slice(max(y, 0), min(y + h, height)), slice(max(x, 0), min(x + w, width))
     if rows.stop - rows.start < MIN_WINDOW_PX or columns.stop - columns.start < MIN_WINDOW_PX:
-        raise CaptureRefused(where, "shows less than 2 mm of the stroke's paper cell")
+        raise CaptureRefused(where, "shows less than 2 mm of the stroke's patch")
     return rows, columns
 
 

@@ -1,7 +1,7 @@
 """`brushloop validate`: from the locations of sessions to the files of a report; and `diff`, two reports compared.
 
 A difference is tested in pairs. These are, in order of preference: the same stroke of the same recording (two software
-versions, or two sets of options); the averages of the same cell in two sessions.
+versions, or two sets of options); the averages of the same condition in two sessions.
 """
 
 from __future__ import annotations
@@ -264,7 +264,7 @@ class Difference:
     before: Report
     after: Report
     by_stroke: bool
-    """Whether the same strokes are paired; else the averages of the same cells."""
+    """Whether the same strokes are paired; else the averages of the same conditions."""
     changes: list[Change]
 
     def lines(self) -> Iterator[object]:
@@ -275,8 +275,8 @@ class Difference:
         what = "the same stroke" if self.by_stroke else "the average of the same (H, α)"
         test = self.changes[0].test
         yield (
-            f"Paired by {what}, n = {test.n} in {test.groups} cells; p by flipping the signs of whole cells, corrected "
-            f"by Holm for {len(self.changes)} series ({self.before.label})."
+            f"Paired by {what}, n = {test.n} in {test.groups} conditions; p by flipping the signs of whole conditions, "
+            f"corrected by Holm for {len(self.changes)} series ({self.before.label})."
         )
         if not self.by_stroke:
             yield "Two sessions also differ in things that were not meant to change: brush, ink, paper, zero touch."
@@ -306,12 +306,12 @@ def compare(request: DiffRequest, _progress: Progress = unseen) -> Difference:
     for series in (series for series in first if series in last):
         both = sorted(first[series].keys() & last[series].keys())
         values = 100.0 * np.array([[side[series][key] for key in both] for side in (first, last)])
-        # The error of a model is common to all strokes of a cell.
-        cells = np.unique([",".join(key[:2]) for key in both], return_inverse=True)[1]
-        if both and (test := paired(values[0], values[1], cells)) is not None:
+        # The error of a model is common to all strokes of a condition.
+        conditions = np.unique([",".join(key[:2]) for key in both], return_inverse=True)[1]
+        if both and (test := paired(values[0], values[1], conditions)) is not None:
             found.append((series, float(values[0].mean()), float(values[1].mean()), test))
     if not found:
-        raise CalibrationError(str(paths[1]), f"has no stroke, cell or model in common with {paths[0]}")
+        raise CalibrationError(str(paths[1]), f"has no stroke, condition or model in common with {paths[0]}")
     corrected = holm([test.p for *_, test in found])
     return Difference(old, new, by_stroke, [Change(*change, p) for change, p in zip(found, corrected, strict=True)])
 
@@ -335,7 +335,10 @@ def report_path(place: Path) -> Path:
 
 
 def _scores(path: Path, report: Report, *, by_stroke: bool) -> dict[Series, Strokes]:
-    """Read scores by cell, recording and stroke, or averaged by cell. Raises `CalibrationError` for an edited table."""
+    """Read scores by condition, recording and stroke, or averaged by condition.
+
+    Raises `CalibrationError` for an edited table.
+    """
     table = path.with_name("scores.csv")
     if not table.is_file() or file_sha256(table) != report.scores_sha256:
         raise CalibrationError(str(table), f"is not the table of {path.name}: its SHA-256 differs")
@@ -343,8 +346,8 @@ def _scores(path: Path, report: Report, *, by_stroke: bool) -> dict[Series, Stro
     scores: defaultdict[Series, defaultdict[tuple[str, ...], list[float]]] = defaultdict(lambda: defaultdict(list))
     with table.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
-            cell = (row["depth_mm"], row["tilt_deg"])
-            key = (*cell, recordings[row["session_id"]], as_text(row["stroke_id"])) if by_stroke else cell
+            condition = (row["depth_mm"], row["tilt_deg"])
+            key = (*condition, recordings[row["session_id"]], as_text(row["stroke_id"])) if by_stroke else condition
             for measure in MEASURES:
                 scores[row["model"], row["alignment"], row["tone"], measure][key].append(float(row[measure]))
     return {series: {key: fmean(of_key) for key, of_key in keys.items()} for series, keys in scores.items()}

@@ -34,7 +34,7 @@ from brushloop.calibrate.report import (
     source_point,
 )
 from brushloop.calibrate.scores import MEASURES, Stat
-from brushloop.calibrate.stats import CEILING, NEAR_POINTS, Cell, Floats, Interval, Summary, is_near
+from brushloop.calibrate.stats import CEILING, NEAR_POINTS, DepthTilt, Floats, Interval, Summary, is_near
 from brushloop.calibrate.validate.run import (
     BEZIER_REFITTED,
     FITTED_HELD_OUT,
@@ -57,7 +57,7 @@ from brushloop.calibrate.validate.tables import (
 )
 from brushloop.calibrate.writing.compare import Table3Row
 
-CELL_COLUMNS = ("ccd-bsmg", "ccd-bsm", FITTED_HELD_OUT, BEZIER_REFITTED, CEILING)
+CONDITION_COLUMNS = ("ccd-bsmg", "ccd-bsm", FITTED_HELD_OUT, BEZIER_REFITTED, CEILING)
 MAX_REFUSED, MAX_REFUSED_IN_TERMINAL = 200, 20
 MAX_SAMPLES = 15
 WIDE_SCALE = 0.005
@@ -71,7 +71,7 @@ MAX_NAMED = 6
 SHORT = {HELD_OUT: ", held out", "fitted, in sample": ", in sample"}
 """What a model knows of the strokes, shortened for the terminal."""
 MAX_POINTS = 200
-MAX_CELLS, EXTREMES = 5, 6
+MAX_CONDITIONS, EXTREMES = 5, 6
 Curve = tuple[str, Floats, Floats]
 """Name, steps and validation losses of a training."""
 
@@ -89,7 +89,7 @@ def page_of(
     """
     best_model, names = report.model(report.shown), [session.session_id for session in report.sessions]
     best, worst = extremes(outcome, report.shown)
-    columns = [model for name in CELL_COLUMNS if (model := report.model(name)) is not None]
+    columns = [model for name in CONDITION_COLUMNS if (model := report.model(name)) is not None]
     return render(
         "report.html.j2",
         report=report,
@@ -108,9 +108,9 @@ def page_of(
         keys=KEYS,
         headline=list(headline(report)),
         scores=[(key, _scores(report, key)) for key in KEYS],
-        cell_columns=columns,
-        cells=[_cell(report, cell, columns) for cell in report.cells],
-        samples=[pictured(outcome, k, report.shown) for k in first_of_cells(outcome, MAX_SAMPLES)],
+        condition_columns=columns,
+        conditions=[_row_of_condition(report, condition, columns) for condition in report.conditions],
+        samples=[pictured(outcome, k, report.shown) for k in first_of_conditions(outcome, MAX_SAMPLES)],
         side=side_by_side(outcome),
         shown=best_model.label if best_model is not None else "",
         best=[pictured(outcome, k, report.shown) for k in best],
@@ -128,7 +128,7 @@ def _table_three(report: Report) -> Iterator[tuple[str, list[TableRow]]]:
     """Title and rows of Table 3 of every character in either alignment."""
     for record in report.written:
         where = f"written in {record.session} with {record.brush or 'an unnamed brush'}"
-        where += f" on paper cells of {record.cell_mm:g} mm"
+        where += f" on patches of {record.cell_mm:g} mm"
         for name in record.characters:
             yield f"{name}, {where} — {NORMAL[0]}, binary", table_3(record, name, NORMAL[0])
             title = f"{name}, {where} — {STRICT[0]}, binary: where size and place count"
@@ -142,10 +142,12 @@ def _scores(report: Report, key: Key) -> list[tuple[ModelInfo, Stat, int, int]]:
     return [(*row, int(first), int(second)) for row, first, second in zip(rows, by_csim, by_ssim, strict=True)]
 
 
-def _cell(report: Report, cell: Cell, columns: Sequence[ModelInfo]) -> tuple[Cell, int, list[Stat | None]]:
-    """A cell, its number of presses, and the scores of these models there."""
-    stats = [report.stat(model.name, STRICT, cell) for model in columns]
-    return cell, max((stat.csim.n for stat in stats if stat is not None), default=0), stats
+def _row_of_condition(
+    report: Report, condition: DepthTilt, columns: Sequence[ModelInfo]
+) -> tuple[DepthTilt, int, list[Stat | None]]:
+    """A condition, its number of presses, and the scores of these models there."""
+    stats = [report.stat(model.name, STRICT, condition) for model in columns]
+    return condition, max((stat.csim.n for stat in stats if stat is not None), default=0), stats
 
 
 def provenance(session: Session) -> tuple[tuple[str, str], ...]:
@@ -199,14 +201,14 @@ def side_by_side(outcome: Outcome) -> dict[str, Any]:
     """Some captures next to the prediction of every model: the paper's figures 3, 10 and 11."""
     labels = {model.name: model.info.label for group in outcome.models.values() for model in group}
     lines: list[tuple[Press, list[str]]] = []
-    for press in (outcome.scores.presses[k] for k in first_of_cells(outcome, MAX_CELLS)):
+    for press in (outcome.scores.presses[k] for k in first_of_conditions(outcome, MAX_CONDITIONS)):
         drawn = outcome.predicted(press)
         predictions = (ink_uri(shown(drawn[name])) if name in drawn else "" for name in labels)
         lines.append((press, [ink_uri(shown(press.images)), *predictions]))
     return {"labels": list(labels.values()), "lines": lines}
 
 
-def first_of_cells(outcome: Outcome, most: int) -> list[int]:
+def first_of_conditions(outcome: Outcome, most: int) -> list[int]:
     """The first capture of each condition; with more than `most` of them, of evenly spaced ones."""
     first = [numbers[0] for numbers in outcome.scores.conditions().values()]
     count = min(len(first), most)
@@ -266,7 +268,7 @@ def measured(report: Report) -> str:
     """Summary of the strokes and models that were compared."""
     compared, strokes = (sum(getattr(s, name) for s in report.sessions) for name in ("compared", "strokes"))
     brush = next(filter(None, (brush_and_size(s.header) for s in report.sessions)), "a brush that is not named")
-    at = f" at {len(report.cells)} combinations of press depth H and brush tilt α" if report.cells else ""
+    at = f" at {len(report.conditions)} combinations of press depth H and brush tilt α" if report.conditions else ""
     left = f", {strokes - compared} more could not be used" if strokes > compared else ""
     models = sum(model.basis != PRESSES for model in report.models)
     sessions = f"{len(report.sessions)} sessions" if len(report.sessions) > 1 else "one session"
@@ -339,7 +341,7 @@ def _session(session: Session) -> Iterator[Point]:
         words = f"two zero touches differ by {collected.moved_mm:.2f} mm ({', '.join(collected.touches[:MAX_NAMED])})"
         yield Point(False, f"{words}: presses with the same H do not have the same depth.")
     if session.cut:
-        words = f"{len(session.cut)} strokes are cut by the edge of their photograph or cell"
+        words = f"{len(session.cut)} strokes are cut by the edge of their photograph or patch"
         yield Point(False, f"{words}: their scores are too low.")
     if scale is not None:
         width = (scale.mm_per_px_high - scale.mm_per_px_low) / scale.mm_per_px
@@ -350,7 +352,7 @@ def _session(session: Session) -> Iterator[Point]:
 def _models(report: Report) -> Iterator[Point]:
     """Whether there is a ceiling, and where the calibrated model stands."""
     if _csim(report, CEILING) is None:
-        words = "No cell was pressed twice: the repeatability of the brush is unknown, and there is no ceiling."
+        words = "No condition was pressed twice: the repeatability of the brush is unknown, and there is no ceiling."
         yield Point(False, words)
     held = _csim(report, FITTED_HELD_OUT)
     if held is not None and held.below_ceiling is not None:

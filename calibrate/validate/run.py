@@ -1,6 +1,6 @@
-"""The run: read every press, fit to other cells, score every model. Finished work is never repeated.
+"""The run: read every press, fit to other conditions, score every model. Finished work is never repeated.
 
-The models are every registered one, the fitted brush, refits to other cells, and trained generators. Each result
+The models are every registered one, the fitted brush, refits to other conditions, and trained generators. Each result
 depends only on its inputs, so neither the order nor the place of work changes it.
 """
 
@@ -38,11 +38,11 @@ if TYPE_CHECKING:
     from brushloop.model.strokes import StrokeModel
 
 PUBLISHED = "as published"
-HELD_OUT = "fitted, held-out cells"
+HELD_OUT = "fitted, held-out conditions"
 PRESSES = "captured presses"
 FITTED_HELD_OUT, BEZIER_REFITTED = "ccd-bsm-heldout", "bezier-refitted"
 ANOTHER = "another press"
-"""A capture predicted by other captures of its cell, averaged: how well one press predicts another."""
+"""A capture predicted by other captures of its condition, averaged: how well one press predicts another."""
 LAMBDAS = {"ccd-bsm-lambda-1": 1.0, "ccd-bsm-lambda-pi/2": 0.5 * math.pi}
 """Values compared in addition to lambda = pi, which is CCD-BSM itself: the paper's figure 3."""
 ORDER = (
@@ -73,7 +73,7 @@ class ModelInfo(Frozen):
     label: str
     definition: str
     basis: str
-    """What it knows of these presses: `as published`, `fitted, in sample`, `fitted, held-out cells`, ..."""
+    """What it knows of these presses: `as published`, `fitted, in sample`, `fitted, held-out conditions`, ..."""
     sha256: str = ""
     """Hash of a generator's file."""
 
@@ -82,15 +82,15 @@ KINDS_OF_PRESS = (
     ModelInfo(
         name=ANOTHER,
         label="another press",
-        definition="A capture predicted by other captures of its cell, averaged: how well the brush repeats a press. A "
-        "model can do better, because only one of two presses strays from its image.",
+        definition="A capture predicted by other captures of its condition, averaged: how well the brush repeats a "
+        "press. A model can do better, because only one of two presses strays from its image.",
         basis=PRESSES,
     ),
     ModelInfo(
         name=CEILING,
         label=CEILING,
-        definition="The score of a perfect model, which draws the best image of each cell: estimated from the "
-        "similarity of other presses of the cell.",
+        definition="The score of a perfect model, which draws the best image of each condition: estimated from the "
+        "similarity of other presses of the condition.",
         basis=PRESSES,
     ),
 )
@@ -99,13 +99,14 @@ BEZIER_LEFT_OUT = ModelInfo(
     name=BEZIER_REFITTED,
     label="Bezier refitted",
     definition="Two mirrored cubic Bezier curves; ends, belly and shoulder regressed on the captures of all other "
-    "cells.",
+    "conditions.",
     basis=HELD_OUT,
 )
 BRUSH_LEFT_OUT = ModelInfo(
     name=FITTED_HELD_OUT,
     label="CCD-BSM calibrated",
-    definition="CCD-BSM's lengths with gains, powers, profile and edges fitted to the captures of all other cells.",
+    definition="CCD-BSM's lengths with gains, powers, profile and edges fitted to the captures of all other "
+    "conditions.",
     basis=HELD_OUT,
 )
 
@@ -247,33 +248,33 @@ def _pressed(model: StrokeModel, at: Condition) -> Mark:
 def _held_out(
     session: FittedSession, presses: Sequence[Press], request: ValidateRequest, scheduler: Scheduler, progress: Progress
 ) -> Iterator[Model]:
-    """Yield the models fitted to the session without the cells that they predict."""
+    """Yield the models fitted to the session without the conditions that they predict."""
     wanted = request.models or (FITTED_HELD_OUT, BEZIER_REFITTED)
     if not request.held_out or not {FITTED_HELD_OUT, BEZIER_REFITTED} & {*wanted}:
         return
     whole = for_fit([press for press in presses if not press.cut], session.header)
-    cells = {(press.condition.depth_mm, press.condition.tilt_deg): list[int]() for press in presses} | whole.cells
-    left_out = [(fold, whole.pick(others)) for fold, others in leave_out(cells)]
+    conditions = {(press.condition.depth_mm, press.condition.tilt_deg): list[int]() for press in presses} | whole.cells
+    left_out = [(fold, whole.pick(others)) for fold, others in leave_out(conditions)]
     if not left_out:
         return
     if session.fit is not None:
         start = session.fit.press()
         size = {"radius_mm": start.radius_mm, "length_mm": start.length_mm}
         jobs = [Refit(replace(others, **size), start=start.values) for _, others in left_out]
-        what = f"{session.header.session_id}: cells left out in turn"
+        what = f"{session.header.session_id}: conditions left out in turn"
         fits = refits(jobs, session.store, scheduler, what, progress)
-        brushes = {cell: fit.outline for (fold, _), fit in zip(left_out, fits, strict=True) for cell in fold}
+        brushes = {at: fit.outline for (fold, _), fit in zip(left_out, fits, strict=True) for at in fold}
         yield _left_out(BRUSH_LEFT_OUT, brushes)
-    yield _left_out(BEZIER_LEFT_OUT, {cell: refit_bezier(others) for fold, others in left_out for cell in fold})
+    yield _left_out(BEZIER_LEFT_OUT, {at: refit_bezier(others) for fold, others in left_out for at in fold})
 
 
 def _left_out(info: ModelInfo, outlines: Mapping[Cell, Draw | None]) -> Model:
-    """A model that was fitted without the cell that it predicts; None where the other cells are too few."""
+    """A model that was fitted without the condition that it predicts; None where the other conditions are too few."""
 
     def mark(at: Condition) -> Mark:
         outline = outlines.get((at.depth_mm, at.tilt_deg))
         if outline is None:
-            raise DomainError("depth_mm", at.depth_mm, "other cells", "the other cells do not determine this press")
+            raise DomainError("depth_mm", at.depth_mm, "other conditions", "they do not determine this press")
         return outline(at.depth_mm, at.tilt_deg), 0.0
 
     return Model(info, mark)
@@ -317,27 +318,27 @@ def _score(
     scheduler: Scheduler,
     progress: Progress,
 ) -> None:
-    """Fill the table for one session: every press against every model, and against other presses of its cell."""
+    """Fill the table for one session: every press against every model, and against other presses of its condition."""
     columns = [scores.models.index(name) for name in (*(model.name for model in models), ANOTHER)]
-    cells = [cell for cell in scores.cells if scores.presses[cell[0]].session == session.header.session_id]
+    groups = [group for group in scores.groups if scores.presses[group[0]].session == session.header.session_id]
     numbers: dict[str, list[int]] = {}
     """Numbers of presses by the key of their job: equal presses share one."""
 
     def jobs() -> Iterator[tuple[str, ScoreJob]]:
-        for cell in cells:
-            presses = [scores.presses[k] for k in cell]
+        for group in groups:
+            presses = [scores.presses[k] for k in group]
             images, reasons = predicted(models, presses[0].condition, session.store)
             for why in reasons.values():
                 refused.extend(Refused(press.session, press.stroke.stroke_id, why) for press in presses)
             predictions = [[images[model.name]] if model.name in images else [] for model in models]
             for number, press in enumerate(presses):
-                others = [presses[other].images for other in others_of(number, len(cell))]
+                others = [presses[other].images for other in others_of(number, len(group))]
                 compared = (*predictions, others)
                 key = key_of("score", press.images, *map(len, compared), *itertools.chain.from_iterable(compared))
-                numbers.setdefault(key, []).append(cell[number])
+                numbers.setdefault(key, []).append(group[number])
                 yield key, (press.images, compared)
 
-    what, count = f"{session.header.session_id}: compared", sum(map(len, cells))
+    what, count = f"{session.header.session_id}: compared", sum(map(len, groups))
     for key, arrays in counted(scheduler.finished(score_job, jobs(), session.store), what, count, progress):
         scores.values[np.ix_(numbers[key], columns)] = arrays["values"]
 
@@ -369,11 +370,11 @@ def _on_others(outline: Draw, presses: Sequence[Press]) -> Iterator[NDArray[np.f
 def _trials(name: str, number: int, scores: Scores) -> Iterator[tuple[list[Press], list[Press]]]:
     """Yield the presses to fit and those to score on, of session `number`."""
     presses = scores.presses
-    cells = [[k for k in cell if presses[k].session == name and not presses[k].cut] for cell in scores.cells]
+    whole = [[k for k in group if presses[k].session == name and not presses[k].cut] for group in scores.groups]
     for draw in range(DRAWS):
         rng = np.random.default_rng([draw, number])
-        # Every cell once before any cell twice, as a person would choose.
-        groups = [[int(k) for k in rng.permutation(cell)] for cell in cells if cell]
+        # Every condition once before any condition twice, as a person would choose.
+        groups = [[int(k) for k in rng.permutation(group)] for group in whole if group]
         groups = [groups[int(g)] for g in rng.permutation(len(groups))]
         order = [k for turn in itertools.zip_longest(*groups) for k in turn if k is not None]
         for count in COUNTS:

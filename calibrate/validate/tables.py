@@ -31,9 +31,9 @@ from brushloop.calibrate.compare import (
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.loop import AGAIN, LoopRecord
 from brushloop.calibrate.report import Sealed, load_sealed, source_label
-from brushloop.calibrate.scores import MEASURES, Cell, Scores, Stat, find_stat, statistics
+from brushloop.calibrate.scores import MEASURES, Scores, Stat, find_stat, statistics
 from brushloop.calibrate.session import Calibration
-from brushloop.calibrate.stats import CEILING, Floats, Summary, ceiling_values
+from brushloop.calibrate.stats import CEILING, DepthTilt, Floats, Summary, ceiling_values
 from brushloop.calibrate.validate.run import (
     ANOTHER,
     FITTED,
@@ -59,7 +59,7 @@ PACKAGES = ("brushloop", "numpy", "opencv-python-headless", "scikit-image", "num
 STRICT: Key = (Alignment.MM, Tone.BINARY)
 NORMAL: Key = (Alignment.SIZE_NORMALISED, Tone.BINARY)
 """The comparison where size and place count, and that of the paper."""
-MAX_CELLS = 60
+MAX_CONDITIONS = 60
 """Most conditions that have statistics of their own."""
 MISSING = {
     "ccd-bsmg": "not in this run: give a trained one with --generator",
@@ -137,9 +137,9 @@ class Report(Sealed):
     models: tuple[ModelInfo, ...]
     """Rows of the tables: models, then comparisons with presses."""
     shown: str
-    """Model shown in the pictures: the best calibrated one on held-out cells, if there is one."""
+    """Model shown in the pictures: the best calibrated one on held-out conditions, if there is one."""
     stats: tuple[Stat, ...]
-    """Over all cells, and in each unless there are too many different (H, alpha) for a table."""
+    """Over all conditions, and in each unless there are too many different (H, alpha) for a table."""
     refused: tuple[Refused, ...]
     by_strokes: tuple[Step, ...]
     """Similarity against number of strokes; empty without --ablations."""
@@ -150,13 +150,13 @@ class Report(Sealed):
     written: tuple[WrittenRecord, ...] = ()
     """Characters: Table 3. Each record here and in `loops` keeps its own digest."""
 
-    def stat(self, model: str, key: Key = STRICT, cell: Cell | None = None) -> Stat | None:
+    def stat(self, model: str, key: Key = STRICT, condition: DepthTilt | None = None) -> Stat | None:
         """The scores of one model, or None if it has none."""
-        return find_stat(self.stats, model, key, cell)
+        return find_stat(self.stats, model, key, condition)
 
     @property
-    def cells(self) -> list[Cell]:
-        """Depth and tilt of every cell with statistics of its own."""
+    def conditions(self) -> list[DepthTilt]:
+        """Depth and tilt of every condition with statistics of its own."""
         return sorted({stat.cell for stat in self.stats if stat.cell is not None})
 
     def model(self, name: str) -> ModelInfo | None:
@@ -202,17 +202,17 @@ def report_of(
 
 
 def _stats(scores: Scores) -> Iterator[Stat]:
-    """Yield the statistics of all cells together, then of single conditions unless there are too many."""
+    """Yield the statistics of all conditions together, then of single conditions unless there are too many."""
     another = 100.0 * scores.of(ANOTHER)
-    ceiling: Floats = np.apply_along_axis(ceiling_values, 0, another, scores.cell_of)
+    ceiling: Floats = np.apply_along_axis(ceiling_values, 0, another, scores.group_of)
     percent = {model: 100.0 * scores.of(model) for model in scores.models} | {CEILING: ceiling}
     presses = {kind.name for kind in KINDS_OF_PRESS}
     for model, values in percent.items():
-        yield from statistics(model, values, scores.cell_of, None, None if model in presses else ceiling)
+        yield from statistics(model, values, scores.group_of, None, None if model in presses else ceiling)
     conditions = scores.conditions()
-    for condition, at in conditions.items() if len(conditions) <= MAX_CELLS else ():
+    for condition, at in conditions.items() if len(conditions) <= MAX_CONDITIONS else ():
         for model, values in percent.items():
-            yield from statistics(model, values[at], scores.cell_of[at], (condition.depth_mm, condition.tilt_deg))
+            yield from statistics(model, values[at], scores.group_of[at], (condition.depth_mm, condition.tilt_deg))
 
 
 def _models(outcome: Outcome) -> Iterator[ModelInfo]:
@@ -326,7 +326,7 @@ def table_3(record: WrittenRecord, character: str, alignment: Alignment) -> list
 
 
 def summary_csv(report: Report) -> str:
-    """Return every statistic, per cell and overall; “robot writing” is what `brushloop repress` pressed again."""
+    """Return every statistic, per condition and overall; “robot writing” is what `brushloop repress` pressed again."""
     stats = [(stat.model, report.label, stat) for stat in report.stats]
     for loop in report.loops:
         again = (stat for stat in loop.stats if stat.model == AGAIN)

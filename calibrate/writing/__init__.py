@@ -212,7 +212,9 @@ def check_drawn_from(plan: Plan, session: OpenSession) -> None:
         if commanded.get(name) != as_points(strokes):
             raise CalibrationError(where, f"{name!r} was not drawn from this plan")
     if cell_mm is not None and cell_mm[2:] != (plan.cell_mm, plan.cell_mm):
-        raise CalibrationError(where, f"has cells of {cell_mm[2]:g} x {cell_mm[3]:g} mm, the plan {plan.cell_mm:g} mm")
+        raise CalibrationError(
+            where, f"has patches of {cell_mm[2]:g} x {cell_mm[3]:g} mm, the plan {plan.cell_mm:g} mm"
+        )
 
 
 def code_points(name: str) -> str:

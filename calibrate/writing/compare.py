@@ -32,7 +32,7 @@ from brushloop.calibrate.compare import (
 )
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.files import Written
-from brushloop.calibrate.presses import Refused, prepare_cell
+from brushloop.calibrate.presses import Refused, prepare_patch
 from brushloop.calibrate.report import (
     Sealed,
     about,
@@ -63,7 +63,7 @@ KEYS: tuple[Key, ...] = tuple(itertools.product(Alignment, Tone, Polarity))
 HEADLINE: Key = (Alignment.MM, Tone.BINARY, Polarity.INK)
 """The comparison that decides which writing is better."""
 Ink = dict[Tone, Image]
-"""(128, 128) ink of a cell from 0 to 1 by tone: coverage of what counts as ink, and how dark it is."""
+"""(128, 128) ink of a patch from 0 to 1 by tone: coverage of what counts as ink, and how dark it is."""
 SIMULATED, REFERENCE = "captured, simulated", "captured, reference"
 PLANNED, ANOTHER = "simulated, reference", "captured, another writing"
 PAIRS = (SIMULATED, REFERENCE, PLANNED, ANOTHER)
@@ -164,7 +164,7 @@ class WritingComparison:
     characters: list[Character]
     refused: tuple[Refused, ...] = ()
     cut: tuple[str, ...] = ()
-    """Writings whose ink reaches the edge of their cell."""
+    """Writings whose ink reaches the edge of their patch."""
 
     @functools.cached_property
     def table_3(self) -> tuple[Table3Row, ...]:
@@ -215,7 +215,7 @@ def compare_written(path: Path, plan: Plan, progress: Progress = unseen) -> Writ
 def read_writings(
     session: OpenSession, refused: list[Refused], progress: Progress
 ) -> Iterator[tuple[str, str, Prepared]]:
-    """Yield stroke id, name of the figure and ink of every cell that the arm wrote on; the others go to `refused`.
+    """Yield stroke id, name of the figure and ink of every patch that the arm wrote on; the others go to `refused`.
 
     Raises `CalibrationError` for an import.
     """
@@ -225,7 +225,7 @@ def read_writings(
     for capture in counted(session.recording.captures(), what, len(session.strokes), progress):
         stroke_id = capture.stroke.stroke_id
         try:
-            prepared = prepare_cell(capture, session.calibration)
+            prepared = prepare_patch(capture, session.calibration)
         except (CaptureRefused, SessionDamaged) as error:
             refused.append((stroke_id, error.what))
         else:
@@ -233,7 +233,7 @@ def read_writings(
 
 
 def compare_ink(fixed: Ink, moving: Ink, key: Key) -> Floats:
-    """(2,) CSIM and SSIM of the ink of two cells. Raises ValueError for a blank one."""
+    """(2,) CSIM and SSIM of the ink of two patches. Raises ValueError for a blank one."""
     alignment, tone, polarity = key
     one, other = (to_tone(aligned(ink[tone], alignment), tone) for ink in (fixed, moving))
     return similarity(one, other[None], alignment, polarity)[0]

@@ -115,7 +115,7 @@ def fit(request: FitFootprintRequest, progress: Progress = unseen) -> Written:
     )
     path = put_to_use(artefact, opened.recording.path.parent, FOLDER)
     words = (
-        f"footprint of {count} strokes on {len(ink)} cells ({artefact.source}): draws them with CSIM "
+        f"footprint of {count} strokes on {len(ink)} patches ({artefact.source}): draws them with CSIM "
         f"{csim_percent:.1f} %, ink = 1"
     )
     return Written(path, (*(f"left out: {stroke_id}: {why}" for stroke_id, why in refused), words, str(path)))

@@ -21,7 +21,7 @@ LEVELS = {AGAIN: 0.94, ANOTHER: 0.95, SIMULATED: 0.9}
 
 
 def pair_scores(step: float = 0.001) -> Scores:
-    """Six presses of three cells, each pressed again: .94 like its original, another press .95."""
+    """Six presses of three conditions, each pressed again: .94 like its original, another press .95."""
     blank, sizes = np.zeros((len(KEYS), 128, 128), np.uint8), Measured(1.0, 1.0, 1.0, 1.0, 1.0)
     presses: list[Press] = []
     for k in range(6):

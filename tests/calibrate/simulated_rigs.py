@@ -100,10 +100,10 @@ def sheet(rig: int, presses: int, seed: int = 0) -> Shot:
     rng = np.random.default_rng([seed, rig, 10_000])
     config = SimConfig(seed=int(rng.integers(1, 2**30)), view=aimed(CAMERAS[rig], rng), brush=BRUSHES[rig])
     world = World(config)
-    cells = [(h, a) for h in HEIGHTS_MM for a in TILTS_DEG]
+    conditions = [(h, a) for h in HEIGHTS_MM for a in TILTS_DEG]
     anchors: list[tuple[float, float]] = []
-    for index, cell in enumerate(rng.permutation(len(cells))[:presses]):
-        depth_mm, tilt_deg = cells[cell]
+    for index, number in enumerate(rng.permutation(len(conditions))[:presses]):
+        depth_mm, tilt_deg = conditions[number]
         # 40 x 34 mm apart: no mark reaches into the window of another.
         place = (36.0 + 40.0 * (index % 5) + rng.uniform(-1, 1), 30.0 + 44.0 * (index // 5) + rng.uniform(-1, 1))
         mark = world.brush.press(depth_mm, tilt_deg, ink_load=rng.uniform(0.85, 1.0), press_seed=1000 * rig + index)
@@ -135,7 +135,7 @@ def true_mask(shot: Shot, window_mm: tuple[float, float, float, float], px_per_m
 
 
 def collected(folder: Path, shot: Shot, optics: Lens | None = None) -> Path:
-    """The closed session of a shot: its board, then each press in a cell of its own, on the same photograph."""
+    """The closed session of a shot: its board, then each press on a patch of its own, on the same photograph."""
     strokes = [
         Stroke(
             stroke_id=f"s{k}",

@@ -29,7 +29,7 @@ from tests.calibrate.given import CALIBRATION
 from tests.calibrate.records import loop_record
 
 MODEL = stroke_model("ccd-bsm", Brush())
-ANCHOR, CELL = (60.0, 40.0), (30.0, 28.0, 40.0, 24.0)
+ANCHOR, PATCH = (60.0, 40.0), (30.0, 28.0, 40.0, 24.0)
 STRICT = (Alignment.MM, Tone.BINARY)
 HEADER = Header(session_id="grid", source=Source.LOOPBACK, software="test")
 
@@ -48,7 +48,7 @@ def press(name: str, shown: tuple[float, float], asked: tuple[float, float], of:
         still=0,
         depth_mm=asked[0],
         tilt_deg=asked[1],
-        cell_mm=CELL,
+        cell_mm=PATCH,
         anchor_mm=ANCHOR,
         again_of=of,
     )
@@ -69,7 +69,7 @@ ORIGINALS = [
 ]
 
 
-def test_a_press_made_again_as_it_was_beats_the_other_press_of_its_cell() -> None:
+def test_a_press_made_again_as_it_was_beats_the_other_press_of_its_condition() -> None:
     again = [
         press("a-r01~1", (14.6, 5.0), (14.6, 5.0), "a-r01"),
         press("a-r02~1", (15.4, 5.0), (15.4, 5.0), "a-r02"),
@@ -87,7 +87,7 @@ def test_a_press_made_again_as_it_was_beats_the_other_press_of_its_cell() -> Non
     assert len(record.lost) == 8
     assert all(points < 0.0 and row.csim.n == 2 for points, _, _, row in record.lost)
     assert record.answer.good
-    assert "so few strokes do not make it certain" in record.answer.text, "two presses of one cell"
+    assert "so few strokes do not make it certain" in record.answer.text, "two presses of one condition"
 
 
 def test_a_press_made_again_too_deep_fails_and_says_so() -> None:
@@ -116,7 +116,7 @@ def test_what_repeats_nothing_is_named() -> None:
     }
 
 
-def test_an_original_alone_in_its_cell_has_no_repeatability() -> None:
+def test_an_original_alone_in_its_condition_has_no_repeatability() -> None:
     again = [press("b-r01~1", (19.0, 0.0), (19.0, 0.0), "b-r01")]
     scores = score_pairs(paired(ORIGINALS, again)[0], ORIGINALS)
     assert np.isnan(scores.of(ANOTHER)).all()

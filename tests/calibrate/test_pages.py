@@ -56,8 +56,8 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """A page of every command but `train` (tests/model/test_train.py), by the command's name."""
     folder = tmp_path_factory.mktemp("pages")
     (folder / "photos").mkdir()
-    cells = [(11.0, 0.0), (15.0, 0.0)]
-    presses = imported_presses(folder / "photos", folder / "presses", cells, (300, 480), (380, 150))
+    conditions = [(11.0, 0.0), (15.0, 0.0)]
+    presses = imported_presses(folder / "photos", folder / "presses", conditions, (300, 480), (380, 150))
     session = photographed(folder / "2026-03-02-board-01", SPEC, [board()], sheet_mm=(100.0, 80.0))
     return {
         "calibrate": run("calibrate", session),
@@ -68,7 +68,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 
 def _loop(folder: Path) -> str:
-    """The page of presses of three cells, of which one was not pressed again."""
+    """The page of presses of three conditions, of which one was not pressed again."""
     scores = pair_scores()
     pairs = [Pair(press, press, press.images) for press in scores.presses]
     original, again = (
@@ -126,7 +126,7 @@ def test_the_page_of_a_calibration_draws_every_corner_with_its_residual(pages: d
     assert "2026-03-02-board-01" in page
 
 
-def test_the_page_of_a_fit_draws_both_outlines_over_the_ink_of_each_cell(pages: dict[str, str]) -> None:
+def test_the_page_of_a_fit_draws_both_outlines_over_the_ink_of_each_condition(pages: dict[str, str]) -> None:
     page = pages["fit"]
     assert page.count('class="fitted" d="M') == page.count('class="published" d="M') == 2
     assert "H 11 mm, α 0° · 1 press · CSIM" in page

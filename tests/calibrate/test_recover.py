@@ -119,14 +119,14 @@ def test_the_command_compares_with_what_was_commanded(tmp_path: Path) -> None:
     assert load_protocol(tmp_path / "again" / PROTOCOL).kind == "replay"
 
 
-CELLS = [Condition(h, a) for h in (11.0, 13.0, 15.0, 17.0, 20.0) for a in (0.0, 5.0, 10.0)]
+CONDITIONS = [Condition(h, a) for h in (11.0, 13.0, 15.0, 17.0, 20.0) for a in (0.0, 5.0, 10.0)]
 
 
-def rows(cells: list[Condition], error_mm: float, error_deg: float) -> list[Row]:
+def rows(conditions: list[Condition], error_mm: float, error_deg: float) -> list[Row]:
     rng = np.random.default_rng(0)
     return [
         Row(f"s{k}", one, one.depth_mm + error_mm * rng.normal(), one.tilt_deg + error_deg * rng.normal(), 0.05, 0.2, 0)
-        for k, one in enumerate(cells * 20)
+        for k, one in enumerate(conditions * 20)
     ]
 
 
@@ -135,7 +135,7 @@ def inside(made: list[Row]) -> float:
 
 
 def test_a_model_error_is_in_the_interval_and_weighs_more_where_the_brush_is_pressed_less() -> None:
-    raw = rows(CELLS, 0.3, 2.0)
+    raw = rows(CONDITIONS, 0.3, 2.0)
     made = with_model_error(raw)
     assert inside(raw) < 0.3
     assert 0.93 <= inside(made) <= 0.99
@@ -150,14 +150,15 @@ def test_the_own_command_does_not_enter_the_interval() -> None:
     assert found[1] > 3.0
 
 
-def test_a_cell_the_brush_was_not_fitted_to_takes_the_error_of_such_cells() -> None:
-    cells = CELLS[:9]
+def test_a_condition_the_brush_was_not_fitted_to_takes_the_error_of_such_conditions() -> None:
+    conditions = CONDITIONS[:9]
     off = np.array([0.1] * 5 + [1.0] * 4)
     sd = np.full(9, 0.01)
-    found = model_sd(off, sd, cells, fitted=cells[:5])
-    assert found[5:] == pytest.approx(1.0 * 3.182 / 1.96, rel=0.01), "three other cells left out"
-    assert (model_sd(off, sd, cells)[5:] < 1.0).all(), "diluted by the fitted cells"
-    assert (model_sd(off[:6], sd[:6], cells[:6], fitted=cells[:5])[5:] < 0.2).all(), "none else left out: all cells"
+    found = model_sd(off, sd, conditions, fitted=conditions[:5])
+    assert found[5:] == pytest.approx(1.0 * 3.182 / 1.96, rel=0.01), "three other conditions left out"
+    assert (model_sd(off, sd, conditions)[5:] < 1.0).all(), "diluted by the fitted conditions"
+    alone = model_sd(off[:6], sd[:6], conditions[:6], fitted=conditions[:5])[5:]
+    assert (alone < 0.2).all(), "none else left out: all conditions"
 
 
 def test_a_press_that_its_image_hardly_determines_counts_little() -> None:
@@ -166,9 +167,9 @@ def test_a_press_that_its_image_hardly_determines_counts_little() -> None:
     assert common_variance(np.array([0.1, 0.1]), np.array([0.5, 0.5])) == 0.0
 
 
-def test_too_few_cells_and_intervals_over_most_of_the_commanded_range_are_flagged() -> None:
-    assert all(NO_MODEL_ERROR in row.flags for row in with_model_error(rows(CELLS[:3], 0.3, 2.0)))
-    vague, sharp = (with_model_error(rows(CELLS, 0.3, error_deg)) for error_deg in (4.0, 0.5))
+def test_too_few_conditions_and_intervals_over_most_of_the_commanded_range_are_flagged() -> None:
+    assert all(NO_MODEL_ERROR in row.flags for row in with_model_error(rows(CONDITIONS[:3], 0.3, 2.0)))
+    vague, sharp = (with_model_error(rows(CONDITIONS, 0.3, error_deg)) for error_deg in (4.0, 0.5))
     assert any(NOT_INFORMATIVE["alpha"] in row.flags and row.tilt_sd_deg > 3.0 for row in vague)
     assert not any(row.flags & set(NOT_INFORMATIVE.values()) for row in sharp)
     for value, sd, most in ((5.0, 2.5, True), (5.0, 1.5, False), (0.0, 2.5, False)):
@@ -177,6 +178,6 @@ def test_too_few_cells_and_intervals_over_most_of_the_commanded_range_are_flagge
 
 
 def test_upright_presses_recovered_at_0_do_not_count_as_exact() -> None:
-    half = [replace(r, tilt_deg=max(r.tilt_deg, 0.0)) for r in rows(CELLS[::3], 0.3, 2.0)]
+    half = [replace(r, tilt_deg=max(r.tilt_deg, 0.0)) for r in rows(CONDITIONS[::3], 0.3, 2.0)]
     assert np.mean([r.tilt_deg == 0.0 for r in half]) > 0.4
     assert np.mean([r.tilt_sd_deg for r in with_model_error(half)]) > 1.9

@@ -124,7 +124,7 @@ def test_many_pairs_at_once_are_scored_as_one_by_one() -> None:
 
 
 MODELS = stroke_models(Brush())
-ANCHOR, CELL = (60.0, 40.0), (30.0, 28.0, 40.0, 24.0)
+ANCHOR, PATCH = (60.0, 40.0), (30.0, 28.0, 40.0, 24.0)
 MM, NORMAL = (Alignment.MM, Tone.BINARY), (Alignment.SIZE_NORMALISED, Tone.BINARY)
 
 
@@ -137,7 +137,7 @@ def page_of(depth_mm: float, tilt_deg: float, model: str = "ccd-bsm") -> np.ndar
 
 def images_of(page: np.ndarray) -> np.ndarray:
     """(KEYS, 128, 128): the press of a page, as it is compared."""
-    stroke = Stroke(stroke_id="a", kind="press", still=0, cell_mm=CELL, anchor_mm=ANCHOR)
+    stroke = Stroke(stroke_id="a", kind="press", still=0, cell_mm=PATCH, anchor_mm=ANCHOR)
     return prepare_job((Capture(stroke, encode_png(page), "test"), CALIBRATION))["images"]
 
 
@@ -183,7 +183,7 @@ def test_scores_of_several_images_are_averaged_and_of_none_are_missing() -> None
     assert np.isnan(similarities(near, [[]])).all()
 
 
-def test_the_field_holds_every_cell_of_the_grid() -> None:
+def test_the_field_holds_every_condition_of_the_grid() -> None:
     for depth_mm, tilt_deg in ((11.0, 0.0), (11.0, 10.0), (20.0, 0.0), (20.0, 10.0)):
         image = simulated(MODELS["ccd-bsm"], depth_mm, tilt_deg)[KEYS.index((Alignment.MM, Tone.GRAY))] / 255
         assert np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]).max() == 0.0
@@ -192,7 +192,7 @@ def test_the_field_holds_every_cell_of_the_grid() -> None:
         )
 
 
-def test_the_table_is_in_order_of_capture_and_its_cells_in_order_of_session_and_condition() -> None:
+def test_the_table_is_in_order_of_capture_and_its_groups_in_order_of_session_and_condition() -> None:
     shallow, upright, tilted = Condition(20.0, 0.0), Condition(11.0, 0.0), Condition(11.0, 10.0)
     order = [("b", shallow), ("b", upright), ("b", tilted), ("b", shallow), ("a", shallow), ("a", upright)]
     sizes, blank = Measured(1.0, 1.0, 1.0, 1.0, 1.0), np.zeros((4, 128, 128), np.uint8)
@@ -201,8 +201,8 @@ def test_the_table_is_in_order_of_capture_and_its_cells_in_order_of_session_and_
         stroke = Stroke(stroke_id=str(k), kind="press", still=k, depth_mm=at.depth_mm, tilt_deg=at.tilt_deg)
         presses.append(Press(name, "", stroke, blank, np.zeros((128, 128), np.float32), (0.0, 0.0), sizes, False))
     scores = Scores(presses, ["line", "circle"])
-    assert scores.cells == [[1], [2], [0, 3], [5], [4]]
-    assert scores.cell_of.tolist() == [2, 0, 1, 2, 4, 3]
+    assert scores.groups == [[1], [2], [0, 3], [5], [4]]
+    assert scores.group_of.tolist() == [2, 0, 1, 2, 4, 3]
     assert scores.conditions() == {upright: [1, 5], tilted: [2], shallow: [0, 3, 4]}
     scores.values[4, 1] = 0.5
     assert [(s.session_id, s.stroke_id, s.model, s.csim) for s in scores] == [("a", "4", "circle", 0.5)] * len(KEYS)

@@ -59,7 +59,7 @@ def test_of_what_lies_on_the_page_the_stroke_is_kept() -> None:
     assert iou(prepare(page(small | large), (420.0, 400.0), "page").mask, small) > 0.95
 
 
-def test_what_lies_outside_the_cell_is_not_seen_and_what_reaches_its_edge_is_cut() -> None:
+def test_what_lies_outside_the_patch_is_not_seen_and_what_reaches_its_edge_is_cut() -> None:
     truth, neighbour = stroke(), stroke(20.0, 8.0, (400, 620))
     inside = prepare(page(truth | neighbour), None, "page", (0, 200, 800, 330))
     assert iou(inside.mask, truth) > 0.98

@@ -326,7 +326,7 @@ def test_what_is_lost_is_listed_by_phase(plan: Plan) -> None:
 PATCH_MM = 70.0
 
 
-def test_a_practice_sheet_is_a_protocol_that_stays_inside_its_cells(tmp_path: Path) -> None:
+def test_a_practice_sheet_is_a_protocol_that_stays_inside_its_patches(tmp_path: Path) -> None:
     protocol = load_protocol(practice(PracticeRequest(tmp_path)).path)
     assert isinstance(protocol, WriteConfig)
     assert len(protocol.figures) == FIGURES

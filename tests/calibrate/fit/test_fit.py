@@ -1,4 +1,4 @@
-"""The fit of a brush: parameters, residuals, held-out cells; and from the photographs of a session to its fit."""
+"""The fit of a brush: parameters, residuals, held-out conditions; and from the photographs of a session to its fit."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from brushloop.calibrate.artefact import FITS, current, load_artefact
 from brushloop.calibrate.commands import FitRequest
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.descent import KnownBrush, about, draw, fit_presses, learned, of_brushes, regress, spreads
-from brushloop.calibrate.fit.fit import FEWEST_CELLS, BrushFit, sizes_of
+from brushloop.calibrate.fit.fit import FEWEST_CONDITIONS, BrushFit, sizes_of
 from brushloop.calibrate.fit.fit import fit_presses as fit_session
-from brushloop.calibrate.fit.heldout import FITTED, leave_cell_out
+from brushloop.calibrate.fit.heldout import FITTED, leave_condition_out
 from brushloop.calibrate.session import open_session
 from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.validate.tables import load_report
@@ -26,7 +26,7 @@ from tests.photographed import imported_presses
 
 PX_MM = 0.4
 GRID = Grid((np.arange(100) + 0.5) * PX_MM - 31.0, 8.0 - (np.arange(40) + 0.5) * PX_MM)
-CELLS = [(11.0, 0.0), (11.0, 10.0), (15.0, 5.0), (20.0, 0.0), (20.0, 10.0)]
+CONDITIONS = [(11.0, 0.0), (11.0, 10.0), (15.0, 5.0), (20.0, 0.0), (20.0, 10.0)]
 
 
 def a_brush(**changed: float) -> FittedPress:
@@ -37,18 +37,18 @@ def a_brush(**changed: float) -> FittedPress:
     return FittedPress(6.0, 48.0, values)
 
 
-def presses(brush: FittedPress, cells: list[tuple[float, float]], noise: float = 0.0, seed: int = 0) -> Presses:
+def presses(brush: FittedPress, conditions: list[tuple[float, float]], noise: float = 0.0, seed: int = 0) -> Presses:
     rng = np.random.default_rng(seed)
     ink = []
-    for cell in cells:
+    for condition in conditions:
         y = GRID.y_mm + noise * rng.normal()
-        ink.append(brush.chance(*cell, GRID.x_mm + noise * rng.normal(), y, 0.15))
-    return Presses(6.0, 48.0, GRID, np.array(cells).reshape(-1, 2), np.array(ink))
+        ink.append(brush.chance(*condition, GRID.x_mm + noise * rng.normal(), y, 0.15))
+    return Presses(6.0, 48.0, GRID, np.array(conditions).reshape(-1, 2), np.array(ink))
 
 
 def test_a_brush_of_the_family_is_found_again() -> None:
     truth = a_brush(h0_mm=1.0, width_power=1.2)
-    fit = fit_presses(presses(truth, CELLS), residual=False)
+    fit = fit_presses(presses(truth, CONDITIONS), residual=False)
     for height, tilt in [(13.0, 5.0), (17.0, 10.0)]:
         seen, wanted = (np.maximum(b.edges_at(height, tilt, GRID.x_mm)[0], 0.0) for b in (fit, truth))
         assert seen.max() == pytest.approx(wanted.max(), rel=0.03)
@@ -57,21 +57,21 @@ def test_a_brush_of_the_family_is_found_again() -> None:
 
 @pytest.mark.parametrize("seed", [21, 25])
 def test_a_brush_far_from_all_known_ones_does_not_end_the_fit_far_from_its_marks(seed: int) -> None:
-    """One fit ended .27 mm from the left-out cell from the prior alone, the other .34 mm with size and place first."""
-    cells = [(h, a) for h in (11.0, 13.0, 15.0, 17.0, 20.0) for a in (0.0, 5.0, 10.0)]
+    """One ended .27 mm from the left-out condition from the prior alone, the other .34 mm with size and place first."""
+    conditions = [(h, a) for h in (11.0, 13.0, 15.0, 17.0, 20.0) for a in (0.0, 5.0, 10.0)]
     known, rng = learned(), np.random.default_rng(seed)
     far = spreads() * np.linalg.cholesky(np.linalg.inv(known.precision)) @ rng.normal(size=len(NAMES))
     low, high = (np.array([getattr(spec, end) for spec in PARAMETERS]) for end in ("low", "high"))
     truth = FittedPress(6.0, 48.0, np.clip(known.values + 1.5 * far, low, high))
-    fit = fit_presses(presses(truth, cells[:-1], noise=0.2, seed=seed), residual=False)
-    seen, wanted = (np.maximum(b.edges_at(*cells[-1], GRID.x_mm)[0], 0.0) for b in (fit, truth))
+    fit = fit_presses(presses(truth, conditions[:-1], noise=0.2, seed=seed), residual=False)
+    seen, wanted = (np.maximum(b.edges_at(*conditions[-1], GRID.x_mm)[0], 0.0) for b in (fit, truth))
     assert np.abs(seen - wanted).mean() < 0.2
 
 
 def test_sizes_of_marks_are_those_of_the_brush_with_intervals_that_narrow() -> None:
     truth = a_brush()
     at = truth.sizes(15.5, 5.0)
-    few = sizes_of(presses(truth, CELLS, noise=0.2))
+    few = sizes_of(presses(truth, CONDITIONS, noise=0.2))
     assert [size.name for size in few] == ["reach toward the tip", "reach toward the heel", "width"]
     assert few[2].here.low < 2.0 * (at.half + 0.4) < few[2].here.high
     assert few[2].by_depth.low > 0.0, "it opens as it is pressed deeper"
@@ -80,8 +80,8 @@ def test_sizes_of_marks_are_those_of_the_brush_with_intervals_that_narrow() -> N
     assert many[2].here.high - many[2].here.low < 0.7 * (few[2].here.high - few[2].here.low)
 
 
-def test_too_few_cells_give_no_interval() -> None:
-    assert sizes_of(presses(a_brush(), CELLS[: FEWEST_CELLS - 1] * 3)) == []
+def test_too_few_conditions_give_no_interval() -> None:
+    assert sizes_of(presses(a_brush(), CONDITIONS[: FEWEST_CONDITIONS - 1] * 3)) == []
     assert sizes_of(presses(a_brush(), [(h, 0.0) for h in range(11, 18)])) == [], "one tilt shows no slope"
 
 
@@ -104,13 +104,13 @@ def test_products_of_the_jacobian_are_those_of_the_whole_image() -> None:
 def test_edges_that_the_profile_does_not_have_are_found() -> None:
     truth = replace(a_brush(), edges=np.zeros_like(a_brush().edges))
     truth.edges[0, 1, 0] = 0.5
-    fit = fit_presses(presses(truth, CELLS))
+    fit = fit_presses(presses(truth, CONDITIONS))
     assert fit.edges[0, 1, 0] - fit.edges[1, 1, 0] == pytest.approx(0.5, abs=0.15)
 
 
-def test_held_out_cells_are_scored_beside_the_ceiling() -> None:
-    strokes = presses(a_brush(), CELLS * 3, noise=0.05)
-    rows = {row.model: row for row in leave_cell_out(strokes, fit_presses(strokes))}
+def test_held_out_conditions_are_scored_beside_the_ceiling() -> None:
+    strokes = presses(a_brush(), CONDITIONS * 3, noise=0.05)
+    rows = {row.model: row for row in leave_condition_out(strokes, fit_presses(strokes))}
     assert rows[FITTED].n == rows[CEILING].n == 15
     assert rows["uncalibrated"].csim + 5.0 < rows[FITTED].csim <= 100.0
     below = rows[FITTED].below
@@ -122,13 +122,13 @@ def test_held_out_cells_are_scored_beside_the_ceiling() -> None:
     assert rows[CEILING].below is None
 
 
-def test_two_presses_of_a_cell_are_enough_for_the_ceiling_and_one_is_not() -> None:
+def test_two_presses_of_a_condition_are_enough_for_the_ceiling_and_one_is_not() -> None:
     for repeats, known in ((2, True), (1, False)):
-        strokes = presses(a_brush(), CELLS[:3] * repeats, noise=0.05)
-        rows = {row.model: row for row in leave_cell_out(strokes, fit_presses(strokes))}
+        strokes = presses(a_brush(), CONDITIONS[:3] * repeats, noise=0.05)
+        rows = {row.model: row for row in leave_condition_out(strokes, fit_presses(strokes))}
         assert (CEILING in rows) is known
         assert (rows[FITTED].below is not None) is known
-    assert leave_cell_out(presses(a_brush(), CELLS[:1] * 2), a_brush()) == []
+    assert leave_condition_out(presses(a_brush(), CONDITIONS[:1] * 2), a_brush()) == []
     with pytest.raises(ValueError, match="at least one press"):
         fit_presses(presses(a_brush(), []))
 
@@ -161,10 +161,10 @@ def test_a_large_family_does_not_outweigh_a_small_one() -> None:
 
 
 def test_strokes_that_repeat_are_followed_and_strokes_that_do_not_are_smoothed() -> None:
-    cells = np.array([(h, a) for h in (11.0, 15.0, 20.0) for a in (0.0, 5.0, 10.0)])
-    terms = command_terms(*cells.T)
-    alternating = 0.5 * (-1.0) ** np.arange(len(cells))
-    steady = regress(np.full((len(cells), 1), 0.5), terms, np.ones(1))
+    conditions = np.array([(h, a) for h in (11.0, 15.0, 20.0) for a in (0.0, 5.0, 10.0)])
+    terms = command_terms(*conditions.T)
+    alternating = 0.5 * (-1.0) ** np.arange(len(conditions))
+    steady = regress(np.full((len(conditions), 1), 0.5), terms, np.ones(1))
     erratic = regress(alternating[:, None], terms, np.ones(1))
     assert terms @ steady[0] == pytest.approx(0.5, abs=0.05)
     assert np.abs(terms @ erratic[0]).max() < 0.15
@@ -184,7 +184,7 @@ def test_the_ends_of_a_brush_move_by_its_residual() -> None:
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("sessions") / "presses"
-    return imported_presses(tmp_path_factory.mktemp("photos"), out, CELLS, (300, 480), (380, 150))
+    return imported_presses(tmp_path_factory.mktemp("photos"), out, CONDITIONS, (300, 480), (380, 150))
 
 
 def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> None:
@@ -200,7 +200,7 @@ def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> Non
     assert path is not None
     fit = load_artefact(path, BrushFit)
     assert fit.strokes == 5
-    assert set(fit.cells) == set(CELLS)
+    assert set(fit.cells) == set(CONDITIONS)
     assert fit.csim_percent["fitted"] > fit.csim_percent["uncalibrated"] + 3.0
     ran = narrow.invoke(app, ["validate", str(session), "--model", "ccd-bsm", "--model", NAME])
     assert ran.exit_code == 0, ran.output
@@ -225,9 +225,9 @@ def test_one_command_leads_from_photographs_to_the_report(session: Path) -> None
     assert load_report(session / "validation" / "report.json").model(NAME) is not None
 
 
-def test_a_single_cell_gives_neither_intervals_nor_held_out_scores(tmp_path: Path) -> None:
+def test_a_single_condition_gives_neither_intervals_nor_held_out_scores(tmp_path: Path) -> None:
     (tmp_path / "photos").mkdir()
-    pressed = imported_presses(tmp_path / "photos", tmp_path / "presses", CELLS[:1], (300, 480), (380, 150))
+    pressed = imported_presses(tmp_path / "photos", tmp_path / "presses", CONDITIONS[:1], (300, 480), (380, 150))
     fitted = fit_session(FitRequest(pressed))
     assert fitted.held_out == []
     assert fitted.sizes == []

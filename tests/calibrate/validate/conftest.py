@@ -12,21 +12,21 @@ import pytest
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 from tests.photographed import imported, photograph
 
-CELLS = [(11.0, 0.0), (11.0, 10.0), (15.0, 5.0), (20.0, 0.0), (20.0, 10.0)]
+CONDITIONS = [(11.0, 0.0), (11.0, 10.0), (15.0, 5.0), (20.0, 0.0), (20.0, 10.0)]
 TOUCH = (380, 150)
 MakeSession = Callable[..., Path]
 
 
 @pytest.fixture(scope="session")
 def make_session() -> MakeSession:
-    """Make a session of `repeats` presses of each cell under a folder, its last photograph blank if wanted."""
+    """Make a session of `repeats` presses of each condition under a folder, its last photograph blank if wanted."""
 
     def make(under: Path, name: str = "presses", *, repeats: int = 2, blank: bool = True, seed: int = 0) -> Path:
         photos = under / f"{name}-photos"
         photos.mkdir(parents=True)
         brush = Brush(BrushSpec())
         lines = ["file,depth_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
-        for k, (depth_mm, tilt_deg) in enumerate(CELLS * repeats):
+        for k, (depth_mm, tilt_deg) in enumerate(CONDITIONS * repeats):
             mark = brush.press(depth_mm, tilt_deg, ink_load=1.0, press_seed=seed + k)
             photograph(photos / f"{k:03d}.png", mark, (300, 480), TOUCH)
             lines.append(f"{k:03d}.png,{depth_mm},{tilt_deg},10.0,{TOUCH[0]},{TOUCH[1]}")
@@ -40,5 +40,5 @@ def make_session() -> MakeSession:
 
 @pytest.fixture(scope="session")
 def session(make_session: MakeSession, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Ten presses of five cells, and a blank capture. Nobody writes into it."""
+    """Ten presses of five conditions, and a blank capture. Nobody writes into it."""
     return make_session(tmp_path_factory.mktemp("sessions"))

@@ -66,8 +66,8 @@ def test_every_model_is_scored_in_both_alignments_and_tones(report: Report) -> N
             assert of.n == 10
             assert 0.0 < of.min <= of.median <= of.max <= 100.0
             assert of.avg_interval[0] <= of.avg <= of.avg_interval[1]
-    cell, ceiling = report.stat("ccd-bsm", cell=(15.0, 5.0)), report.stat(CEILING)
-    assert (cell.csim.n, ceiling.csim.max) == (2, None)
+    condition, ceiling = report.stat("ccd-bsm", condition=(15.0, 5.0)), report.stat(CEILING)
+    assert (condition.csim.n, ceiling.csim.max) == (2, None)
     # It has not seen what it predicts, and yet knows this brush.
     refitted, published = (report.stat(name) for name in (BEZIER_REFITTED, "bezier"))
     assert refitted.csim.avg > published.csim.avg + 5.0
@@ -103,7 +103,7 @@ def test_the_page_has_the_papers_numbers_its_source_and_what_was_refused_and_fet
     assert all(re.match(r"data:image/(png|svg\+xml);base64,", source) for source in sources)
     links = re.findall(r'href="([^"]*)"', page)
     assert all(f'id="{link[1:]}"' in page or (folder / link).is_file() for link in links)
-    assert {"scores.csv", "scores.parquet", "summary.csv", "report.json", "#cell-1"} <= set(links)
+    assert {"scores.csv", "scores.parquet", "summary.csv", "report.json", "#condition-1"} <= set(links)
     assert "&lt;script&gt;" in page
     assert not re.search(r"<script|url\(|@import|<link|<iframe", page)
 
@@ -268,19 +268,19 @@ def test_another_version_of_a_model_is_compared_stroke_by_stroke(
     monkeypatch.setattr(validation, "_pressed", lambda model, at: (model.profile(at.depth_mm, at.tilt_deg), -9.0))
     run(session, "--out", tmp_path, *TWO)
     changes = {change.series: change for change in compare(DiffRequest(before, tmp_path)).changes}
-    # Every mark is drawn 9 mm too far to the left, in each of the five cells.
+    # Every mark is drawn 9 mm too far to the left, in each of the five conditions.
     worse = changes[("line", "mm", "binary", "csim")]
     assert (worse.test.n, worse.test.groups) == (10, 5)
     assert worse.test.interval is not None
     assert worse.test.interval[1] < 0.0
-    assert worse.test.p == pytest.approx(2 / 2**5)  # signs are flipped by cell: five alike are no proof yet
+    assert worse.test.p == pytest.approx(2 / 2**5)  # signs are flipped by condition: five alike are no proof yet
     assert worse.verdict == "no significant difference"
     table = run("diff", before, tmp_path)
     assert "the same stroke" in table
-    assert "n = 10 in 5 cells" in table
+    assert "n = 10 in 5 conditions" in table
 
 
-def test_two_sessions_are_compared_cell_by_cell(make_session: object, before: Path, tmp_path: Path) -> None:
+def test_two_sessions_are_compared_condition_by_condition(make_session: object, before: Path, tmp_path: Path) -> None:
     other = make_session(tmp_path, "other", seed=500, blank=False)  # pyright: ignore[reportCallIssue]
     run(other, *TWO)
     found = compare(DiffRequest(before, other))  # the session's own folder
