@@ -20,9 +20,9 @@ from brushloop.collect.protocols.steps import Drawn, DrawStep, PressStep, TouchS
 from brushloop.collect.rig.check import BLUE, GREY, ORANGE, Axes, finish, from_above, shown_name
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import limits_of
-from brushloop.collect.rig.paper import Sheet, to_base
+from brushloop.collect.rig.paper import PaperPlane, Sheet, to_base
 from brushloop.collect.touch.selfcheck import partners
-from brushloop.collect.walk import StepMoves, poses_of, sheet_of, walk
+from brushloop.collect.walk import StepMoves, moves_of, poses_of, sheet_of, walk
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import distance
 from brushloop.drivers.limits import Limits
@@ -120,15 +120,15 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
     touches = list(measured or [config.paper.touch_point_mm])
     dips = poses = 0
     sheets = 1
-    here = park_moves(config)[-1].target
+    plane, here = PaperPlane(config.paper.touch_z_mm), park_moves(config)[-1].target
     for walked in walk(config, protocol):
         step = walked.step
-        kind = str(step.kind)
+        kind, moves = str(step.kind), moves_of(config, plane, step, walked.patches, dips=dips)
         kinds[kind] += 1
-        took_s, here = step_s(config, here, walked.moves)
+        took_s, here = step_s(config, here, moves)
         seconds[kind] = seconds.get(kind, 0.0) + took_s
-        dips += walked.moves.dips
-        poses += len(walked.moves.poses)
+        dips += moves.dips
+        poses += len(moves.poses)
         if isinstance(step, TouchStep):
             touches.append((step.x_mm, step.y_mm))
         if isinstance(step, PressStep | DrawStep):

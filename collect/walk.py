@@ -28,7 +28,7 @@ from brushloop.collect.motion import (
     visit_moves,
 )
 from brushloop.collect.protocols.config import ProtocolConfig
-from brushloop.collect.protocols.kinds import CalibrationConfig
+from brushloop.collect.protocols.kinds import CalibrationConfig, WriteConfig
 from brushloop.collect.protocols.steps import (
     MARKING,
     BoardStep,
@@ -182,12 +182,11 @@ class Walked:
     """From 1."""
     patches: tuple[Patch, ...]
     """Patches that the step marks, or the one that it photographs."""
-    moves: StepMoves = field(default_factory=StepMoves)
 
 
 def sheet_of(config: RigConfig, protocol: ProtocolConfig) -> Sheet:
-    """The sheet as this protocol divides it."""
-    return Sheet(config.paper, protocol.own_patch_mm)
+    """The sheet as this protocol divides it: into patches of the rig, or of the size that figures need."""
+    return Sheet(config.paper, protocol.cell_mm if isinstance(protocol, WriteConfig) else None)
 
 
 def steps_on(config: RigConfig, protocol: ProtocolConfig) -> Protocol:
@@ -198,13 +197,10 @@ def steps_on(config: RigConfig, protocol: ProtocolConfig) -> Protocol:
 
 def as_planned(step: Step, sheet: int, patch: int) -> StepResult | None:
     """The result of a step that makes its press there, as commanded; None for a step that makes none."""
-    match step:
-        case PressStep(press=press):
-            return PressResult(press=press.model_copy(update={"sheet": sheet, "patch": patch}))
-        case DrawStep(press=press):
-            return PressResult(kind=StepKind.DRAW, press=press.model_copy(update={"sheet": sheet, "patch": patch}))
-        case _:
-            return None
+    if not isinstance(step, PressStep | DrawStep):
+        return None
+    kind = StepKind.PRESS if isinstance(step, PressStep) else StepKind.DRAW
+    return PressResult(kind=kind, press=step.press.model_copy(update={"sheet": sheet, "patch": patch}))
 
 
 def patches_of(step: Step, sheet: Sheet, used: set[int], number: int) -> tuple[Patch, ...]:
@@ -215,8 +211,8 @@ def patches_of(step: Step, sheet: Sheet, used: set[int], number: int) -> tuple[P
     return (patch, *(partners(sheet, patch, used) if isinstance(step, SelfCheckStep) else ()))
 
 
-def placed_steps(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Walked]:
-    """Every step in order, each mark on the next free patch, with a fresh sheet whenever one is full; without moves.
+def walk(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Walked]:
+    """Every step in order, each mark on the next free patch, with a fresh sheet whenever one is full.
 
     The sheet must have room for at least one patch.
     """
@@ -236,18 +232,12 @@ def placed_steps(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Walked
             step = generator.send(as_planned(step, number, patches[0].index if patches else 0))
 
 
-def walk(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Walked]:
-    """Every step of `placed_steps` with its moves, over the taught plane."""
-    plane, dips = PaperPlane(config.paper.touch_z_mm), 0
-    for placed in placed_steps(config, protocol):
-        moves = moves_of(config, plane, placed.step, placed.patches, dips=dips)
-        dips += moves.dips
-        yield replace(placed, moves=moves)
-
-
 # Checks before motion
 
 TOUCH_CLEAR_MM = 5.0
+"""Least distance of the zero-touch point from ink."""
+PlannedPose = tuple[Pose, float, str]
+"""A pose that a step commands, its speed in mm/s, and the name of what it belongs to."""
 
 
 def check_protocol(rig_path: Path, protocol_path: Path, rig: RigConfig, protocol: ProtocolConfig) -> None:
@@ -256,10 +246,97 @@ def check_protocol(rig_path: Path, protocol_path: Path, rig: RigConfig, protocol
     if first_round:
         sheet = sheet_of(rig, protocol)
         _check_sheet(rig_path, protocol_path, rig, protocol, sheet)
-        _check_brush(protocol_path, rig.brush, protocol.depths_field, first_round, sheet.patch(0))
+        _check_brush(protocol_path, rig.brush, first_round, sheet.patch(0))
         _check_touch_point(rig_path, rig.paper, first_round, sheet)
-    _check_touches(protocol_path, rig, protocol)
-    check_poses(rig_path, rig, protocol, PaperPlane(rig.paper.touch_z_mm))
+    if isinstance(protocol, CalibrationConfig):
+        _check_touches(protocol_path, rig, protocol.touches_mm)
+    check_poses(rig_path, rig, all_poses(rig, protocol, PaperPlane(rig.paper.touch_z_mm)))
+
+
+def _check_sheet(rig_path: Path, path: Path, rig: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> None:
+    if sheet.capacity == 0:
+        where, field = (path, "cell_mm") if isinstance(protocol, WriteConfig) else (rig_path, "paper.cell_mm")
+        raise ConfigError(where, field, f"{sheet.cell_mm} does not fit on {rig.paper.size_mm}")
+    if rig.self_check.enabled:
+        try:
+            triangle_on((sheet.patch(0),), rig.self_check)
+        except StepError as error:
+            what = f"{error}; --arm switches the self-check on, `enabled = false` switches it off for a new session"
+            raise ConfigError(rig_path, "self_check.legs_mm", what) from None
+
+
+def _check_brush(path: Path, brush: BrushConfig, strokes: Iterable[Planned], patch: Patch) -> None:
+    for stroke in strokes:
+        for _, _, asked in marks_of(stroke, patch):
+            bundle_mm = brush.length_mm * math.cos(math.radians(asked.tilt_deg))
+            bundle = f"the bundle at {asked.tilt_deg:g} deg"
+            for name, most_mm in (("brush.max_depth_mm", brush.max_depth_mm), (bundle, bundle_mm)):
+                if asked.depth_mm > most_mm:
+                    what = f"{asked.depth_mm:g} mm is deeper than {name} = {most_mm:.4g} mm allows"
+                    raise ConfigError(path, stroke.stroke_id, what)
+
+
+def _check_touch_point(rig_path: Path, paper: PaperConfig, strokes: Iterable[Planned], sheet: Sheet) -> None:
+    first = sheet.patch(0)
+    marks = {(x_mm, y_mm) for stroke in strokes for x_mm, y_mm, _ in marks_of(stroke, first)}
+    for patch in map(sheet.patch, range(sheet.capacity)):
+        right_mm, up_mm = patch.x_mm - first.x_mm, patch.y_mm - first.y_mm
+        for x_mm, y_mm in marks:
+            at_mm = x_mm + right_mm, y_mm + up_mm
+            if math.dist(at_mm, paper.touch_point_mm) < TOUCH_CLEAR_MM:
+                where = [round(v, 1) for v in at_mm]
+                what = f"{[*paper.touch_point_mm]} lies within {TOUCH_CLEAR_MM:g} mm of ink at {where}"
+                raise ConfigError(rig_path, "paper.touch_point_mm", what)
+
+
+def _check_touches(path: Path, rig: RigConfig, points_mm: Sequence[tuple[float, float]]) -> None:
+    if points_mm and rig.touch.method == "camera":
+        what = "single touches cannot be found by camera: use force, jog or taught in [touch]"
+        raise ConfigError(path, "touches_mm", what)
+    width, height = rig.paper.size_mm
+    for x_mm, y_mm in points_mm:
+        if not (0.0 <= x_mm <= width and 0.0 <= y_mm <= height):
+            what = f"[{x_mm:g}, {y_mm:g}] lies off the sheet of {width:g} x {height:g} mm"
+            raise ConfigError(path, "touches_mm", what)
+
+
+def check_poses(rig_path: Path, rig: RigConfig, poses: Iterable[PlannedPose]) -> None:
+    """Raise `ConfigError` for the first pose that is outside the limits."""
+    limits, acc_mm_s2 = limits_of(rig), rig.motion.acc_mm_s2
+    for pose, speed_mm_s, where in poses:
+        try:
+            limits.check("robot", pose, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
+        except LimitExceeded as error:
+            what = f"a planned pose is outside the limits: {error.what} ({where})"
+            raise ConfigError(rig_path, "robot.limits", what) from None
+
+
+def all_poses(
+    rig: RigConfig, protocol: ProtocolConfig, plane: PaperPlane, *, every_patch: bool = False
+) -> Iterator[PlannedPose]:
+    """Everything that the protocol can command over this plane, taught or measured by touch.
+
+    The box of the limits is convex, so what fits on the outermost patches fits on all. The arm's reach is not convex
+    and needs `every_patch`.
+    """
+    yield from ((move.target, move.speed_mm_s, "park") for move in park_moves(rig))
+    sheet = sheet_of(rig, protocol)
+    patches = [sheet.patch(i) for i in range(sheet.capacity)] if every_patch else sheet.corners
+    distinct: dict[object, Step] = {}
+    for walked in walk(rig, protocol):
+        distinct.setdefault((walked.step.kind, _moved(walked.step)), walked.step)
+    for step in distinct.values():
+        for marked in _places(step, patches):
+            yield from step_poses(rig, plane, step, marked)
+
+
+def step_poses(rig: RigConfig, plane: PaperPlane, step: Step, patches: Sequence[Patch] = ()) -> Iterator[PlannedPose]:
+    """Everything that a step can command on the patches that it marks."""
+    name = str(step.kind) if (press := press_of(step)) is None else press.stroke_id
+    where = f"{name} on patch {patches[0].index}" if patches else name
+    # Assume that a wash is due: when one is due depends on the step at which the process starts.
+    dips = 0 if rig.ink.wash is None else rig.ink.wash.every_dips - 1
+    yield from ((pose, speed, where) for pose, speed in moves_of(rig, plane, step, patches, dips=dips).poses)
 
 
 def _moved(step: Step) -> object:
@@ -275,107 +352,6 @@ def _moved(step: Step) -> object:
             return replace(step, index=0)
 
 
-def _check_sheet(rig_path: Path, path: Path, rig: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> None:
-    if sheet.capacity == 0:
-        own = protocol.own_patch_mm is not None
-        where, field = (path, "cell_mm") if own else (rig_path, "paper.cell_mm")
-        raise ConfigError(where, field, f"{sheet.cell_mm} does not fit on {rig.paper.size_mm}")
-    if rig.self_check.enabled:
-        try:
-            triangle_on((sheet.patch(0),), rig.self_check)
-        except StepError as error:
-            what = f"{error}; --arm switches the self-check on, `enabled = false` switches it off for a new session"
-            raise ConfigError(rig_path, "self_check.legs_mm", what) from None
-
-
-def _check_brush(path: Path, brush: BrushConfig, field: str, strokes: Iterable[Planned], patch: Patch) -> None:
-    for stroke in strokes:
-        for _, _, asked in marks_of(stroke, patch):
-            depth_mm, tilt_deg = asked.depth_mm, asked.tilt_deg
-            deep = f"{stroke.stroke_id}: {depth_mm:g} mm"
-            if depth_mm > brush.max_depth_mm:
-                limit = f"is deeper than brush.max_depth_mm = {brush.max_depth_mm:g} mm allows"
-                raise ConfigError(path, field, f"{deep} {limit}")
-            most_mm = brush.length_mm * math.cos(math.radians(tilt_deg))
-            if depth_mm > most_mm:
-                limit = f"at {tilt_deg:g} deg is more than the bundle allows ({most_mm:.1f} mm)"
-                raise ConfigError(path, field, f"{deep} {limit}")
-
-
-def _check_touch_point(rig_path: Path, paper: PaperConfig, strokes: Iterable[Planned], sheet: Sheet) -> None:
-    x_mm, y_mm = paper.touch_point_mm
-    first = sheet.patch(0)
-    marks = {(x_mm, y_mm) for stroke in strokes for x_mm, y_mm, _ in marks_of(stroke, first)}
-    for patch in map(sheet.patch, range(sheet.capacity)):
-        right_mm, up_mm = patch.x_mm - first.x_mm, patch.y_mm - first.y_mm
-        for mark_x, mark_y in marks:
-            at = mark_x + right_mm, mark_y + up_mm
-            if math.dist(at, (x_mm, y_mm)) < TOUCH_CLEAR_MM:
-                where = [round(at[0], 1), round(at[1], 1)]
-                what = f"{[x_mm, y_mm]} lies within {TOUCH_CLEAR_MM:g} mm of ink at {where}"
-                raise ConfigError(rig_path, "paper.touch_point_mm", what)
-
-
-def _check_touches(path: Path, rig: RigConfig, protocol: ProtocolConfig) -> None:
-    if not isinstance(protocol, CalibrationConfig):
-        return
-    if protocol.touches_mm and rig.touch.method == "camera":
-        raise ConfigError(
-            path, "touches_mm", "single touches cannot be found by camera: use force, jog or taught in [touch]"
-        )
-    width, height = rig.paper.size_mm
-    for x_mm, y_mm in protocol.touches_mm:
-        if not (0.0 <= x_mm <= width and 0.0 <= y_mm <= height):
-            raise ConfigError(
-                path, "touches_mm", f"[{x_mm:g}, {y_mm:g}] lies off the sheet of {width:g} x {height:g} mm"
-            )
-
-
-def check_poses(rig_path: Path, rig: RigConfig, protocol: ProtocolConfig, plane: PaperPlane) -> None:
-    """Check every pose over this plane, taught or measured by touch. Raises `ConfigError`."""
-    _check(rig_path, rig, all_poses(rig, protocol, plane))
-
-
-def check_step(rig_path: Path, rig: RigConfig, plane: PaperPlane, step: Step, patches: Sequence[Patch] = ()) -> None:
-    """Check the poses of one step on the patches that it marks. Raises `ConfigError`."""
-    _check(rig_path, rig, ((*pose, step.kind) for pose in moves_of(rig, plane, step, patches).poses))
-
-
-def _check(rig_path: Path, rig: RigConfig, poses: Iterable[tuple[Pose, float, str]]) -> None:
-    limits, acc_mm_s2 = limits_of(rig), rig.motion.acc_mm_s2
-    for pose, speed_mm_s, where in poses:
-        try:
-            limits.check("robot", pose, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
-        except LimitExceeded as error:
-            raise ConfigError(
-                rig_path, "robot.limits", f"a planned pose is outside the limits: {error.what} ({where})"
-            ) from None
-
-
-def all_poses(
-    rig: RigConfig, protocol: ProtocolConfig, plane: PaperPlane, *, every_patch: bool = False
-) -> Iterator[tuple[Pose, float, str]]:
-    """Yield (pose, speed in mm/s, what it belongs to) for everything that the protocol can command.
-
-    The box of the limits is convex, so what fits on the outermost patches fits on all. The arm's reach is not convex
-    and needs `every_patch`.
-    """
-    yield from ((move.target, move.speed_mm_s, "park") for move in park_moves(rig))
-    sheet = sheet_of(rig, protocol)
-    patches = [sheet.patch(i) for i in range(sheet.capacity)] if every_patch else sheet.corners
-    # Assume that a wash is due in every step: when one is due depends on the step at which the process starts.
-    dips = 0 if rig.ink.wash is None else rig.ink.wash.every_dips - 1
-    distinct: dict[object, Step] = {}
-    for placed in placed_steps(rig, protocol):
-        distinct.setdefault((placed.step.kind, _moved(placed.step)), placed.step)
-    for step in distinct.values():
-        for marked in _places(step, patches):
-            name = str(step.kind) if (press := press_of(step)) is None else press.stroke_id
-            where = f"{name} on patch {marked[0].index}" if marked else name
-            moves = moves_of(rig, plane, step, marked, dips=dips)
-            yield from ((pose, speed, where) for pose, speed in moves.poses)
-
-
 def _places(step: Step, patches: list[Patch]) -> Iterator[tuple[Patch, ...]]:
     """The sets of patches that a step may mark; the self-check marks one patch, or three."""
     if step.kind not in MARKING:
@@ -387,7 +363,7 @@ def _places(step: Step, patches: list[Patch]) -> Iterator[tuple[Patch, ...]]:
             yield (patch, patch, patch)
 
 
-async def ask_reach(rig_path: Path, config: RigConfig, poses: Iterable[tuple[Pose, float, str]]) -> int:
+async def ask_reach(rig_path: Path, config: RigConfig, poses: Iterable[PlannedPose]) -> int:
     """Ask the controller for the joints of each pose, near those of the previous one; return how many are distinct.
 
     Powers, sets and moves nothing. The tool that is set on the controller stays: every pose is converted to that tool.

@@ -16,7 +16,7 @@ from brushloop.collect.touch.force import ForceTap
 from brushloop.collect.touch.heights import plane_of
 from brushloop.collect.touch.measure import measure_plane
 from brushloop.collect.touch.selfcheck import self_check, triangle_on
-from brushloop.collect.walk import check_poses, check_step, touch_of
+from brushloop.collect.walk import all_poses, step_poses, touch_of
 from brushloop.drivers.devices import PoseSample, Well
 from brushloop.sessions.events import (
     DipResult,
@@ -146,10 +146,11 @@ async def zero_touch(context: StepContext, step: ZeroTouchStep) -> ZeroTouchResu
     if rig.force is not None and rig.config.force is not None:
         await rig.force.bias(rig.config.force.bias_s)
     if step.method is not None:
-        await within_limits(check_step, "", rig.config, run.procedures.plane, step)
+        await within_limits("", rig.config, step_poses(rig.config, run.procedures.plane, step))
     measured = await _measured(context, touch_of(rig.config, step))
     plane = plane_of(measured)
-    await within_limits(check_poses, "over the paper as it was touched, ", rig.config, run.protocol, plane)
+    poses = all_poses(rig.config, run.protocol, plane)
+    await within_limits("over the paper as it was touched, ", rig.config, poses)
     moved_mm = _moved_mm(measured, run.procedures.plane)
     if measured.method != "taught":
         run.progress.log(

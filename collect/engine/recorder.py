@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
@@ -23,10 +23,11 @@ from brushloop.collect.errors import BadPicture, ConfigError, ForceTooHigh, Step
 from brushloop.collect.motion import Procedures
 from brushloop.collect.operator import Asker, OperatorRequests
 from brushloop.collect.protocols.config import ProtocolConfig
+from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import Rig
 from brushloop.collect.rig.paper import Patch, Sheet
 from brushloop.collect.touch.heights import used_patches as touched_patches
-from brushloop.collect.walk import sheet_of
+from brushloop.collect.walk import PlannedPose, check_poses, sheet_of
 from brushloop.drivers.devices import ForceSample, Frame, PoseSample, Stamp
 from brushloop.drivers.errors import DeviceError, MotionFailed
 from brushloop.drivers.host import Clock, finished
@@ -329,10 +330,12 @@ async def uninterrupted(function: Callable[..., _R], *args: object) -> _R:
     return await finished(asyncio.to_thread(function, *args))
 
 
-async def within_limits(check: Callable[..., None], where: str, *arguments: object) -> None:
-    """Run a check of `collect.walk` in a thread: it takes seconds for a long protocol, and a stop takes effect
-    meanwhile. Raises `StepError`, which begins with `where`."""
+async def within_limits(where: str, rig: RigConfig, poses: Iterable[PlannedPose]) -> None:
+    """Check poses in a thread: it takes seconds for a long protocol, and a stop takes effect meanwhile.
+
+    Raises `StepError`, which begins with `where`.
+    """
     try:
-        await asyncio.to_thread(check, Path("rig.toml"), *arguments)
+        await asyncio.to_thread(check_poses, Path("rig.toml"), rig, poses)
     except ConfigError as error:
         raise StepError(f"{where}{error.what}") from None

@@ -9,21 +9,19 @@ from __future__ import annotations
 import contextlib
 import csv
 import io
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_args
+from typing import Annotated, TypeVar
 
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.protocols.kinds import (
-    MAX_STROKE_POINTS,
     MAX_STROKES,
     CalibrationConfig,
     FewStrokesConfig,
     GridConfig,
     ListConfig,
-    PointRow,
-    ProtocolBase,
     ReplayConfig,
     WriteConfig,
 )
@@ -36,9 +34,6 @@ MAX_TABLE_BYTES = 4 * 1024 * 1024
 ProtocolConfig = GridConfig | FewStrokesConfig | ListConfig | ReplayConfig | WriteConfig | CalibrationConfig
 TaggedProtocol = Annotated[ProtocolConfig, Field(discriminator="kind")]
 _PROTOCOL: TypeAdapter[ProtocolConfig] = TypeAdapter(TaggedProtocol)
-_KINDS: dict[str, type[ProtocolBase]] = {
-    kind: model for model in get_args(ProtocolConfig) for kind in get_args(model.model_fields["kind"].annotation)
-}
 _R = TypeVar("_R", bound=BaseModel)
 
 
@@ -52,48 +47,20 @@ def load_protocol(path: Path) -> ProtocolConfig:
         values = read_toml(path, MAX_PROTOCOL_BYTES)
         if "robot" in values and "kind" not in values:
             raise ConfigError(path, "", "is a rig, not a protocol: give it to --config, and the protocol to --protocol")
-        kind = _KINDS.get(str(values.get("kind")))
-        if kind is WriteConfig:
-            for i, figure in enumerate(_tables(values.get("figures"))):
-                for k, stroke in enumerate(_tables(figure.get("strokes"))):
-                    if "file" in stroke:
-                        place = f"figures.{i}.strokes.{k}."
-                        rows = _rows_of(path, stroke, "points", PointRow, MAX_STROKE_POINTS, place)
-                        stroke["points"] = [row.point for row in rows]
-        if kind is not None and kind.row is not None and "file" in values:
-            values["presses"] = _rows_of(path, values, "presses", kind.row, MAX_STROKES)
-        return _PROTOCOL.validate_python(values)
+        return _PROTOCOL.validate_python(values, context=partial(read_rows, path.parent))
     except ValidationError as error:
         raise refusal(path, error, TaggedProtocol) from None
 
 
-def _rows_of(
-    path: Path, table: dict[str, Any], name: str, row: type[_R], at_most: int, place: str = ""
-) -> tuple[_R, ...]:
-    """The rows of the CSV file that a table of the protocol names instead of giving the field `name`.
+def read_rows(folder: Path, name: object, row: type[_R]) -> list[_R]:
+    """Return the rows of the CSV file `name` in the folder of a protocol, at most `MAX_STROKES`.
 
-    `place` is where the table lies in the protocol. Raises `ConfigError`.
-    """
-    if name in table:
-        raise ConfigError(path, f"{place}{name}", "a file is named too: give only one of the two")
-    return read_rows(path, f"{place}file", table["file"], row, at_most)
-
-
-def _tables(value: object) -> list[dict[str, Any]]:
-    if not isinstance(value, list):
-        return []
-    return [item for item in value if isinstance(item, dict)]  # pyright: ignore[reportUnknownVariableType]
-
-
-def read_rows(protocol: Path, field: str, name: object, row: type[_R], at_most: int) -> tuple[_R, ...]:
-    """Return the rows of the CSV file `name` in the folder of `protocol`.
-
-    The first line names the columns; an empty cell counts as left out. `field` is where the protocol names the file.
-    Raises `ConfigError`.
+    The first line names the columns; an empty cell counts as left out. Raises `ConfigError`, and ValueError if `name`
+    is none of a file there.
     """
     if not isinstance(name, str) or not name or Path(name).name != name or not name.isprintable() or "\\" in name:
-        raise ConfigError(protocol, field, f"must be the plain name of a file next to it (given: {name!r:.80})")
-    path = protocol.parent / name
+        raise ValueError(f"file: must be the plain name of a file next to it (given: {name!r:.80})")
+    path = folder / name
     lines = csv.reader(io.StringIO(read_text(path, MAX_TABLE_BYTES, "utf-8-sig"), newline=""), strict=True)
     rows: list[_R] = []
     try:
@@ -103,8 +70,8 @@ def read_rows(protocol: Path, field: str, name: object, row: type[_R], at_most: 
                 raise ConfigError(path, "line 1", f"the column {column!r:.80} occurs twice")
         for cells in filter(None, lines):
             line = f"line {lines.line_num}"
-            if len(rows) == at_most:
-                raise ConfigError(path, line, f"more than {at_most} rows")
+            if len(rows) == MAX_STROKES:
+                raise ConfigError(path, line, f"more than {MAX_STROKES} rows")
             if len(cells) != len(columns):
                 raise ConfigError(path, line, f"{len(cells)} cells under {len(columns)} columns")
             texts = {column: as_text(cell.strip()) for column, cell in zip(columns, cells, strict=True)}
@@ -118,7 +85,7 @@ def read_rows(protocol: Path, field: str, name: object, row: type[_R], at_most: 
         raise ConfigError(path, f"line {lines.line_num}", f"is not CSV: {error}") from None
     if not rows:
         raise ConfigError(path, "", "has no rows")
-    return tuple(rows)
+    return rows
 
 
 def _value(column: str, cell: str) -> str | float:

@@ -10,11 +10,11 @@ import math
 import random
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Annotated, ClassVar, Literal, Self, TypeVar
+from typing import Annotated, ClassVar, Literal, Self, TypeVar, cast
 
-from pydantic import AfterValidator, AliasChoices, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, AliasChoices, BaseModel, ConfigDict, Field, ValidationInfo, model_validator
 
 from brushloop.calibrate.stats import spread_out
 from brushloop.collect.protocols.steps import (
@@ -85,19 +85,9 @@ Place = tuple[Finite, Finite]
 class ProtocolBase(Config):
     """Fields and methods of every kind."""
 
-    depths_field: ClassVar[str] = "presses"
-    """The field that the error names if a depth is more than the brush can take."""
-    row: ClassVar[type[BaseModel] | None] = None
-    """Model of a row of the CSV that `file` names; the rows become `presses`."""
-
     board_every: Annotated[int, Field(ge=1, le=MAX_STROKES)] | None = None
     """Photograph the board again after this many strokes, to see whether camera or sheet moved; if left out, only at
     the start."""
-
-    @property
-    def own_patch_mm(self) -> tuple[float, float] | None:
-        """Size of the paper patch that each stroke needs; None for that of the rig, `paper.cell_mm`."""
-        return None
 
     def planned(self, layout: Layout | None = None) -> list[Planned]:
         """Every stroke exactly once, in order; none for a protocol that marks nothing.
@@ -130,7 +120,7 @@ class RoundsConfig(ProtocolBase):
             raise ValueError(f"{strokes} strokes with repeats, at most {MAX_STROKES}")
         for stroke_id, count in Counter(stroke.stroke_id for stroke in self.planned()).items():
             if count > 1:
-                raise ValueError(f"{self.depths_field}: {stroke_id!r} occurs twice")
+                raise ValueError(f"{stroke_id!r} occurs twice")
         return self
 
     def planned(self, layout: Layout | None = None) -> list[Planned]:
@@ -159,8 +149,6 @@ class RoundsConfig(ProtocolBase):
 class _DesignConfig(ProtocolBase):
     """Presses of a grid of depths and tilts."""
 
-    depths_field: ClassVar[str] = "depths_mm"
-
     depths_mm: Depths = Field(validation_alias=EARLIER_DEPTHS)
     """Depths H below the touch height."""
     tilts_deg: Tilts
@@ -184,7 +172,7 @@ class GridConfig(_DesignConfig, RoundsConfig):
     """Seed of the order."""
 
     def round(self, repeat: int) -> list[Planned]:
-        """Every cell of the grid."""
+        """Every condition of the grid."""
         conditions = [Condition(depth_mm, tilt_deg) for depth_mm in self.depths_mm for tilt_deg in self.tilts_deg]
         return [self.press(condition, repeat) for condition in conditions]
 
@@ -209,6 +197,25 @@ class FewStrokesConfig(_DesignConfig):
 # Presses one by one
 
 
+def _with_rows(
+    values: object,
+    info: ValidationInfo,
+    name: str,
+    row: type[BaseModel],
+    item: Callable[[BaseModel], object] = lambda row: row,
+) -> object:
+    """The fields of a table; where it names a CSV `file`, `name` holds an item for each row.
+
+    `info.context` reads such a file. Without it, the table is one that a session keeps, and has its rows.
+    """
+    if info.context is None or not isinstance(values, dict) or "file" not in values:
+        return cast("object", values)
+    table = cast("dict[str, object]", values)
+    if name in table:
+        raise ValueError(f"{name}: a file is named too: give only one of the two")
+    return table | {name: [item(each) for each in info.context(table["file"], row)]}
+
+
 class PressRow(Config):
     """One press of a list."""
 
@@ -223,16 +230,24 @@ class PressRow(Config):
 class _TableConfig(RoundsConfig):
     """Presses one by one, from a CSV next to `protocol.toml` or written out in it as `presses`."""
 
+    row: ClassVar[type[BaseModel]]
+    """Model of one press."""
+
     file: FileName | None = None
     """CSV with a column for each field of a press."""
     dwell_s: DwellS = 0.2
     """Time at full depth of presses that have no `dwell_s` of their own."""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _from_file(cls, values: object, info: ValidationInfo) -> object:
+        return _with_rows(values, info, "presses", cls.row)
+
 
 class ListConfig(_TableConfig):
     """Presses one by one. The CSV has a column `depth_mm` and optionally `tilt_deg`, `dwell_s` and `stroke_id`."""
 
-    row: ClassVar[type[BaseModel] | None] = PressRow
+    row = PressRow
 
     kind: Literal["list"]
     presses: Annotated[tuple[PressRow, ...], Field(min_length=1, max_length=MAX_STROKES)]
@@ -271,7 +286,7 @@ class ReplayConfig(_TableConfig):
     The CSV has the columns `stroke_id`, `depth_mm` and `tilt_deg`.
     """
 
-    row: ClassVar[type[BaseModel] | None] = ReplayRow
+    row = ReplayRow
 
     kind: Literal["replay"]
     of: StrokeId
@@ -301,18 +316,13 @@ class ReplayConfig(_TableConfig):
 
 
 class PointRow(Config):
-    """One point of a trajectory as a row of a CSV."""
+    """One point of a trajectory as a row of a CSV; the fields are in the order of a `TrajectoryPoint`."""
 
     x_mm: InCellMm
     y_mm: InCellMm
     depth_mm: PathDepthMm = Field(validation_alias=EARLIER_DEPTH)
     tilt_deg: TiltDeg = 0.0
     heading_deg: HeadingDeg = 0.0
-
-    @property
-    def point(self) -> TrajectoryPoint:
-        """The row as a tuple, in the order of `points` in a protocol."""
-        return self.x_mm, self.y_mm, self.depth_mm, self.tilt_deg, self.heading_deg
 
 
 class DrawnStroke(Config):
@@ -322,6 +332,11 @@ class DrawnStroke(Config):
     """CSV with the columns `x_mm`, `y_mm`, `depth_mm` and optionally `tilt_deg` and `heading_deg`."""
     points: Annotated[tuple[TrajectoryPoint, ...], Field(min_length=2, max_length=MAX_STROKE_POINTS)]
     """Points [x_mm, y_mm, depth_mm, tilt_deg, heading_deg]. Read from `file` where one is named."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_file(cls, values: object, info: ValidationInfo) -> object:
+        return _with_rows(values, info, "points", PointRow, lambda row: tuple(row.model_dump().values()))
 
     @model_validator(mode="after")
     def _marks(self) -> Self:
@@ -344,8 +359,6 @@ class Figure(Config):
 
 class WriteConfig(RoundsConfig):
     """Trajectories to draw: x, y, depth, tilt and heading, in the frame of the figure's own paper patch."""
-
-    depths_field: ClassVar[str] = "figures"
 
     kind: Literal["write"]
     cell_mm: tuple[CellMm, CellMm]
@@ -370,11 +383,6 @@ class WriteConfig(RoundsConfig):
         if points > MAX_POINTS:
             raise ValueError(f"{points} points in all, at most {MAX_POINTS}")
         return self
-
-    @property
-    def own_patch_mm(self) -> tuple[float, float]:
-        """The patch of one figure."""
-        return self.cell_mm
 
     def round(self, repeat: int) -> list[Planned]:
         """Every figure, under the condition of its deepest point."""

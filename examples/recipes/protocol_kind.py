@@ -6,7 +6,7 @@ it from `protocol.toml`, limits, plan, steps, resume, screen and recording then 
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 from pydantic import Field
 
@@ -17,8 +17,6 @@ from brushloop.sessions.records import Condition
 
 class StairsConfig(RoundsConfig):
     """`kind = "stairs"`: from `from_mm` to `to_mm` in `count` presses, `repeats` times."""
-
-    depths_field: ClassVar[str] = "from_mm, to_mm"
 
     kind: Literal["stairs"]
     from_mm: DeepMm

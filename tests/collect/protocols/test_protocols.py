@@ -188,7 +188,6 @@ def test_a_figure_is_one_step_that_holds_its_trajectories() -> None:
     strokes = drawn[0].drawn.strokes
     assert [len(stroke) for stroke in strokes] == [6, 6]
     assert tuple(map(tuple, strokes[0])) == config.figures[0].strokes[0].points
-    assert config.own_patch_mm == (80.0, 80.0)
     assert config.planned()[0].condition.depth_mm == 9.0
 
 
@@ -330,7 +329,7 @@ def load(folder: Path, protocol: str, csv: str | bytes | None = None):
         (LIST, 'depth_mm\n"11', r"p.csv: line 2: is not CSV"),
         (LIST, "depth_mm,stroke_id\n11,a/b\n", r"line 2: stroke_id: a name has no .*slashes"),
         (LIST, "depth_mm,stroke_id\n11,\x1b[2J\n", r"line 2: stroke_id: .*control"),
-        (LIST, "depth_mm,stroke_id\n11,a\n12,a\n", r"presses: 'a' occurs twice"),
+        (LIST, "depth_mm,stroke_id\n11,a\n12,a\n", r"'a' occurs twice"),
         (LIST, None, r"p.csv: no such file"),
         (LIST.replace("p.csv", "../p.csv"), None, r"protocol.toml: file: must be the plain name of a file next to it"),
         (LIST.replace("p.csv", "/etc/passwd"), None, r"file: must be the plain name"),
@@ -341,7 +340,7 @@ def load(folder: Path, protocol: str, csv: str | bytes | None = None):
         (REPLAY, "stroke_id,depth_mm\na,11\n", r"line 2: tilt_deg: Field required"),
         (REPLAY, "stroke_id,depth_mm,tilt_deg\na,11,-0.2\n", r"line 2: tilt_deg: .* greater than or equal to 0"),
         (REPLAY.replace("old", "a b"), "stroke_id,depth_mm,tilt_deg\na,11,0\n", r"of: a name has no spaces"),
-        (WRITE + 'file = "p.csv"\n' + POINTS, None, r"figures.0.strokes.0.points: a file is named too"),
+        (WRITE + 'file = "p.csv"\n' + POINTS, None, r"figures.0.strokes.0: points: a file is named too"),
         (WRITE + 'file = "p.csv"\n', "x_mm,y_mm,depth_mm\n1,1,3\n70,1,3\n", r"the point \[70, 1\] lies outside"),
         (WRITE + 'file = "p.csv"\n', "x_mm,y_mm,depth_mm\n1,1,3\n1.5,1,3\n", r"point 2 is less than 1 mm from"),
         (WRITE + 'file = "p.csv"\n', "x_mm,y_mm,depth_mm\n1,1,3\n", r"figures.0.strokes.0.points: .*at least 2"),

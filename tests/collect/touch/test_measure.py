@@ -21,7 +21,7 @@ from brushloop.collect.touch import camera
 from brushloop.collect.touch.heights import Touch, at_one_point, plane_of, used_patches
 from brushloop.collect.touch.measure import measure_plane
 from brushloop.collect.touch.selfcheck import partners, self_check, triangle_on
-from brushloop.collect.walk import check_step, moves_of
+from brushloop.collect.walk import check_poses, moves_of, step_poses
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import MotionFailed
 from brushloop.sessions.events import ZeroTouchResult
@@ -292,6 +292,6 @@ def test_a_touch_that_the_operator_asks_for_by_key_is_checked_before_it(make_ben
         }
     )
     plane = PaperPlane(config.paper.touch_z_mm)
-    check_step(Path("rig.toml"), there, plane, TOUCH)
+    check_poses(Path("rig.toml"), there, step_poses(there, plane, TOUCH))
     with pytest.raises(ConfigError, match=r"y = -10\.000 mm is outside .*zero_touch"):
-        check_step(Path("rig.toml"), there, plane, replace(TOUCH, method="jog"))
+        check_poses(Path("rig.toml"), there, step_poses(there, plane, replace(TOUCH, method="jog")))
