@@ -44,7 +44,7 @@ def show(
     session: Session,
     as_json: Annotated[bool, typer.Option("--json", help="Everything, as one JSON object.")] = False,
 ) -> None:
-    """Show what is in a session: steps, strokes per cell of the grid, sheets, devices."""
+    """Show what is in a session: steps, strokes per condition, sheets, devices."""
     from pydantic import TypeAdapter
 
     from brushloop.sessions.show import Details, details, renderables

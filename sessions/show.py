@@ -1,4 +1,4 @@
-"""Contents of one session (steps, strokes per cell of the grid, sheets, devices), and lists of sessions.
+"""Contents of one session (steps, strokes per condition, sheets, devices), and lists of sessions.
 
 Only journals and headers are read, no photographs.
 """

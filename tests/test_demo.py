@@ -60,8 +60,8 @@ def test_killed_in_mid_collection_the_same_command_ends_with_every_stroke_exactl
     session, again = sorted((out / "sessions").iterdir())
     for folder in (session, again):
         begun = [line for line in read_lines(folder / "journal.jsonl") if line["event"] == "begin"]
-        cells = [(line["sheet"], patch) for line in begun for patch in line.get("patches", [])]
-        assert len(cells) == len(set(cells)), "no cell is ever pressed twice"
+        patches = [(line["sheet"], patch) for line in begun for patch in line.get("patches", [])]
+        assert len(patches) == len(set(patches)), "no patch is ever pressed twice"
         assert verify_session(folder).sound
     strokes = [capture.stroke for capture in Recording(session).captures()]
     assert len(strokes) == 4
@@ -80,6 +80,6 @@ def test_killed_in_mid_collection_the_same_command_ends_with_every_stroke_exactl
     assert "pix2len" not in ran.stdout
     report = load_report(Path(printed[1]).with_name("report.json"))
     rows = {row.label: row.scores for row in table_1(report)}
-    assert rows.pop("another press") is rows.pop("ceiling") is None  # no cell was pressed twice
+    assert rows.pop("another press") is rows.pop("ceiling") is None  # no condition was pressed twice
     assert set(rows) == {"CCD-BSM", "CCD-BSMG", "robot writing", "CCD-BSM calibrated"}
     assert None not in rows.values()

@@ -307,12 +307,12 @@ def twin_toml(twin: Twin, session_id: str, noise_gray: float | None) -> Iterator
         yield f"{one.constant.name} = {one.value:.6g}    # {unit}{known}; default {one.constant.default:.4g}"
     for row in twin.held_out:
         scores = f"CSIM {row.csim:.2f} %, SSIM {row.ssim:.2f} %, n = {row.n}"
-        yield f"# a third of the cells left out in turn: {row.model}: {scores}"
+        yield f"# a third of the conditions left out in turn: {row.model}: {scores}"
     if twin.spread is None:
-        yield "# No cell has three captures: how presses differ is left as in the default brush."
+        yield "# No condition has three captures: how presses differ is left as in the default brush."
     else:
         yield (
-            f"# two presses of a cell: CSIM {twin.spread.captured_percent:.2f} % captured, "
+            f"# two presses of a condition: CSIM {twin.spread.captured_percent:.2f} % captured, "
             f"{twin.spread.twin_percent:.2f} % from the twin"
         )
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from brushloop.model.ccdbsm import Brush, CcdBsm, ccdbsm
 from brushloop.model.outline import Array, Outline, as_batch
 
-# The paper's H and alpha; H as a share of its brush's 48 mm, so that the cells lie in the domain of any brush.
+# The paper's H and alpha; H as a share of its brush's 48 mm, so that the conditions lie in the domain of any brush.
 DEPTHS = tuple(depth_mm / 48 for depth_mm in (11.0, 13.0, 15.0, 17.0, 20.0))
 TILTS_DEG = (0.0, 5.0, 10.0)
 Profile = Callable[[Array, Array], Outline]
@@ -79,7 +79,7 @@ class Basis:
         return ccdbsm(self.brush, depth_mm, tilt_deg, self.lam)
 
     def regressed(self, measure: Callable[[CcdBsm], Mapping[str, Array]]) -> Callable[[Array, Array], dict[str, Array]]:
-        """A function (H, alpha) -> parameters: `measure` of the marks at the paper's 15 cells, regressed on first use.
+        """A function (H, alpha) -> parameters: `measure` of the marks at the paper's 15 conditions, regressed once.
 
         Without captures the regression adds no information about real ink. The function raises DomainError where
         CCD-BSM has no mark.
@@ -90,8 +90,8 @@ class Basis:
             self.mark(depth_mm, tilt_deg)
             if not planes:
                 length_mm = float(np.ravel(self.brush.length_mm)[0])
-                cells = np.meshgrid(np.multiply(length_mm, DEPTHS), TILTS_DEG, indexing="ij")
-                depth, tilt = (part.ravel() for part in cells)
+                conditions = np.meshgrid(np.multiply(length_mm, DEPTHS), TILTS_DEG, indexing="ij")
+                depth, tilt = (part.ravel() for part in conditions)
                 planes.append(fit_plane(depth, tilt, measure(self.mark(depth, tilt))))
             return planes[0].at(*as_batch(depth_mm, tilt_deg))
 
@@ -103,7 +103,7 @@ class Plane:
     """Parameters as c0 + c1 H + c2 H alpha: `coefficients` (P, 3) for the P `names`.
 
     Wang and Min regress a Bezier stroke's lengths on the descending height and the tilt angle. Here the effect of tilt
-    is proportional to depth, as is every length of CCD-BSM, so a regressed stroke stays valid far from the cells.
+    is proportional to depth, as is every length of CCD-BSM, so a regressed stroke stays valid far from the conditions.
     """
 
     names: tuple[str, ...]
@@ -118,14 +118,14 @@ class Plane:
 def fit_plane(depth_mm: Array, tilt_deg: Array, values: Mapping[str, Array]) -> Plane:
     """The least-squares fit to values (N,) at H and alpha (N,), for captures or marks alike.
 
-    Raises ValueError if the cells do not span a plane: at least two depths and two tilts are needed.
+    Raises ValueError if the conditions do not span a plane: at least two depths and two tilts are needed.
     """
     depth, tilt = np.asarray(depth_mm, np.float64), np.asarray(tilt_deg, np.float64)
     design = np.column_stack([np.ones_like(depth), depth, depth * tilt])
     targets = np.column_stack([np.asarray(value, np.float64) for value in values.values()])
     coefficients, _, rank, _ = np.linalg.lstsq(design, targets)
     if rank < 3:
-        raise ValueError(f"{len(design)} cells do not span depth and tilt: two depths and two tilts are needed")
+        raise ValueError(f"{len(design)} conditions do not span depth and tilt: two depths and two tilts are needed")
     return Plane(tuple(values), coefficients.T)
 
 

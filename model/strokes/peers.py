@@ -35,7 +35,7 @@ def models(basis: Basis) -> tuple[StrokeModel, ...]:
         "bezier": (
             "Bezier",
             "Two mirrored cubic Bezier curves; tip, belly, base and shoulder are regressed on (H, alpha) "
-            "from CCD-BSM's marks at the paper's 15 cells.",
+            "from CCD-BSM's marks at the paper's 15 conditions.",
             lambda h, a: bezier(**sizes(h, a)),
         ),
         "ellipse": (
@@ -56,7 +56,7 @@ def models(basis: Basis) -> tuple[StrokeModel, ...]:
         "qbc": (
             "QBC",
             "A disc of evenly changing width moved along a quadratic Bezier curve; its 8 parameters are "
-            "regressed on (H, alpha) from CCD-BSM's marks at the paper's 15 cells.",
+            "regressed on (H, alpha) from CCD-BSM's marks at the paper's 15 conditions.",
             lambda h, a: qbc(**discs(h, a)),
         ),
     }

@@ -42,11 +42,11 @@ def presses(draw: st.DrawFn) -> tuple[Brush, float, float]:
     return brush, draw(st.floats(0.01, 0.999)) * deepest_mm, tilt_deg
 
 
-@pytest.mark.parametrize("cell", TABLE)
-def test_lengths_match_the_published_grid(cell: tuple[int, int]) -> None:
-    mark = ccdbsm(BRUSH, *cell)
+@pytest.mark.parametrize("condition", TABLE)
+def test_lengths_match_the_published_grid(condition: tuple[int, int]) -> None:
+    mark = ccdbsm(BRUSH, *condition)
     ours = [mark.o3a_mm, mark.o3c_mm, mark.o4o3_mm, mark.length_mm, mark.width_mm]
-    assert [value.item() for value in ours] == pytest.approx(TABLE[cell], abs=1e-3)
+    assert [value.item() for value in ours] == pytest.approx(TABLE[condition], abs=1e-3)
 
 
 @given(presses())

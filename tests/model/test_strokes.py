@@ -120,7 +120,7 @@ def test_strokes_that_fold_over_are_refused() -> None:
         swept([(-1.0, 0.0), (0.0, 0.0), (1.0, 0.0)], 0.4, 12.0)
 
 
-def test_a_plane_is_fitted_and_needs_three_cells() -> None:
+def test_a_plane_is_fitted_and_needs_three_conditions() -> None:
     depth, tilt = (part.ravel() for part in np.meshgrid(DEPTHS, [0.0, 10.0]))
     plane = fit_plane(depth, tilt, {"tip_mm": 0.5 + depth * (1.1 - 0.002 * tilt)})
     assert plane.coefficients[0].tolist() == pytest.approx([0.5, 1.1, -0.002])

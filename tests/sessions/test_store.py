@@ -30,7 +30,7 @@ def test_an_existing_folder_is_refused_and_left_as_it_is(make, tmp_path):
     assert list((tmp_path / "s").iterdir()) == []
 
 
-def test_attempts_cells_and_results_are_kept_across_processes(make, store, resume):
+def test_attempts_patches_and_results_are_kept_across_processes(make, store, resume):
     make.perform(store, "H13-a05", 0)
     store.void(store.begin("H15-a05", StepKind.PRESS, patches=(1, 36)), "stopped by the operator")
     second = resume(store)
@@ -43,7 +43,7 @@ def test_attempts_cells_and_results_are_kept_across_processes(make, store, resum
     assert resume(second).state.attempts == {"H13-a05": 1, "H15-a05": 2}
 
 
-def test_a_fresh_sheet_frees_its_cells_and_stays_fresh(make, store, resume):
+def test_a_fresh_sheet_frees_its_patches_and_stays_fresh(make, store, resume):
     make.perform(store, "H13-a05", 0)
     store.fresh_sheet()
     make.perform(store, "H15-a05", 0)

@@ -26,13 +26,13 @@ from tests.photographed import imported_presses
 from tests.twin.test_search import Serial
 from tests.waiting import wait_until
 
-CELLS = [(height, tilt) for height in (3.0, 4.0, 5.0) for tilt in (0.0, 5.0)]
+CONDITIONS = [(height, tilt) for height in (3.0, 4.0, 5.0) for tilt in (0.0, 5.0)]
 
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("sessions") / "presses"
-    return imported_presses(tmp_path_factory.mktemp("photos"), out, CELLS, (200, 320), (250, 100))
+    return imported_presses(tmp_path_factory.mktemp("photos"), out, CONDITIONS, (200, 320), (250, 100))
 
 
 @contextmanager
@@ -73,9 +73,9 @@ def test_a_session_gets_a_twin_and_a_run_that_was_broken_off_goes_on(
     assert searched == [1.0, 0.5]
 
     said = twin(session, out)
-    assert searched == [1.0, 0.5] * (1 + PARTS)  # those of all cells were not repeated
-    unknown = "No cell has three captures", "The camera's noise was not measured"
-    for words in ("friction", "a third of the cells left out in turn", "next: brushloop sim --brush", *unknown):
+    assert searched == [1.0, 0.5] * (1 + PARTS)  # those of all conditions were not repeated
+    unknown = "No condition has three captures", "The camera's noise was not measured"
+    for words in ("friction", "a third of the conditions left out in turn", "next: brushloop sim --brush", *unknown):
         assert words in said
     assert load_brush(out).name == "simulated bristle bundle (twin of presses, simulated)"
     with pytest.raises(CalibrationError, match="exists: give --out FILE or --replace"):

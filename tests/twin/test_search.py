@@ -32,7 +32,7 @@ from brushloop.twin.search import (
 )
 
 GRID = Grid(np.arange(-20.0, 6.0, 0.4), np.arange(8.0, -8.0, -0.4))
-CELLS = ((3.0, 0.0), (4.0, 5.0))
+CONDITIONS = ((3.0, 0.0), (4.0, 5.0))
 BASE = BrushSpec(seed=0)
 
 
@@ -75,28 +75,28 @@ def test_a_mark_has_the_area_and_the_place_of_the_press_that_it_stands_for() -> 
 
 
 def test_the_quality_limits_hold_for_other_presses_of_the_brush() -> None:
-    grid, cells = field_grid(), [(11.0, 0.0), (20.0, 0.0), (11.0, 10.0), (20.0, 10.0)]
+    grid, conditions = field_grid(), [(11.0, 0.0), (20.0, 0.0), (11.0, 10.0), (20.0, 10.0)]
     brush = Brush(load_brush(Path(PAPER)).brush)
-    head = sound_head(brush.spec, cells, grid)
+    head = sound_head(brush.spec, conditions, grid)
     assert head is not None
-    for depth_mm, tilt_deg in cells:
+    for depth_mm, tilt_deg in conditions:
         mark = brush.press(depth_mm, tilt_deg, ink_load=1.0, press_seed=7)
         columns = np.flatnonzero((mark.density > 0.5).any(axis=0))
         begins_mm = (columns[-1] + 1 - mark.origin_px[0]) / mark.px_per_mm
         assert abs(begins_mm - head.head_mm) < head.misplaced_mm - 0.5
-    default = sound_head(BrushSpec(), cells, grid)
+    default = sound_head(BrushSpec(), conditions, grid)
     assert default is not None
     assert default.misplaced_mm == LEAST_MISPLACED_MM == QualityConfig().misplaced_mm
     assert default.head_mm == pytest.approx(QualityConfig().head_mm, abs=0.3)
-    assert sound_head(BrushSpec(), cells[:1], replace(grid, y_mm=grid.y_mm + 50.0)) is None
+    assert sound_head(BrushSpec(), conditions[:1], replace(grid, y_mm=grid.y_mm + 50.0)) is None
 
 
 def test_a_search_comes_nearer_to_a_brush_that_gives_ink_from_higher_over_the_paper(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("brushloop.twin.search.STEPS", 2)
-    ink = draw(replace(BASE, film_mm=1.0), (0.0, 0.4, 0.0), CELLS, GRID, repeats=2, first_seed=50)
-    target = Target(BASE, CELLS, GRID, ink.mean(axis=1))
+    ink = draw(replace(BASE, film_mm=1.0), (0.0, 0.4, 0.0), CONDITIONS, GRID, repeats=2, first_seed=50)
+    target = Target(BASE, CONDITIONS, GRID, ink.mean(axis=1))
     before = start()
     after = search(target, before, Serial(), 0.5)
     squares = [float((off(target, 0, 0.5, one.point) ** 2).sum()) for one in (before, after)]
@@ -106,8 +106,8 @@ def test_a_search_comes_nearer_to_a_brush_that_gives_ink_from_higher_over_the_pa
 
 def test_the_individual_nearest_to_the_captures_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("brushloop.twin.search.INDIVIDUALS", range(4))
-    ink = draw(replace(BASE, seed=2), HERE, CELLS, GRID)
-    assert choose_individual(Target(BASE, CELLS, GRID, ink[:, 0]), start(), Serial()).seed == 2
+    ink = draw(replace(BASE, seed=2), HERE, CONDITIONS, GRID)
+    assert choose_individual(Target(BASE, CONDITIONS, GRID, ink[:, 0]), start(), Serial()).seed == 2
 
 
 def test_what_the_parts_disagree_on_is_not_determined() -> None:
@@ -120,8 +120,8 @@ def test_what_the_parts_disagree_on_is_not_determined() -> None:
 
 @pytest.mark.parametrize(("name", "value", "least"), [("place_wander_mm", 0.4, 0.25), ("reach_wander_mm", 1.0, 0.2)])
 def test_presses_that_differ_more_give_a_wider_spread_of_that_kind(name: str, value: float, least: float) -> None:
-    captured = draw(replace(BrushSpec(), **{name: value}), HERE, CELLS, GRID, repeats=6, first_seed=70)
-    found = fit_spread(BrushSpec(), HERE, dict(zip(CELLS, captured, strict=True)), GRID, Serial())
+    captured = draw(replace(BrushSpec(), **{name: value}), HERE, CONDITIONS, GRID, repeats=6, first_seed=70)
+    found = fit_spread(BrushSpec(), HERE, dict(zip(CONDITIONS, captured, strict=True)), GRID, Serial())
     brush = with_values(BrushSpec(), SPREAD, found.point)
     assert least < getattr(brush, name) < 1.5 * value
     assert brush.strand_mm < 0.2
@@ -138,10 +138,10 @@ def test_the_shape_is_found_with_hairs_that_stray_as_those_of_the_captures(monke
     for name, value in {"COARSE_MM": (1.0,), "FINE_MM": 0.5, "search": counted}.items():
         monkeypatch.setattr(f"brushloop.twin.run.{name}", value)
     monkeypatch.setattr("brushloop.twin.search.INDIVIDUALS", range(1))
-    cell = (3.0, 0.0)
+    condition = (3.0, 0.0)
     brush = replace(BrushSpec(), strand_mm=0.5)
-    captured = draw(brush, HERE, [cell], GRID, repeats=4)[0]
-    presses = Presses(brush.radius_mm, brush.length_mm, GRID, np.array([cell] * 4), captured)
+    captured = draw(brush, HERE, [condition], GRID, repeats=4)[0]
+    presses = Presses(brush.radius_mm, brush.length_mm, GRID, np.array([condition] * 4), captured)
     twin = fit_twin(presses, Serial())
     assert strays == [(1.0, BrushSpec().strand_mm), (0.5, pytest.approx(twin.spec.strand_mm, rel=0.2))]
     assert twin.spec.strand_mm > BrushSpec().strand_mm

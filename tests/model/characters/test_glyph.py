@@ -49,10 +49,10 @@ def test_an_outline_is_a_closed_loop_counter_clockwise_whichever_way_it_was_draw
         assert 0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) == pytest.approx(200.0**2)
 
 
-def test_ways_lie_on_the_cell_with_the_foot_of_the_font_at_its_margin() -> None:
-    cell = Patch(70.0)
-    assert cell.to_mm(np.array([[0.0, -124.0], [1024.0, 900.0]])).tolist() == [[6.0, 6.0], [64.0, 64.0]]
-    for path in paths_of(parse_glyph(shipped("永")), cell, 2.0):
+def test_ways_lie_on_the_patch_with_the_foot_of_the_font_at_its_margin() -> None:
+    patch = Patch(70.0)
+    assert patch.to_mm(np.array([[0.0, -124.0], [1024.0, 900.0]])).tolist() == [[6.0, 6.0], [64.0, 64.0]]
+    for path in paths_of(parse_glyph(shipped("永")), patch, 2.0):
         assert np.all(path.half_width_mm > 0)
         steps = np.linalg.norm(np.diff(path.points, axis=0), axis=1)
         assert steps.max() < 3.0

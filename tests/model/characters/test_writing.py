@@ -18,7 +18,7 @@ from brushloop.model.raster import coverage
 from brushloop.model.strokes import stroke_model
 
 MODEL = stroke_model("ccd-bsm", Brush())
-CELL = Patch(60.0)
+PATCH = Patch(60.0)
 REACH = Reach()
 
 
@@ -93,10 +93,10 @@ def test_the_slopes_of_an_image_are_those_of_every_number_of_a_press() -> None:
 def test_refinement_brings_a_character_to_its_image_within_reach() -> None:
     text = (files("brushloop.model.characters") / "data" / "子.json").read_text("utf-8")
     glyph = parse_glyph(text)
-    wanted = reference(glyph, CELL, 64)
-    first = [trajectory(path, MODEL, REACH, CELL, 5.0) for path in paths_of(glyph, CELL, 2.5)]
-    better = refine(MODEL, first, wanted, CELL.side_mm, REACH, 25)
-    before, after = (np.square(written(MODEL, one, CELL.side_mm, 64) - wanted).mean() for one in (first, better))
+    wanted = reference(glyph, PATCH, 64)
+    first = [trajectory(path, MODEL, REACH, PATCH, 5.0) for path in paths_of(glyph, PATCH, 2.5)]
+    better = refine(MODEL, first, wanted, PATCH.side_mm, REACH, 25)
+    before, after = (np.square(written(MODEL, one, PATCH.side_mm, 64) - wanted).mean() for one in (first, better))
     assert after < 0.15 * before
     for points in (*first, *better):
         assert_feasible(points, REACH)
