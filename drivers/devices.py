@@ -1,11 +1,11 @@
-"""The devices of a rig as the engine sees them, and the samples that they give.
+"""What the devices of a rig take and give, and what an ink device must be able to do.
 
-A sample is frozen and has the time at which it was taken and its place in the sequence.
+A sample is frozen and has the time at which it was taken and its place in the sequence. There is one driver for the
+arm, one for cameras and one for the force sensor; ink devices come in several kinds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
@@ -95,121 +95,6 @@ class Identity:
     firmware: str
     simulated: bool
     """True if the device itself says that it is the loopback rig, or shows a recording; never from configuration."""
-
-
-@runtime_checkable
-class Robot(Protocol):
-    """An arm with a brush. All poses are of the brush tip, in the base frame."""
-
-    async def connect(self) -> Identity:
-        """Open the connections, learn who answers, start telemetry; powers nothing."""
-        ...
-
-    async def enable(self) -> None:
-        """Power the arm and release its brakes; moves nothing."""
-        ...
-
-    async def move(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
-        """Move the tip in a straight line; returns when the arm has settled within tolerance.
-
-        The whole line is checked, from where the arm is. Raises `ArmMoved` if the arm is not where it was left, and
-        `SettingsChanged` before a line down if tool, payload or speed differ from what was set.
-        """
-        ...
-
-    async def follow(self, poses: Sequence[Pose], *, speed_mm_s: float, acc_mm_s2: float, blend_mm: float) -> None:
-        """Move the tip through all poses without halting between them; returns when it has settled at the last.
-
-        Corners may be rounded within `blend_mm` of a pose. Every pose is checked before the arm moves.
-        """
-        ...
-
-    async def sequence(self, lines: Sequence[QueuedLine], *, acc_mm_s2: float) -> list[Pose]:
-        """Send all lines to the arm's controller, then start them: once started, they are carried out to the end even
-        if this program dies. Returns the poses seen meanwhile.
-
-        Every pose is checked before anything is sent. The last one must differ from where the arm starts. A stop drops
-        all lines.
-        """
-        ...
-
-    async def stop(self) -> None:
-        """Stop now. Idempotent, from any state, never queued behind a slow call. Not an emergency stop."""
-        ...
-
-    def latest(self) -> PoseSample:
-        """The newest pose; never blocks. Raises `Stale` when it is too old to act on."""
-        ...
-
-    async def where(self) -> Pose:
-        """Ask the controller for the pose."""
-        ...
-
-    def pose_lag_ms(self) -> float | None:
-        """How late poses arrived during the last motions, measured against `where`; None if that is not known."""
-        ...
-
-    async def confirm(self) -> None:
-        """Raise `NotPowered`, `SettingsChanged` or `ArmMoved` if the arm is not as it was left; sets nothing."""
-        ...
-
-    async def take_up(self) -> Pose:
-        """Accept the place where the arm rests as the start of the next move. Raises while it moves."""
-        ...
-
-    def listen(self, on_sample: Callable[[PoseSample], None] | None) -> None:
-        """Hand every pose sample to `on_sample`, in the event loop; None ends it."""
-        ...
-
-    def check(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
-        """Raise `LimitExceeded` where the target leaves the workspace box, floor, tilt cone or speed cap."""
-        ...
-
-    async def close(self) -> None:
-        """Stop, then close the connections. The arm stays where it is, powered."""
-        ...
-
-
-@runtime_checkable
-class Camera(Protocol):
-    """A camera that looks at the sheet."""
-
-    async def connect(self) -> Identity:
-        """Open the stream and wait for the first frame."""
-        ...
-
-    async def fresh(self, after: Stamp) -> Frame:
-        """The first frame exposed after `after`, never an older buffered one. Raises `DeviceTimeout`."""
-        ...
-
-    async def close(self) -> None:
-        """Release the camera; joins the grabber thread."""
-        ...
-
-
-@runtime_checkable
-class ForceSensor(Protocol):
-    """A force sensor between flange and brush; optional in a rig."""
-
-    async def connect(self) -> Identity:
-        """Open the bus, start the stream and wait for the first sample."""
-        ...
-
-    def latest(self) -> ForceSample:
-        """The newest sample; never blocks. Raises `Stale`."""
-        ...
-
-    def listen(self, on_sample: Callable[[ForceSample], None] | None) -> None:
-        """Hand every sample to `on_sample`, in the event loop; None ends it."""
-        ...
-
-    async def bias(self, seconds: float) -> None:
-        """Average for `seconds` with nothing touching, and subtract that from now on."""
-        ...
-
-    async def close(self) -> None:
-        """Stop the stream and release the bus."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

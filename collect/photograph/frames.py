@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from brushloop.collect.errors import StepError
 from brushloop.collect.rig.config import CameraConfig
-from brushloop.drivers.devices import Camera, Frame, Stamp
+from brushloop.drivers.camera import OpenCvCamera
+from brushloop.drivers.devices import Frame, Stamp
 
 Gray = NDArray[np.uint8]
 Thumbnail = NDArray[np.float32]
@@ -130,7 +131,7 @@ class Frames:
         self._waiting = _Waiting(condition, loop.time() + within_s, loop.create_future())
         return await self._waiting.answer
 
-    async def follow(self, camera: Camera) -> None:
+    async def follow(self, camera: OpenCvCamera) -> None:
         """Take frame after frame, until cancelled or the camera fails."""
         after = Stamp(0)
         try:
@@ -162,7 +163,7 @@ class Frames:
 
 
 @contextlib.asynccontextmanager
-async def watching(camera: Camera, reference: Thumbnail | None) -> AsyncGenerator[Frames]:
+async def watching(camera: OpenCvCamera, reference: Thumbnail | None) -> AsyncGenerator[Frames]:
     """Within the block, follow the frames; `reference` is the view without the arm."""
     frames = Frames(reference)
     task = asyncio.create_task(frames.follow(camera), name="camera frames")

@@ -24,7 +24,9 @@ from brushloop.calibrate.stats import student_95
 from brushloop.collect.errors import ArmInPicture, CameraLate
 from brushloop.collect.photograph.frames import ARM_SHARE, FrameChange, Frames, Thumbnail, View, watching
 from brushloop.collect.rig.config import CameraConfig
-from brushloop.drivers.devices import Camera, Frame, Robot
+from brushloop.drivers.arcs.robot import AuboArcs
+from brushloop.drivers.camera import OpenCvCamera
+from brushloop.drivers.devices import Frame
 from brushloop.drivers.errors import DeviceError
 from brushloop.drivers.host import Clock
 
@@ -196,7 +198,9 @@ class ArmTrips:
 class Photographer:
     """One camera over one sheet, for one run."""
 
-    def __init__(self, robot: Robot, camera: Camera, config: CameraConfig, clock: Clock, trips: ArmTrips) -> None:
+    def __init__(
+        self, robot: AuboArcs, camera: OpenCvCamera, config: CameraConfig, clock: Clock, trips: ArmTrips
+    ) -> None:
         self._robot = robot
         self._camera = camera
         self._config = config

@@ -32,10 +32,11 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.rig.config import PREFIX, RigConfig
 from brushloop.collect.rig.devices import make_robot
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, RobotMode, survey
+from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.arcs.telemetry import rtde_answers
 from brushloop.drivers.arcs.wire import Framing
 from brushloop.drivers.camera import OpenCvCamera
-from brushloop.drivers.devices import Camera, ForceSensor, Identity, Ink, Robot, Stamp
+from brushloop.drivers.devices import Identity, Ink, Stamp
 from brushloop.drivers.errors import DeviceError
 from brushloop.drivers.force.sri_m8123 import ForceTable, SriM8123
 from brushloop.drivers.host import Clock
@@ -101,7 +102,7 @@ async def examine(config: RigConfig, clock: Clock) -> list[Finding]:
 
 
 @contextlib.asynccontextmanager
-async def _connected(device: Camera | ForceSensor | Ink | Robot) -> AsyncGenerator[Identity]:
+async def _connected(device: AuboArcs | OpenCvCamera | SriM8123 | Ink) -> AsyncGenerator[Identity]:
     """Connect a device for the block."""
     try:
         yield await device.connect()

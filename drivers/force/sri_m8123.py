@@ -291,7 +291,7 @@ def command(data: bytes) -> can.Message:
 
 
 class SriM8123:
-    """`ForceSensor` over a `RoundStream`; samples reach listeners in the event loop that connected."""
+    """The force sensor behind a `RoundStream`; samples reach listeners in the event loop that connected."""
 
     def __init__(self, table: ForceTable, clock: Clock) -> None:
         self._table = table

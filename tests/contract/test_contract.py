@@ -1,4 +1,4 @@
-"""What a `Robot` promises, whoever answers: the loopback controller in either framing, or the arm of `--rig`.
+"""What the arm promises, whoever answers: the loopback controller in either framing, or the arm of `--rig`.
 
 Tests that power or move the arm are marked `moves`; each begins where the arm stands and brings it back there.
 """

@@ -16,7 +16,7 @@ import can
 import pytest
 from can.interfaces.virtual import VirtualBus
 
-from brushloop.drivers.devices import ForceSample, ForceSensor
+from brushloop.drivers.devices import ForceSample
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected, Stale, Stuck
 from brushloop.drivers.force import sri_m8123
 from brushloop.drivers.force.simulator import CanFrame, ForceBoard
@@ -96,7 +96,6 @@ def readers() -> int:
 
 async def test_connecting_starts_the_board_and_closing_stops_it(board: ForceBoard, channel: str):
     sensor = sensor_on(channel)
-    assert isinstance(sensor, ForceSensor)
     identity = await sensor.connect()
     assert identity.model == f"SRI M8123B2 on virtual {channel}"
     assert identity.simulated

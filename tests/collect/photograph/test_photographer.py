@@ -28,7 +28,7 @@ OUT_MM, IN_MM = 60.0, 120.0
 
 @dataclass
 class Theatre:
-    """`Robot` and `Camera` as far as a photographer needs them; every delay is in seconds of the loop's time."""
+    """Arm and camera as far as a photographer needs them; every delay is in seconds of the loop's time."""
 
     delay: Callable[[float], float]
     """By the time of exposure, in s since the start."""

@@ -47,7 +47,7 @@ class OwnClock:
 
 @dataclass
 class Bench:
-    """`Robot`, `Camera`, `ForceSensor` and `Clock` over one world, and the rig that they are."""
+    """Arm, camera, force sensor and clock over one world, and the rig that they are."""
 
     sim: SimConfig
     folder: Path

@@ -12,7 +12,6 @@ from brushloop.drivers.arcs import stopping, wire
 from brushloop.drivers.arcs.controller import RobotMode, SafetyMode
 from brushloop.drivers.arcs.motion import planned_s
 from brushloop.drivers.arcs.robot import AuboArcs
-from brushloop.drivers.devices import Robot
 from brushloop.drivers.errors import (
     ConnectionLost,
     DeviceError,
@@ -39,7 +38,6 @@ Break = Callable[[AuboArcs, ArcsServer], None]
 
 async def test_connecting_reports_who_answers_and_where_the_tool_is(cabinet: ArcsServer, make_arm: MakeArm):
     arm = make_arm()
-    assert isinstance(arm, Robot)
     with pytest.raises(NotConnected):
         arm.latest()
     identity = await arm.connect()
