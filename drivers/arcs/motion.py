@@ -51,12 +51,10 @@ def arrived(here: Pose, target: Pose) -> bool:
     return off_mm <= ARRIVED_MM and off_deg <= ARRIVED_DEG
 
 
-Look = Callable[[], Awaitable[tuple[bool, Pose]]]
-"""Asks whether the arm rests, and where its tip is."""
-
-
-async def until_settled(look: Look, target: Pose, planned_s: float, *, patient: bool = False) -> None:
-    """Return once `look` reports that the arm rests where it was sent.
+async def until_settled(
+    look: Callable[[], Awaitable[tuple[bool, Pose]]], target: Pose, planned_s: float, *, patient: bool = False
+) -> None:
+    """Return once `look`, which tells whether the arm rests and where its tip is, reports that it rests at `target`.
 
     Raises `MotionFailed` if the arm rests elsewhere, or if twice the planned time has passed and it comes no nearer: an
     arm whose speed was turned down on the pendant is slow, not stuck. If `patient`, an answer that cannot be read is an
@@ -160,26 +158,23 @@ async def feed(
     legs: Sequence[Leg],
     acc_mm_s2: float,
     *,
-    stopped: Callable[[], bool],
+    go: Callable[[], None],
     notice: Callable[[str], None],
 ) -> None:
     """Queue every leg, at most `MOST_QUEUED` at a time; return once the last one is queued.
 
-    Raises `RobotNotSafe`, `MotionRefused`, and `MotionFailed` where the arm was stopped meanwhile or does not advance.
+    `go` raises if the arm was stopped: it is asked before every line, with nothing awaited between, because after a
+    stop none may follow. Raises `RobotNotSafe`, `MotionRefused`, and `MotionFailed` where the arm was stopped meanwhile
+    or does not advance.
     """
     loop = asyncio.get_running_loop()
     room, sent = MOST_QUEUED, 0
     queue, advanced_at = EMPTY, loop.time()
 
-    def require_not_stopped() -> None:
-        # Checked before every line, with nothing awaited between: after a stop none may follow.
-        if stopped():
-            raise _cut_short(sent, len(legs), "the arm was stopped")
-
     await controller.require_safe("moveLine")
     while True:
         while sent < len(legs) and room > 0:
-            require_not_stopped()
+            go()
             leg = legs[sent]
             try:
                 await controller.move_line(leg.target, leg.speed_mm_s, acc_mm_s2, leg.blend_mm)
@@ -191,13 +186,14 @@ async def feed(
         if sent == len(legs):
             return
         await asyncio.sleep(POLL_S)
-        require_not_stopped()
+        go()
         await controller.require_safe("moveLine")
         before, queue, now = queue, await controller.queue(), loop.time()
         if queue != before:
             advanced_at = now
         elif now - advanced_at > STUCK_S + 2.0 * max(leg.seconds for leg in legs[:sent]):
-            raise _cut_short(sent, len(legs), "the arm does not advance")
+            what = f"the arm does not advance, after {sent} of {len(legs)} points were sent"
+            raise MotionFailed(DEVICE, "follow", what)
         room = max(MOST_QUEUED - queue[1], 0)
         if queue == EMPTY:
             # The lines came too late; or the arm has not begun, or another client stopped it: then nothing may follow.
@@ -207,34 +203,25 @@ async def feed(
                 room = 0
 
 
-def _cut_short(sent: int, legs: int, why: str) -> MotionFailed:
-    return MotionFailed(DEVICE, "follow", f"{why}, after {sent} of {legs} points were sent")
-
-
 async def queue_all(
     controller: Controller,
     start: Pose,
     lines: Sequence[Leg],
     acc_mm_s2: float,
     *,
-    stopped: Callable[[], bool],
+    go: Callable[[], None],
 ) -> None:
     """Queue every line on an arm that rests at `start`, then release it; return once it may have begun.
 
-    Raises `RobotNotSafe`, `MotionRefused`, and `MotionFailed` where the arm was stopped meanwhile, or where the
-    controller does not hold all lines, and `PathDisturbed` where it holds more: then the arm is not released.
+    `go` as for `feed`. Raises `RobotNotSafe`, `MotionRefused`, and `MotionFailed` where the arm was stopped meanwhile,
+    or where the controller does not hold all lines, and `PathDisturbed` where it holds more: then the arm is not
+    released.
     """
-
-    def require_not_stopped() -> None:
-        # Checked before every request, with nothing awaited between: after a stop none may follow.
-        if stopped():
-            raise _not_begun("the arm was stopped")
-
     await controller.require_safe("moveLine")
-    require_not_stopped()
+    go()
     await controller.hold_path()
     for line in lines:
-        require_not_stopped()
+        go()
         await controller.move_line(line.target, line.speed_mm_s, acc_mm_s2, least_s=line.least_s)
     rests = arrived(await controller.pose(), start)
     _, size = await controller.queue()  # last: what another client sends after this answer comes after our lift
@@ -244,7 +231,7 @@ async def queue_all(
         raise _not_begun(f"the controller holds {size} of {len(lines)} lines")
     if not rests:
         raise _not_begun("the controller does not hold its path: the arm moved before it was released")
-    require_not_stopped()
+    go()
     # Without a readable answer the arm may have begun, and a stop would leave the brush down: what it does will tell.
     with contextlib.suppress(ConnectionLost, DeviceTimeout, ProtocolViolation):
         await controller.go_on()

@@ -1,38 +1,42 @@
-"""The Aubo-i5 behind ARCS as a `Robot`: three sockets, so that neither stop nor telemetry waits for anything."""
+"""The Aubo-i5 behind ARCS: three sockets, so that neither stop nor telemetry waits for anything.
+
+Any client of the controller may use the arm and change its settings, so place and settings are checked before each
+motion: an arm that is not where it was left, or is not set up as it was, is not sent anywhere.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 from collections.abc import AsyncGenerator, Callable, Sequence
 
-from brushloop.drivers.arcs.controller import LOOPBACK_CONTROL_BOX, Controller
-from brushloop.drivers.arcs.motion import (
-    Leg,
-    OwnPath,
-    arrived,
-    feed,
-    legs_of,
-    queue_all,
-    seconds_of,
-    until_settled,
-)
-from brushloop.drivers.arcs.settings import ArcsTable, Departure, make_ready, power_on
+from brushloop.drivers.arcs.controller import LOOPBACK_CONTROL_BOX, Controller, RobotMode
+from brushloop.drivers.arcs.motion import POLL_S, OwnPath, arrived, feed, legs_of, queue_all, seconds_of, until_settled
+from brushloop.drivers.arcs.settings import ArcsTable, Settings, make_ready, power_on, read_back, require_same
 from brushloop.drivers.arcs.stopping import Stopper
 from brushloop.drivers.arcs.telemetry import Telemetry
 from brushloop.drivers.arcs.wire import DEVICE, RpcConnection, open_arcs
 from brushloop.drivers.devices import Identity, Pose, PoseSample, QueuedLine
-from brushloop.drivers.errors import DeviceError, MotionFailed, NotConnected
+from brushloop.drivers.errors import ArmMoved, DeviceError, MotionFailed, NotConnected, NotPowered
+from brushloop.drivers.geometry import distance
 from brushloop.drivers.host import Clock, finished
 from brushloop.drivers.limits import Limits
 
-__all__ = ["ArcsTable", "AuboArcs"]
-
 STOP_ACC_M_S2 = 2.0
+MOVED_MM, MOVED_DEG = 0.5, 0.5
+"""Limits beyond which another client or a person moved the arm: larger than the tolerance of any settled move."""
+DOWN_MM = 0.01
+"""A line that ends more than this lower counts as going down."""
+RESTS_S = 0.5
+"""Longest wait for rest: an arm that has just settled may take a moment to report it."""
 
 
 class AuboArcs:
-    """`Robot` for an Aubo arm under ARCS. FK and IK are the controller's; units on the wire are m, rad, s."""
+    """An Aubo arm under ARCS, with a brush: all poses are of the brush tip, in the base frame.
+
+    FK and IK are the controller's; units on the wire are m, rad, s.
+    """
 
     def __init__(
         self,
@@ -56,12 +60,14 @@ class AuboArcs:
         self._connected = False
         self._enabled = False
         self._telemetry = Telemetry(self._state, table, clock, on_notice)
-        self._departure: Departure | None = None
-        """Of the arm since it was enabled."""
+        self._settings: Settings | None = None
+        """As read back when the arm was enabled."""
+        self._left: Pose | None = None
+        """Where the last line ended, or where `take_up` found the arm; None after a line that did not reach its end."""
         self._motion.on_pose = self._telemetry.lag.asked
 
     async def connect(self) -> Identity:
-        """Connect and identify; telemetry runs from here on. Raises `WrongGeneration` for AUBOPE cabinets.
+        """Connect and identify; powers nothing, telemetry runs from here on. Raises `WrongGeneration` for AUBOPE.
 
         After a failure nothing is left open, and nothing was set on an arm that was not identified.
         """
@@ -101,7 +107,7 @@ class AuboArcs:
         await power_on(self._motion)
         self._held = True  # a process that was killed may have left it so
         await self._ready()
-        self._departure = Departure(self._motion, settings, await self._motion.pose())
+        self._left, self._settings = await self._motion.pose(), settings
         await self._telemetry.read()
 
     async def modes(self) -> tuple[str, str]:
@@ -113,84 +119,143 @@ class AuboArcs:
         self._limits.check(DEVICE, target, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
 
     async def move(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
-        """Send moveLine, then wait until the queue is empty, the arm steady and the pose within tolerance.
-
-        The whole line is checked, from where the arm really is. Any failure, cancellation included, stops the arm
-        before it is raised.
-        """
-        await self._feed([QueuedLine(target, speed_mm_s)], acc_mm_s2)
+        """Move the tip in a straight line; returns when the arm has settled within tolerance. See `follow`."""
+        await self.follow([target], speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2, blend_mm=0.0)
 
     async def follow(self, poses: Sequence[Pose], *, speed_mm_s: float, acc_mm_s2: float, blend_mm: float) -> None:
-        """Send lines through all poses without a halt between them, then wait as `move` does at the last.
+        """Send lines through all poses without a halt between them; returns when the arm has settled at the last.
 
-        Every pose, and every line between two of them, is checked before the first line is sent. Raises ValueError for
-        no poses.
+        Corners may be rounded within `blend_mm` of a pose. Every pose, and every line from where the arm really is, is
+        checked before the first line is sent. Any failure, cancellation included, stops the arm before it is raised.
+        Raises `ArmMoved` if the arm is not where it was left, `SettingsChanged` before a line down if what a press
+        depends on is not as it was set, `RobotNotSafe`, `NotPowered`, `LimitExceeded`, and ValueError for no poses.
         """
         if not poses:
             raise ValueError("follow: no poses")
-        await self._feed([QueuedLine(pose, speed_mm_s) for pose in poses], acc_mm_s2, blend_mm)
+        lines = [QueuedLine(pose, speed_mm_s) for pose in poses]
+        start = await self._depart("moveLine", lines, acc_mm_s2)
+        legs = legs_of(start, lines, self._limits, acc_mm_s2, blend_mm)
+        async with self._under_way("moveLine", legs[-1].target) as go:
+            await feed(self._motion, legs, acc_mm_s2, go=go, notice=self._notice)
+            await until_settled(self._motion.rest, legs[-1].target, seconds_of(legs))
 
     async def sequence(self, lines: Sequence[QueuedLine], *, acc_mm_s2: float) -> list[Pose]:
-        """Queue all lines while the controller holds its path, release it, and wait as `move` does.
+        """Queue all lines while the controller holds its path, release it, and wait as `follow` does; return the poses
+        seen meanwhile.
 
-        After the release, answers that cannot be read do not stop the arm. Raises `PathDisturbed` if another client
+        After the release the lines are carried out to the end even if this program dies, and answers that cannot be
+        read do not stop the arm; a stop drops all lines. Raises as `follow` does, `PathDisturbed` if another client
         interferes, and ValueError for no lines and for lines that end where the arm is.
         """
         start = await self._depart("sequence", lines, acc_mm_s2)
         if not lines or arrived(start, lines[-1].target):
             raise ValueError("sequence: it must not end where it begins")
         legs = legs_of(start, lines, self._limits, acc_mm_s2)
-        async with self._under_way(legs) as stopped:
+        async with self._under_way("sequence", legs[-1].target) as go:
             self._held = True
             with self._telemetry.seeing() as seen:
                 path = OwnPath(self._motion, start, legs, seen)
-                await queue_all(self._motion, start, legs, acc_mm_s2, stopped=stopped)
+                await queue_all(self._motion, start, legs, acc_mm_s2, go=go)
                 await until_settled(path.look, legs[-1].target, seconds_of(legs), patient=True)
                 self._held = False
                 await self._telemetry.reaching(legs[-1].target)
                 path.require_followed()
             return seen
 
-    async def _feed(self, lines: Sequence[QueuedLine], acc_mm_s2: float, blend_mm: float | None = None) -> None:
-        start = await self._depart("moveLine", lines, acc_mm_s2)
-        legs = legs_of(start, lines, self._limits, acc_mm_s2, blend_mm)
-        async with self._under_way(legs) as stopped:
-            await feed(self._motion, legs, acc_mm_s2, stopped=stopped, notice=self._notice)
-            await until_settled(self._motion.rest, legs[-1].target, seconds_of(legs))
-
     @contextlib.asynccontextmanager
-    async def _under_way(self, legs: Sequence[Leg]) -> AsyncGenerator[Callable[[], bool]]:
-        """Whatever ends the block before the arm has settled, the arm is stopped before it is raised.
+    async def _under_way(self, op: str, target: Pose) -> AsyncGenerator[Callable[[], None]]:
+        """Whatever ends the block before the arm has settled at `target`, the arm is stopped before it is raised.
 
-        Yields a function that tells whether the arm was stopped since the block began.
+        Yields a function that raises `MotionFailed` if the arm was stopped since the block began.
         """
-        departure, stops = self._require_enabled("moveLine"), self._stops
-        departure.left = None
+        stops, self._left = self._stops, None
         try:
-            yield lambda: self._stops != stops
+            yield lambda: self._require_no_stop_since(stops, op)
         except BaseException as error:
             try:
                 await finished(self.stop())
             except DeviceError as failure:
                 error.add_note(str(failure))
             raise
-        departure.left = legs[-1].target
+        self._left = target
+
+    def _require_no_stop_since(self, stops: int, op: str) -> None:
+        if self._stops != stops:
+            raise MotionFailed(DEVICE, op, "the arm was stopped")
 
     async def _depart(self, op: str, lines: Sequence[QueuedLine], acc_mm_s2: float) -> Pose:
-        """Check that the arm may go along `lines` from where it is, and return that place; see `Departure`."""
+        """Return where the arm is, once it may go from there along `lines`."""
         for line in lines:
             self.check(line.target, speed_mm_s=line.speed_mm_s, acc_mm_s2=acc_mm_s2)
-        departure, stops = self._require_enabled(op), self._stops
+        self._require_enabled(op)
+        stops = self._stops
         await self._ready()
-        start = await departure.ready(op, self._limits, [line.target for line in lines])
-        if self._stops != stops:
-            raise MotionFailed(DEVICE, op, "the arm was stopped", condition="Nothing was sent to it.")
+        start = await self._resting(op)
+        ways = list(itertools.pairwise([start, *(line.target for line in lines)]))
+        if self._moved(start) or any(b.z_mm < a.z_mm - DOWN_MM for a, b in ways):
+            await self._require_settings(op)  # with another tool, the same place would look like another
+        self._require_place(op, start)
+        for a, b in ways:
+            self._limits.check_way(DEVICE, a, b)
+        self._require_no_stop_since(stops, op)
         return start
+
+    async def confirm(self) -> None:
+        """Raise `RobotNotSafe`, `NotPowered`, `SettingsChanged` or `ArmMoved` if the arm is not as it was left."""
+        await self._require_settings("confirm")
+        self._require_place("confirm", await self._resting("confirm"))
+
+    async def take_up(self) -> Pose:
+        """Accept the place where the arm rests as the start of the next line.
+
+        Raises `ArmMoved` while it moves, `SettingsChanged` if a pose would refer to another tool, `RobotNotSafe`,
+        `NotPowered`.
+        """
+        self._require_enabled("take up")
+        here = await self._resting("take up")
+        await self._require_settings("take up")
+        self._left = here
+        return here
+
+    def _require_enabled(self, op: str) -> Settings:
+        if self._settings is None:
+            raise NotConnected(DEVICE, op, "not enabled")
+        return self._settings
+
+    async def _require_settings(self, op: str) -> None:
+        settings, current = self._require_enabled(op), await read_back(self._motion)
+        await self._motion.require_safe(op)
+        if await self._motion.mode() != RobotMode.RUNNING:
+            raise NotPowered(DEVICE, op)
+        require_same(op, settings, current)
+
+    async def _resting(self, op: str) -> Pose:
+        """Where the arm rests. Raises `ArmMoved` if it moves, `RobotNotSafe` if a safety stop holds its path."""
+        loop = asyncio.get_running_loop()
+        until_s = loop.time() + RESTS_S
+        while not await self._motion.at_rest():
+            if loop.time() > until_s:
+                await self._motion.require_safe(op)
+                raise ArmMoved(DEVICE, op, *self._off(await self._motion.pose()), moving=True)
+            await asyncio.sleep(POLL_S)
+        return await self._motion.pose()
+
+    def _require_place(self, op: str, here: Pose) -> None:
+        if self._moved(here):
+            raise ArmMoved(DEVICE, op, *self._off(here))
+
+    def _moved(self, here: Pose) -> bool:
+        off_mm, off_deg = self._off(here)
+        return off_mm > MOVED_MM or off_deg > MOVED_DEG
+
+    def _off(self, here: Pose) -> tuple[float, float]:
+        return (0.0, 0.0) if self._left is None else distance(self._left, here)
 
     async def stop(self) -> None:
         """Decelerate along the path, drop whatever is queued, and return once the arm is seen at rest.
 
-        Raises `MotionFailed` if it is not: then only the emergency stop is left.
+        Idempotent, from any state, never queued behind a slow call. Raises `MotionFailed` if the arm is not seen at
+        rest: then only the emergency stop is left.
         """
         if not self._connected:
             raise NotConnected(DEVICE, "stop", "not connected")
@@ -201,21 +266,8 @@ class AuboArcs:
         """Ask the controller for the pose, independently of telemetry."""
         return await self._motion.pose()
 
-    async def confirm(self) -> None:
-        """Raise `RobotNotSafe`, `NotPowered`, `SettingsChanged` or `ArmMoved` if the arm is not as it was left."""
-        await self._require_enabled("confirm").confirm()
-
-    async def take_up(self) -> Pose:
-        """Accept the place where the arm rests as the start of the next move. Raises as `confirm` does."""
-        return await self._require_enabled("take up").take_up()
-
-    def _require_enabled(self, op: str) -> Departure:
-        if self._departure is None:
-            raise NotConnected(DEVICE, op, "not enabled")
-        return self._departure
-
     def latest(self) -> PoseSample:
-        """The newest pose. Raises `NotConnected` before the first, `Stale` after `stale_after_ms`."""
+        """The newest pose; never blocks. Raises `NotConnected` before the first, `Stale` when it is too old."""
         return self._telemetry.latest()
 
     def pose_lag_ms(self) -> float | None:
@@ -223,7 +275,7 @@ class AuboArcs:
         return self._telemetry.lag.lag_ms()
 
     def listen(self, on_sample: Callable[[PoseSample], None] | None) -> None:
-        """Hand every telemetry sample to `on_sample` in the event loop."""
+        """Hand every telemetry sample to `on_sample`, in the event loop; None ends it."""
         self._telemetry.listener = on_sample
 
     async def close(self) -> None:
@@ -238,7 +290,7 @@ class AuboArcs:
         self._telemetry.listener = None
         try:
             if self._enabled:
-                under_way = self._departure is not None and self._departure.left is None
+                under_way = self._settings is not None and self._left is None
                 try:
                     await self.stop()
                 except DeviceError:
@@ -252,7 +304,7 @@ class AuboArcs:
         for controller in (self._motion, self._stop, self._state):
             await controller.connection.close()
         self._connected = self._enabled = False
-        self._departure = None
+        self._settings = None
 
     async def _ready(self) -> None:
         """Before each motion, make sure that it can be stopped and that the controller does not hold its path."""

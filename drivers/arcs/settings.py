@@ -1,15 +1,13 @@
-"""How an arm is set up, what is read back, and what must still be so before a line is sent.
+"""How an arm is set up, and what is read back: any client may change these settings, so a return code proves nothing.
 
-Any client may change these settings and use the arm, so a return code proves nothing, and everything is checked again
-before each departure. No step here moves the arm or clears a stop.
+No step here moves the arm or clears a stop.
 """
 
 from __future__ import annotations
 
 import asyncio
-import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
@@ -19,9 +17,8 @@ from brushloop.drivers.arcs.controller import Controller, RobotMode, accepted
 from brushloop.drivers.arcs.motion import POLL_S
 from brushloop.drivers.arcs.wire import DEVICE, Framing, numbers
 from brushloop.drivers.devices import Pose
-from brushloop.drivers.errors import ArmMoved, DeviceTimeout, MotionError, NotPowered, SettingsChanged
+from brushloop.drivers.errors import DeviceTimeout, MotionError, SettingsChanged
 from brushloop.drivers.geometry import angles, distance, from_wire
-from brushloop.drivers.limits import Limits
 
 Finite = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Turn = Annotated[float, Field(ge=-180.0, le=180.0)]
@@ -177,80 +174,3 @@ async def _until_mode(controller: Controller, *wanted: RobotMode) -> None:
                 remedy="Look at the pendant: a confirmation may be waiting there.",
             )
         await asyncio.sleep(POLL_S)
-
-
-MOVED_MM, MOVED_DEG = 0.5, 0.5
-"""Limits beyond which another client or a person moved the arm: larger than the tolerance of any settled move."""
-DOWN_MM = 0.01
-"""A line that ends more than this lower counts as going down."""
-RESTS_S = 0.5
-"""Longest wait for rest: an arm that has just settled may take a moment to report it."""
-
-
-class Departure:
-    """Place and settings in which an enabled arm was left."""
-
-    def __init__(self, controller: Controller, settings: Settings, left: Pose) -> None:
-        self._controller = controller
-        self._settings = settings
-        self.left: Pose | None = left
-        """Where the last line ended, or where `take_up` found the arm; None after a line that did not reach its end."""
-
-    async def take_up(self) -> Pose:
-        """Accept the place where the arm rests as the start of the next line.
-
-        Raises `ArmMoved` while it moves, `SettingsChanged` if a pose would refer to another tool, `RobotNotSafe`,
-        `NotPowered`.
-        """
-        here = await self._resting("take up")
-        await self._require_settings("take up")
-        self.left = here
-        return here
-
-    async def confirm(self) -> None:
-        """Check that all is as it was left. Raises `RobotNotSafe`, `NotPowered`, `SettingsChanged`, then `ArmMoved`."""
-        await self._require_settings("confirm")
-        self._require_place("confirm", await self._resting("confirm"))
-
-    async def ready(self, op: str, limits: Limits, poses: Sequence[Pose]) -> Pose:
-        """Return where the arm is, once it may go from there through `poses`.
-
-        Raises as `confirm` does, and `LimitExceeded` if a line would leave the limits.
-        """
-        start = await self._resting(op)
-        lines = list(itertools.pairwise([start, *poses]))
-        if self._moved(start) or any(b.z_mm < a.z_mm - DOWN_MM for a, b in lines):
-            await self._require_settings(op)  # with another tool, the same place would look like another
-        self._require_place(op, start)
-        for a, b in lines:
-            limits.check_way(DEVICE, a, b)
-        return start
-
-    async def _require_settings(self, op: str) -> None:
-        current = await read_back(self._controller)
-        await self._controller.require_safe(op)
-        if await self._controller.mode() != RobotMode.RUNNING:
-            raise NotPowered(DEVICE, op)
-        require_same(op, self._settings, current)
-
-    async def _resting(self, op: str) -> Pose:
-        """Where the arm rests. Raises `ArmMoved` if it moves, `RobotNotSafe` if a safety stop holds its path."""
-        loop = asyncio.get_running_loop()
-        until_s = loop.time() + RESTS_S
-        while not await self._controller.at_rest():
-            if loop.time() > until_s:
-                await self._controller.require_safe(op)
-                raise ArmMoved(DEVICE, op, *self._off(await self._controller.pose()), moving=True)
-            await asyncio.sleep(POLL_S)
-        return await self._controller.pose()
-
-    def _require_place(self, op: str, here: Pose) -> None:
-        if self._moved(here):
-            raise ArmMoved(DEVICE, op, *self._off(here))
-
-    def _moved(self, here: Pose) -> bool:
-        off_mm, off_deg = self._off(here)
-        return off_mm > MOVED_MM or off_deg > MOVED_DEG
-
-    def _off(self, here: Pose) -> tuple[float, float]:
-        return (0.0, 0.0) if self.left is None else distance(self.left, here)
