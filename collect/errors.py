@@ -44,17 +44,7 @@ class StepVoid(StepError):
 
 
 class BadPicture(StepError):
-    """The photograph shows too little of the stroke. Leaves the arm parked and the stroke as it is."""
-
-
-class ArmInPicture(BadPicture):
-    """Something that should not be in the picture stays there. Leaves the arm parked and the stroke as it is."""
-
-    def __init__(self, seconds: float) -> None:
-        super().__init__(
-            f"something moves or stays in the picture {seconds:g} s after the arm parked: the arm, a hand or a shadow, "
-            "or camera or sheet were moved. Clear the view; the arm must be out of it at motion.park_mm."
-        )
+    """The photograph shows too little of the stroke, or what should not be in it. Leaves arm and stroke as they are."""
 
 
 class ForceTooHigh(StepError):
@@ -76,16 +66,6 @@ class CameraLate(NeedsOperator):
 
     def __init__(self, text: str) -> None:
         super().__init__(f"{too_busy()} {text}".strip())
-
-
-class PosesLate(NeedsOperator):
-    """The recorded path of the brush would lag behind force and camera. Leaves the step void, and the brush lifted."""
-
-    def __init__(self, lag_ms: float, limit_ms: float) -> None:
-        super().__init__(
-            f"poses of the arm arrive {lag_ms:.0f} ms late; robot.max_pose_lag_ms = {limit_ms:g}. If only pushed poses "
-            "are late, leave robot.rtde_port out of rig.toml: they are then asked for. If not, look at the network."
-        )
 
 
 class SheetFull(StepError):

@@ -8,11 +8,11 @@ from collections.abc import AsyncGenerator, Awaitable, Callable, Sequence
 from dataclasses import dataclass
 
 from brushloop.collect.errors import StepVoid, arm_at_fault
-from brushloop.collect.photograph.photographer import ArmTrips, Photographer
+from brushloop.collect.photograph.photographer import Photographer
 from brushloop.collect.protocols.steps import Drawn, TrajectoryPoint
 from brushloop.collect.rig.config import RigConfig, WashConfig
 from brushloop.collect.rig.devices import Rig, limits_of
-from brushloop.collect.rig.paper import PaperPlane, Patch, to_base, to_paper
+from brushloop.collect.rig.paper import PaperPlane, Patch, to_base
 from brushloop.drivers.devices import Frame, Pose, QueuedLine
 from brushloop.drivers.geometry import brush_pose, interpolate, lean
 from brushloop.sessions.records import Condition
@@ -274,20 +274,7 @@ class Procedures:
         self.target_mm: tuple[float, float, float] | None = None
         """Where the arm was last sent; for a press, its deepest point."""
         self._dips = 0
-        over = over_sheet_move(rig.config)
-        self.photographer = Photographer(
-            rig.robot,
-            rig.camera,
-            rig.config.camera,
-            rig.clock,
-            ArmTrips(
-                over_mm=over.target.position_mm,
-                park_mm=rig.config.motion.park_mm,
-                over=lambda: self.go(over),
-                park=self.park,
-                over_sheet=self._over_sheet,
-            ),
-        )
+        self.photographer = Photographer(rig, self.go, over_sheet_move(rig.config), *park_moves(rig.config))
 
     async def go(self, *moves: Move) -> None:
         """Make moves one after the other, each when the arm rests after the one before."""
@@ -406,9 +393,3 @@ class Procedures:
     async def park(self) -> None:
         """Go out of the camera's view."""
         await self.go(*park_moves(self._config))
-
-    async def _over_sheet(self) -> bool:
-        here = await self.rig.robot.where()
-        x_mm, y_mm = to_paper(self._config.paper, here.x_mm, here.y_mm)
-        size_x_mm, size_y_mm = self._config.paper.size_mm
-        return 0.0 <= x_mm <= size_x_mm and 0.0 <= y_mm <= size_y_mm

@@ -28,7 +28,6 @@ from brushloop.collect.engine.recorder import ForceGuard, Recorder, RunContext, 
 from brushloop.collect.errors import (
     NeedsOperator,
     Parked,
-    PosesLate,
     SheetFull,
     StepError,
     arm_at_fault,
@@ -289,8 +288,8 @@ class Run(RunContext):
             rig.robot.listen(None)
 
     async def _check_heights(self, step: Step) -> None:
-        """After a step whose heights count: raise `PosesLate` if poses came too late for that, and `DeviceError` if the
-        tool is not the one that was set."""
+        """After a step whose heights count: raise `NeedsOperator` if poses came too late for that, and `DeviceError` if
+        the tool is not the one that was set."""
         if step.kind not in HEIGHTS:
             return
         robot, limit_ms = self.rig.robot, self.rig.config.robot.max_pose_lag_ms
@@ -298,7 +297,11 @@ class Run(RunContext):
             await robot.confirm()
         lag_ms = robot.pose_lag_ms()
         if lag_ms is not None and lag_ms > limit_ms:
-            raise PosesLate(lag_ms, limit_ms)
+            raise NeedsOperator(
+                f"poses of the arm arrive {lag_ms:.0f} ms late; robot.max_pose_lag_ms = {limit_ms:g}. If only pushed "
+                "poses are late, leave robot.rtde_port out of rig.toml: they are then asked for. If not, look at the "
+                "network."
+            )
 
     async def _do(self, step: Step, context: StepContext) -> StepResult:
         match step:

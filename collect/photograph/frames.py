@@ -62,15 +62,8 @@ def changed_share(now: Thumbnail, before: Thumbnail) -> float:
     return float(np.mean(np.abs(now - light * before) > CHANGED_LEVELS))
 
 
-@dataclass(frozen=True, slots=True)
-class FrameChange:
-    """How far one frame differs from the view without the arm."""
-
-    arrival_s: float
-    changed: float
-    """Share of the picture, 0 to 1."""
-
-
+Series = list[tuple[float, float]]
+"""A quantity at several times, in s: of frames, when they arrived, and the share of the picture that has changed."""
 ARM_SHARE = 0.02
 """An arm over the sheet hides a far larger share of the picture than a stroke, or a drawn figure, covers with ink."""
 STILL_SHARE = 0.005
@@ -99,37 +92,28 @@ class View:
         return self.moved < STILL_SHARE
 
 
-Condition = Callable[[View], bool]
-
-
-@dataclass(frozen=True, slots=True)
-class _Waiting:
-    condition: Condition
-    until_s: float
-    answer: asyncio.Future[View | None]
-
-
 class Frames:
     """The camera's frames from now on."""
 
     def __init__(self, reference: Thumbnail | None) -> None:
         self._reference = reference
         self._before: Thumbnail | None = None
-        self._waiting: _Waiting | None = None
+        self._waiting: tuple[Callable[[View], bool], float, asyncio.Future[View | None]] | None = None
+        """What a caller waits for, until when, and its answer."""
         self._failure: Exception | None = None
-        self.seen: list[FrameChange] = []
-        """Every frame so far."""
+        self.seen: Series = []
+        """Of every frame so far: arrival, and how far it differs from the reference, 0 to 1."""
 
-    async def first(self, condition: Condition, *, within_s: float) -> View | None:
-        """The first frame from now on that meets `condition`; None if none does within `within_s`.
+    async def first(self, wanted: Callable[[View], bool], *, within_s: float) -> View | None:
+        """The first frame from now on that is wanted; None if none is within `within_s`.
 
-        One caller waits at a time. Raises `DeviceError` if no frame comes.
+        One caller waits at a time, and is shown every frame. Raises `DeviceError` if no frame comes.
         """
         if self._failure is not None:
             raise self._failure
         loop = asyncio.get_running_loop()
-        self._waiting = _Waiting(condition, loop.time() + within_s, loop.create_future())
-        return await self._waiting.answer
+        self._waiting = wanted, loop.time() + within_s, (answer := loop.create_future())
+        return await answer
 
     async def follow(self, camera: OpenCvCamera) -> None:
         """Take frame after frame, until cancelled or the camera fails."""
@@ -141,19 +125,19 @@ class Frames:
                 self._show(await asyncio.to_thread(self._view, frame))
         except Exception as error:
             self._failure = error
-            if self._waiting is not None and not self._waiting.answer.done():
-                self._waiting.answer.set_exception(error)
+            if self._waiting is not None and not self._waiting[2].done():
+                self._waiting[2].set_exception(error)
 
     def _show(self, view: View) -> None:
         self._before = view.small
-        self.seen.append(FrameChange(view.frame.stamp.host_ns / 1e9, view.changed))
-        waiting = self._waiting
-        if waiting is None or waiting.answer.done():
+        self.seen.append((view.frame.stamp.host_ns / 1e9, view.changed))
+        if self._waiting is None or self._waiting[2].done():
             return
-        if waiting.condition(view):
-            waiting.answer.set_result(view)
-        elif asyncio.get_running_loop().time() > waiting.until_s:
-            waiting.answer.set_result(None)
+        wanted, until_s, answer = self._waiting
+        if wanted(view):
+            answer.set_result(view)
+        elif asyncio.get_running_loop().time() > until_s:
+            answer.set_result(None)
 
     def _view(self, frame: Frame) -> View:
         small = thumbnail(frame.image)

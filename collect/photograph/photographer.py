@@ -14,21 +14,19 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-from collections.abc import AsyncGenerator, Awaitable, Callable, Sequence
+from collections.abc import AsyncGenerator, Awaitable, Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.stats import student_95
-from brushloop.collect.errors import ArmInPicture, CameraLate
-from brushloop.collect.photograph.frames import ARM_SHARE, FrameChange, Frames, Thumbnail, View, watching
-from brushloop.collect.rig.config import CameraConfig
-from brushloop.drivers.arcs.robot import AuboArcs
-from brushloop.drivers.camera import OpenCvCamera
-from brushloop.drivers.devices import Frame
+from brushloop.collect.errors import BadPicture, CameraLate
+from brushloop.collect.photograph.frames import ARM_SHARE, Frames, Series, Thumbnail, View, watching
+from brushloop.collect.rig.devices import Rig
+from brushloop.collect.rig.paper import to_paper
+from brushloop.drivers.devices import Frame, QueuedLine
 from brushloop.drivers.errors import DeviceError
-from brushloop.drivers.host import Clock
 
 Floats = NDArray[np.float64]
 GOOD_SHARE, GOOD_S = 0.1, 0.03
@@ -41,15 +39,6 @@ LEAST_ALIKE, ALIKE_SHARE = 4, 0.75
 """Fewer trips may agree by chance on a busy computer, and so may a smaller share of them."""
 EXACT_S = 0.015
 """Half width of the 95 % interval that is good enough for a short delay."""
-
-
-@dataclass(frozen=True, slots=True)
-class ArmPlace:
-    """Where the arm was at one time."""
-
-    t_s: float
-    way: float
-    """0 at its position outside the picture, 1 over the sheet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,15 +108,17 @@ class CameraDelay:
         return f"{delay_ms:.0f} ± {resolution_ms:.0f} ms (from {trips})"
 
 
-def look(seen: Sequence[FrameChange], placed: Sequence[ArmPlace]) -> Look | None:
+def look(seen: Series, placed: Series) -> Look | None:
     """Return the delay of one trip; None if a silence, or a picture that does not fit the trip, leaves it unknown.
 
-    `seen` begins and ends without the arm; `placed` goes from 0 to 1 and back.
+    `seen` is how much of the picture had changed in each frame, by its arrival; it begins and ends without the arm.
+    `placed` is where the arm was: from 0, outside the picture, to 1, over the sheet, and back.
     """
-    arrival_s = np.array([frame.arrival_s for frame in seen])
-    changed = np.array([frame.changed for frame in seen])
-    t_s, way = np.array([place.t_s for place in placed]), np.array([place.way for place in placed])
-    if len(seen) < 3 or len(placed) < 3 or max(np.diff(arrival_s).max(), np.diff(t_s).max()) > MOST_GAP_S:
+    if len(seen) < 3 or len(placed) < 3:
+        return None
+    frames, places = np.array(seen, np.float64), np.array(placed, np.float64)
+    arrival_s, changed, t_s, way = frames[:, 0], frames[:, 1], places[:, 0], places[:, 1]
+    if max(np.diff(arrival_s).max(), np.diff(t_s).max()) > MOST_GAP_S:
         return None
     half = 0.5 * float(changed.max())
     inside = np.flatnonzero(changed >= half)
@@ -180,32 +171,17 @@ GROWN_SHARE, GROWN_S = 0.2, 0.1
 POSE_PERIOD_S = 0.005
 
 
-@dataclass(frozen=True, slots=True)
-class ArmTrips:
-    """Moves of the arm over the sheet and away again."""
-
-    over_mm: tuple[float, float, float]
-    """Position of the tip over the middle of the sheet, in the base frame."""
-    park_mm: tuple[float, float, float]
-    over: Callable[[], Awaitable[None]]
-    """Go over the middle of the sheet at travel height."""
-    park: Callable[[], Awaitable[None]]
-    """Go to the park position."""
-    over_sheet: Callable[[], Awaitable[bool]]
-    """Whether the arm is over the sheet now."""
-
-
 class Photographer:
     """One camera over one sheet, for one run."""
 
     def __init__(
-        self, robot: AuboArcs, camera: OpenCvCamera, config: CameraConfig, clock: Clock, trips: ArmTrips
+        self, rig: Rig, go: Callable[[QueuedLine], Awaitable[None]], over: QueuedLine, park: QueuedLine
     ) -> None:
-        self._robot = robot
-        self._camera = camera
-        self._config = config
-        self._clock = clock
-        self._trips = trips
+        """`go` makes a move: `over` leads over the middle of the sheet, `park` out of the picture."""
+        self._rig = rig
+        self._config = rig.config.camera
+        self._patience_s = self._config.max_delay_ms / 1e3 + PATIENCE_S
+        self._go, self._over, self._park = go, over, park
         self._reference: Thumbnail | None = None
         """The sheet without the arm, as it was seen last."""
         self.delay: CameraDelay | None = None
@@ -218,42 +194,45 @@ class Photographer:
     async def photograph(self) -> Frame:
         """Park, and return the first frame that was exposed after the arm was gone.
 
-        Raises `CameraLate`, `ArmInPicture`, or `DeviceError` if the camera shows nothing.
+        Raises `CameraLate`, `BadPicture`, or `DeviceError` if the camera shows nothing.
         """
         delay, reference = self.delay, self._reference
+        seen_to_leave = delay is None or reference is None
         if delay is None or reference is None:
             delay, reference = self.delay, self._reference = await self._measured()
-            # The arm was just seen to leave: only a frame from after that is still needed.
-            async with watching(self._camera, reference) as frames:
-                return await self._clear(frames, delay, self._clock.now_ns())
-        async with watching(self._camera, reference) as frames:
-            if not await self._trips.over_sheet():
-                await self._trips.over()
-            arrived_ns = self._clock.now_ns()
-            shown = await frames.first(
-                lambda v: v.arm and v.frame.stamp.host_ns >= arrived_ns, within_s=self._patience_s
-            )
-            if shown is None:
-                raise self._not_shown()
-            await self._trips.park()
-            return await self._clear(frames, delay, self._clock.now_ns())
+        async with watching(self._rig.camera, reference) as frames:
+            if not seen_to_leave:
+                await self._show_arm(frames)
+            return await self._clear(frames, delay, self._rig.clock.now_ns())
+
+    async def _show_arm(self, frames: Frames) -> None:
+        """Have the arm over the sheet until the camera shows it there, then park. Raises `CameraLate`."""
+        here, size_mm = await self._rig.robot.where(), self._rig.config.paper.size_mm
+        at_mm = to_paper(self._rig.config.paper, here.x_mm, here.y_mm)
+        if not all(0.0 <= at <= size for at, size in zip(at_mm, size_mm, strict=True)):
+            await self._go(self._over)
+        arrived_ns = self._rig.clock.now_ns()
+        shown = await frames.first(lambda v: v.arm and v.frame.stamp.host_ns >= arrived_ns, within_s=self._patience_s)
+        if shown is None:
+            raise self._not_shown()
+        await self._go(self._park)
 
     async def _clear(self, frames: Frames, delay: CameraDelay, parked_ns: int) -> Frame:
-        """The first frame without the arm that was exposed after `parked_ns`. Raises `CameraLate`, `ArmInPicture`."""
+        """The first frame without the arm that was exposed after `parked_ns`. Raises `CameraLate`, `BadPicture`."""
         bound_ns = round(delay.bound_s * 1e9)
         clear = await frames.first(
             lambda v: not v.arm and v.still and v.frame.stamp.host_ns - bound_ns >= parked_ns,
             within_s=self._patience_s,
         )
         if clear is None:
-            raise ArmInPicture(self._patience_s)
+            raise _in_picture(self._patience_s)
         self._check_drift(frames, delay, parked_ns / 1e9)
         self._reference = clear.small
         return replace(clear.frame, exposed_after_ns=parked_ns)
 
     def _check_drift(self, frames: Frames, delay: CameraDelay, parked_s: float) -> None:
         """Correct the delay if frames show the arm for longer after it parked. Raises `CameraLate` beyond the limit."""
-        shown_s = (frame.arrival_s for frame in frames.seen if frame.changed >= ARM_SHARE)
+        shown_s = (arrival_s for arrival_s, changed in frames.seen if changed >= ARM_SHARE)
         late_s = max(shown_s, default=parked_s) - parked_s
         if late_s > self._config.max_delay_ms / 1e3:
             self.forget()
@@ -310,20 +289,20 @@ class Photographer:
         Returns None alone if the picture did not change when the arm came, or did not change back when it left.
         """
         within_s = self._patience_s
-        async with watching(self._camera, without_arm) as frames, self._placed() as placed:
+        async with watching(self._rig.camera, without_arm) as frames, self._placed() as placed:
             if await frames.first(lambda v: not v.arm, within_s=within_s) is None:
                 return None
-            await self._trips.over()
+            await self._go(self._over)
             if await frames.first(lambda v: v.arm and v.still, within_s=within_s) is None:
                 return None
             await asyncio.sleep(stay_s)
-            await self._trips.park()
+            await self._go(self._park)
             clear = await frames.first(lambda v: not v.arm and v.still, within_s=within_s)
         return None if clear is None else (clear.small, look(frames.seen, placed))
 
     async def _view_without_arm(self, *, still_s: float) -> Thumbnail:
-        """A view with the arm parked, once nothing has moved in it for `still_s`. Raises `ArmInPicture`."""
-        await self._trips.park()
+        """A view with the arm parked, once nothing has moved in it for `still_s`. Raises `BadPicture`."""
+        await self._go(self._park)
         moved_s = 0.0
 
         def settled(view: View) -> bool:
@@ -332,28 +311,29 @@ class Photographer:
             moved_s = moved_s if view.still else arrival_s
             return view.still and arrival_s - moved_s >= still_s
 
-        async with watching(self._camera, None) as frames:
+        async with watching(self._rig.camera, None) as frames:
             view = await frames.first(settled, within_s=3.0 * self._patience_s)
         if view is None:
-            raise ArmInPicture(3.0 * self._patience_s)
+            raise _in_picture(3.0 * self._patience_s)
         return view.small
 
     @contextlib.asynccontextmanager
-    async def _placed(self) -> AsyncGenerator[list[ArmPlace]]:
-        """Within the block, note where the arm is on its way from park to the middle of the sheet."""
-        placed: list[ArmPlace] = []
-        way_mm = [b - a for a, b in zip(self._trips.park_mm, self._trips.over_mm, strict=True)]
+    async def _placed(self) -> AsyncGenerator[Series]:
+        """Within the block, note where the arm is on its way from park, 0, to the middle of the sheet, 1."""
+        placed: Series = []
+        park_mm, over_mm = self._park.target.position_mm, self._over.target.position_mm
+        way_mm = [b - a for a, b in zip(park_mm, over_mm, strict=True)]
         length_mm = math.hypot(*way_mm)
 
         async def note() -> None:
             while True:
                 with contextlib.suppress(DeviceError):
-                    sample = self._robot.latest()
-                    gone_mm = [p - a for p, a in zip(sample.pose.position_mm, self._trips.park_mm, strict=True)]
+                    sample = self._rig.robot.latest()
+                    gone_mm = [p - a for p, a in zip(sample.pose.position_mm, park_mm, strict=True)]
                     way = sum(g * w for g, w in zip(gone_mm, way_mm, strict=True)) / length_mm**2
                     t_s = sample.stamp.host_ns / 1e9
-                    if not placed or t_s > placed[-1].t_s:
-                        placed.append(ArmPlace(t_s, way))
+                    if not placed or t_s > placed[-1][0]:
+                        placed.append((t_s, way))
                 await asyncio.sleep(POSE_PERIOD_S)
 
         task = asyncio.create_task(note(), name="note the arm's path")
@@ -382,6 +362,9 @@ class Photographer:
             f"{self._config.max_delay_ms:g}. Point it at the sheet, and see that nothing else moves in its view."
         )
 
-    @property
-    def _patience_s(self) -> float:
-        return self._config.max_delay_ms / 1e3 + PATIENCE_S
+
+def _in_picture(seconds: float) -> BadPicture:
+    return BadPicture(
+        f"something moves or stays in the picture {seconds:g} s after the arm parked: the arm, a hand or a shadow, "
+        "or camera or sheet were moved. Clear the view; the arm must be out of it at motion.park_mm."
+    )

@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.recorder import ForceGuard, Recorder
-from brushloop.collect.errors import ForceTooHigh, PosesLate, arm_at_fault, describe, rest_is_unknown
+from brushloop.collect.errors import ForceTooHigh, NeedsOperator, arm_at_fault, describe, rest_is_unknown
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.devices import ForceSample, Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceError, MotionFailed, Stuck
@@ -155,7 +155,7 @@ def test_a_dose_that_does_not_arrive_is_the_operators_to_mend(lab: Lab, monkeypa
 
 def test_poses_that_come_late_end_the_run_before_a_press_counts(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(AuboArcs, "pose_lag_ms", lambda _: 412.0)
-    with pytest.raises(PosesLate, match="arrive 412 ms late"):
+    with pytest.raises(NeedsOperator, match="arrive 412 ms late"):
         lab.run()
     assert len(lab.state.cut) == 1
     assert not lab.state.results(PressResult)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,16 +14,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brushloop.collect.errors import ArmInPicture, CameraLate
-from brushloop.collect.photograph.frames import FrameChange
-from brushloop.collect.photograph.photographer import ArmPlace, ArmTrips, CameraDelay, Look, Photographer, look
-from brushloop.collect.rig.config import CameraConfig
-from brushloop.drivers.devices import Frame, Pose, PoseSample, Stamp
+from brushloop.collect.errors import BadPicture, CameraLate
+from brushloop.collect.photograph.frames import Series
+from brushloop.collect.photograph.photographer import CameraDelay, Look, Photographer, look
+from brushloop.collect.rig.config import CameraConfig, PaperConfig
+from brushloop.drivers.devices import Frame, Pose, PoseSample, QueuedLine, Stamp
+from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.host import Clock
 from tests.simulated_time import LoopClock
 
 PERIOD_S, TRIP_S = 0.02, 0.06
 PARK_MM, OVER_MM = (0.0, 0.0, 100.0), (200.0, 0.0, 100.0)
+PAPER = PaperConfig(origin_mm=(100.0, -50.0), touch_z_mm=0.0, size_mm=(200.0, 100.0))
 OUT_MM, IN_MM = 60.0, 120.0
 """From here to there on its way the arm comes into the picture."""
 
@@ -46,9 +50,11 @@ class Theatre:
         """By the sequence of the frame, since the start: the truth."""
 
     def photographer(self, **limits: float) -> Photographer:
-        config = CameraConfig.model_validate({"kind": "opencv", "source": "0", **limits})
-        trips = ArmTrips(OVER_MM, PARK_MM, lambda: self.go(1.0), lambda: self.go(0.0), self._is_over)
-        return Photographer(self, self, config, self.clock, trips)  # pyright: ignore[reportArgumentType]
+        camera = CameraConfig.model_validate({"kind": "opencv", "source": "0", **limits})
+        config: Any = SimpleNamespace(camera=camera, paper=PAPER)
+        over, park = (QueuedLine(brush_pose(*at_mm), 100.0) for at_mm in (OVER_MM, PARK_MM))
+        rig: Any = SimpleNamespace(config=config, clock=self.clock, robot=self, camera=self)
+        return Photographer(rig, lambda move: self.go(move.target.x_mm / OVER_MM[0]), over, park)
 
     def way(self, t_s: float) -> float:
         """Where the arm was: 0 parked, 1 over the sheet."""
@@ -58,7 +64,10 @@ class Theatre:
     def latest(self) -> PoseSample:
         now_ns = self.clock.now_ns()
         x_mm = OVER_MM[0] * self.way(now_ns / 1e9)
-        return PoseSample(Stamp(now_ns), Pose(x_mm, 0.0, 100.0, 1.0, 0.0, 0.0, 0.0))
+        return PoseSample(Stamp(now_ns), brush_pose(x_mm, 0.0, 100.0))
+
+    async def where(self) -> Pose:
+        return self.latest().pose
 
     async def fresh(self, after: Stamp) -> Frame:
         while True:
@@ -77,9 +86,6 @@ class Theatre:
         now_s = self._now_s()
         self._legs.append((now_s, self.way(now_s), way))
         await asyncio.sleep(TRIP_S + 0.01)
-
-    async def _is_over(self) -> bool:
-        return self.way(self._now_s()) > 0.5
 
     def _draw(self, t_s: float) -> np.ndarray:
         image = np.full((120, 160), 230, np.uint8)
@@ -179,7 +185,7 @@ async def test_a_hand_in_the_picture_is_named_and_gives_no_photograph():
     photographer = theatre.photographer(max_delay_ms=200)
     await photographer.photograph()
     theatre.intruder = True
-    with pytest.raises(ArmInPicture, match="the arm, a hand or a shadow"):
+    with pytest.raises(BadPicture, match="the arm, a hand or a shadow"):
         await photographer.photograph()
     theatre.intruder = False
     await photographer.photograph()
@@ -266,17 +272,14 @@ def way(t_s: float, trip_s: float, stay_s: float) -> float:
     return min(max((t_s - begins_s) / trip_s, 0.0), 1.0) - min(max((t_s - ends_s) / trip_s, 0.0), 1.0)
 
 
-def trip(
-    delay_s: float, *, period_s: float, phase: float, trip_s: float, stay_s: float
-) -> tuple[list[FrameChange], list[ArmPlace]]:
+def trip(delay_s: float, *, period_s: float, phase: float, trip_s: float, stay_s: float) -> tuple[Series, Series]:
     end_s = 2.0 + 2.0 * trip_s + stay_s
     exposed = np.arange(phase * period_s, end_s, period_s)
     trips = [way(t, trip_s, stay_s) for t in exposed]
     seen = [
-        FrameChange(float(t) + delay_s, 0.15 * min(max((w - ENTERS) / 0.3, 0.0), 1.0))
-        for t, w in zip(exposed, trips, strict=True)
+        (float(t) + delay_s, 0.15 * min(max((w - ENTERS) / 0.3, 0.0), 1.0)) for t, w in zip(exposed, trips, strict=True)
     ]
-    return seen, [ArmPlace(float(t), way(float(t), trip_s, stay_s)) for t in np.arange(0.0, end_s, 0.01)]
+    return seen, [(float(t), way(float(t), trip_s, stay_s)) for t in np.arange(0.0, end_s, 0.01)]
 
 
 @given(
@@ -307,13 +310,13 @@ def test_a_slow_arm_is_seen_on_its_way_and_gives_the_delay_far_better_than_the_f
     ("stay_s", "seen_s", "shown"),
     [
         (0.3, 0.9, lambda frame: frame),
-        (0.3, 0.3, lambda frame: FrameChange(frame.arrival_s, 0.0)),
-        (3.0, 3.0, lambda frame: None if 1.5 < frame.arrival_s < 3.0 else frame),
+        (0.3, 0.3, lambda frame: (frame[0], 0.0)),
+        (3.0, 3.0, lambda frame: None if 1.5 < frame[0] < 3.0 else frame),
     ],
     ids=["another trip was seen for longer", "the picture does not change", "a long silence"],
 )
 def test_pictures_that_do_not_show_the_trip_give_no_delay(
-    stay_s: float, seen_s: float, shown: Callable[[FrameChange], FrameChange | None]
+    stay_s: float, seen_s: float, shown: Callable[[tuple[float, float]], tuple[float, float] | None]
 ) -> None:
     seen, placed = trip(0.1, period_s=0.05, phase=0.0, trip_s=0.1, stay_s=stay_s)
     assert look(seen, placed) is not None
