@@ -268,7 +268,8 @@ def sound_head(spec: BrushSpec, cells: Sequence[Cell], grid: Grid) -> SoundHead 
         return None
     middle_mm = 0.5 * (min(heads_mm) + max(heads_mm))
     reach_mm = max(heads_mm) - middle_mm
-    return SoundHead(round(middle_mm, 1), round(max(reach_mm + MARGIN_MM, LEAST_MISPLACED_MM), 1))
+    misplaced_mm = round(max(reach_mm + MARGIN_MM, LEAST_MISPLACED_MM), 1)
+    return SoundHead(head_mm=round(middle_mm, 1), misplaced_mm=misplaced_mm)
 
 
 def _head_mm(image: Images, grid: Grid) -> float | None:

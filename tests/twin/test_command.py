@@ -85,11 +85,15 @@ def test_a_session_gets_a_twin_and_a_run_that_was_broken_off_goes_on(
 def test_a_twin_is_read_back_and_what_is_not_determined_has_no_interval(tmp_path: Path) -> None:
     spec = BrushSpec(radius_mm=5.0, length_mm=42.0, friction=0.3, set_deg=9.0, seed=7)
     estimates = tuple(Estimate(one, float(getattr(spec, one.name)), 0.1, 0.4, one.name != "set_deg") for one in SHAPE)
-    fitted = Twin(spec, estimates, None, (HeldOut("twin", 95.1, 90.2, 45),), SoundHead(2.2, 4.0))
+    fitted = Twin(spec, estimates, None, (HeldOut("twin", 95.1, 90.2, 45),), SoundHead(head_mm=2.2, misplaced_mm=4.0))
     path = tmp_path / "twin.toml"
     path.write_text("\n".join(twin_toml(fitted, 'session "1"\n', 1.234)))
     found = load_brush(path)
-    assert (found.brush, found.camera, found.quality) == (spec, CameraNoise(noise=1.23), SoundHead(2.2, 4.0))
+    assert (found.brush, found.camera, found.quality) == (
+        spec,
+        CameraNoise(noise=1.23),
+        SoundHead(head_mm=2.2, misplaced_mm=4.0),
+    )
     assert found.name == "simulated bristle bundle (twin of session ?1??, simulated)"
     lines = {line.split(" = ")[0]: line for line in path.read_text().splitlines()}
     assert lines["friction"].endswith("# 0.1 to 0.4; default 0.22")

@@ -98,20 +98,6 @@ def within(name: str, value: float, low: float, high: float) -> None:
         raise ValueError(f"{name} = {value:g} is outside {low:g} .. {high:g}")
 
 
-@dataclass(frozen=True, slots=True)
-class SoundHead:
-    """The `[quality]` settings of a rig.toml that depend on the brush; raises ValueError out of range."""
-
-    head_mm: float
-    """How far a sound mark begins behind the zero-touch point, on the side away from its tip."""
-    misplaced_mm: float
-    """Distance from there at which a mark counts as misplaced."""
-
-    def __post_init__(self) -> None:
-        within("head_mm", self.head_mm, -20.0, 20.0)
-        within("misplaced_mm", self.misplaced_mm, 0.1, 20.0)
-
-
 class SimFileError(Exception):
     """A file or socket cannot be used, read or written: path, field, what is allowed."""
 
@@ -152,6 +138,15 @@ class CameraNoise(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
 
     noise: Annotated[float, Field(ge=0.0, le=30.0)]
     """Standard deviation, in gray levels."""
+
+
+class SoundHead(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
+    """The `[quality]` settings of a rig.toml that depend on the brush."""
+
+    head_mm: Annotated[float, Field(ge=-20.0, le=20.0)]
+    """How far a sound mark begins behind the zero-touch point, on the side away from its tip."""
+    misplaced_mm: Annotated[float, Field(ge=0.1, le=20.0)]
+    """Distance from there at which a mark counts as misplaced."""
 
 
 class BrushFile(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
