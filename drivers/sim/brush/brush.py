@@ -13,14 +13,15 @@ from numpy.typing import NDArray
 
 from brushloop.drivers.sim.brush.drag import Stances, Waypoint, draw_drag
 from brushloop.drivers.sim.brush.footprint import (
+    FLAWLESS,
     Flaw,
     Trouble,
     Tuft,
     blank_footprint,
     draw_trouble,
-    draw_wander,
     grow_bristles,
     print_footprint,
+    wet_tuft,
 )
 from brushloop.drivers.sim.brush.mechanics import (
     LOAD_STEP_MM,
@@ -83,12 +84,12 @@ class Brush:
         within("severity", severity, 0.0, 1.0)
         if depth_mm <= 0.0:
             return blank_footprint(px_per_mm)
-        trouble: Trouble | None = None
+        trouble = FLAWLESS
         if flaw is not None and severity > 0.0:
             rng = np.random.default_rng([self.spec.seed, press_seed, 2])
             trouble = draw_trouble(flaw, severity, self.spec.bristles, self.spec.length_mm, rng)
         spine = _spine(self.spec, float(depth_mm), float(tilt_deg))
-        return print_footprint(spine, self._tuft(press_seed, trouble), ink_load, px_per_mm, self._paper(press_seed))
+        return self.print_descent(spine, ink_load=ink_load, press_seed=press_seed, px_per_mm=px_per_mm, trouble=trouble)
 
     def descents(self, depths_mm: Sequence[float], tilt_deg: float) -> dict[float, Descent]:
         """The way down to each of the depths, all taken from one descent to the deepest, which is quicker than many.
@@ -107,10 +108,12 @@ class Brush:
             for depth in depths_mm
         }
 
-    def print_descent(self, descent: Descent, *, ink_load: float, press_seed: int, px_per_mm: float) -> Footprint:
-        """The mark that a descent leaves, as `press` would print it. Raises ValueError as `press` does."""
-        _check_print(ink_load, press_seed, px_per_mm)
-        return print_footprint(descent, self._tuft(press_seed, None), ink_load, px_per_mm, self._paper(press_seed))
+    def print_descent(
+        self, descent: Descent, *, ink_load: float, press_seed: int, px_per_mm: float, trouble: Trouble = FLAWLESS
+    ) -> Footprint:
+        """The mark that a descent leaves, as `press` prints it."""
+        tuft = self._tuft(press_seed, trouble)
+        return print_footprint(descent, tuft, ink_load, px_per_mm, self._paper(press_seed))
 
     @property
     def set_lean_deg(self) -> float:
@@ -155,7 +158,7 @@ class Brush:
             path,
             _stances(self.spec, math.ceil(deepest), float(tilt_deg)),
             math.radians(heading_deg),
-            self._tuft(press_seed, None),
+            self._tuft(press_seed),
             ink_load,
             px_per_mm,
             self._paper(press_seed),
@@ -163,22 +166,18 @@ class Brush:
 
     def _check(self, depth_mm: float, tilt_deg: float, ink_load: float, press_seed: int, px_per_mm: float) -> None:
         within("tilt_deg", tilt_deg, 0.0, MAX_TILT_DEG)
-        _check_print(ink_load, press_seed, px_per_mm)
+        within("ink_load", ink_load, 0.0, 1.0)
+        within("px_per_mm", px_per_mm, 2.0, 40.0)
+        within("press_seed", press_seed, 0, 2**63 - 1)
         within("depth_mm", depth_mm, -math.inf, self.deepest_mm(tilt_deg))
 
     # two random streams, so that the paper does not change with the number of bristles
-    def _tuft(self, press_seed: int, trouble: Trouble | None) -> Tuft:
+    def _tuft(self, press_seed: int, trouble: Trouble = FLAWLESS) -> Tuft:
         lie_rng = np.random.default_rng([self.spec.seed, press_seed, 0])
-        return Tuft(self.spec, self._bundle, self._bristles, draw_wander(self.spec, lie_rng), trouble)
+        return wet_tuft(self._bundle, self._bristles, trouble, lie_rng)
 
     def _paper(self, press_seed: int) -> np.random.Generator:
         return np.random.default_rng([self.spec.seed, press_seed, 1])
-
-
-def _check_print(ink_load: float, press_seed: int, px_per_mm: float) -> None:
-    within("ink_load", ink_load, 0.0, 1.0)
-    within("px_per_mm", px_per_mm, 2.0, 40.0)
-    within("press_seed", press_seed, 0, 2**63 - 1)
 
 
 @lru_cache(maxsize=REMEMBERED_SPINES)
@@ -204,13 +203,11 @@ def _bundle(spec: BrushSpec) -> Bundle:
     rigidity = spec.stiffness_n_mm2 * (_profile(spec, joint_mm) / spec.radius_mm) ** spec.stiffness_power
     share = np.clip(joint_mm / spec.length_mm - 0.5, 0.0, None)
     return Bundle(
+        spec,
         link_mm=link,
         radius_mm=_profile(spec, joint_mm + link),
         joint_n_mm=rigidity / link,
         rest_bend_rad=math.radians(spec.set_deg) * share / share.sum(),
-        squash_n_per_mm2=spec.squash_n_per_mm2,
-        suction_n_per_mm2=spec.suction_n_per_mm2,
-        friction=spec.friction,
     )
 
 

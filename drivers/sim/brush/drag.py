@@ -5,14 +5,14 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
 
 from brushloop.drivers.sim.brush.footprint import MARGIN_MM, Tuft, frame_around
 from brushloop.drivers.sim.brush.mechanics import SpineShape, Vector
-from brushloop.drivers.sim.brush.paper import Dots, Footprint, Image, scatter, soak
+from brushloop.drivers.sim.brush.paper import Footprint, Image, scatter, soak
 
 STEP_MM = 0.3
 """Longest distance that the commanded tip travels between two moments of a drag."""
@@ -168,10 +168,9 @@ def draw_drag(
     """Lay the patch along the path, in a frame parallel to the paper's with its origin at the first waypoint."""
     start = path[0]
     local = tuple(Waypoint(w.x_mm - start.x_mm, w.y_mm - start.y_mm, w.depth_mm) for w in path)
-    track = follow(local, stances, heading_rad)
     stamps: dict[tuple[float, float, bool], _Stamp] = {}
     laid: list[tuple[_Stamp, Moment]] = []
-    for moment in track:
+    for moment in follow(local, stances, heading_rad):
         if moment.depth_mm <= 0.0:
             continue
         load = round(ink_left(ink_load, moment.travel_mm) / LOAD_STEP) * LOAD_STEP
@@ -180,14 +179,13 @@ def draw_drag(
             stamps[key] = _stamp(stances.at(key[0], key[2]), tuft, key[1], px_per_mm)
         laid.append((stamps[key], moment))
     corners = np.concatenate([_corners_mm(*item, px_per_mm) for item in laid])
-    frame = Dots(corners[:, 0], corners[:, 1], np.zeros(0))
-    shape_px, origin = frame_around([frame], px_per_mm, MARGIN_MM)
+    shape_px, origin = frame_around(corners[:, 0], corners[:, 1], px_per_mm, MARGIN_MM)
     wet = np.zeros(shape_px, np.float32)
     load_map = np.zeros(shape_px, np.float32)
     for stamp, moment in laid:
         column, row = origin[0] + moment.x_mm * px_per_mm, origin[1] - moment.y_mm * px_per_mm
-        _lay(wet, load_map, stamp, column, row, moment.heading_rad, moment.length)
-    density = soak(wet, load_map, px_per_mm, paper_rng, tuft.spec)
+        _lay(wet, load_map, stamp, column, row, moment)
+    density = soak(wet, load_map, px_per_mm, paper_rng, tuft.bundle.spec)
     return Footprint(density, px_per_mm, origin)
 
 
@@ -202,9 +200,9 @@ class _Stamp:
 
 def _stamp(shape: SpineShape, tuft: Tuft, load: float, px_per_mm: float) -> _Stamp:
     dots = tuft.touch(shape, load)
-    dots = Dots(dots.x_mm - middle_mm(shape), dots.y_mm, dots.ink)
-    shape_px, origin = frame_around([dots], px_per_mm, STAMP_MARGIN_MM)
-    return _Stamp(scatter(dots, shape_px, origin, px_per_mm, load, tuft.spec), origin, load)
+    dots = replace(dots, x_mm=dots.x_mm - middle_mm(shape))
+    shape_px, origin = frame_around(dots.x_mm, dots.y_mm, px_per_mm, STAMP_MARGIN_MM)
+    return _Stamp(scatter(dots, shape_px, origin, px_per_mm, load, tuft.bundle.spec), origin, load)
 
 
 def _corners_mm(stamp: _Stamp, moment: Moment, px_per_mm: float) -> Vector:
@@ -216,16 +214,14 @@ def _corners_mm(stamp: _Stamp, moment: Moment, px_per_mm: float) -> Vector:
     return np.column_stack([moment.x_mm + cos * u - sin * v, moment.y_mm + sin * u + cos * v])
 
 
-def _lay(
-    wet: Image, load_map: Image, stamp: _Stamp, column: float, row: float, heading_rad: float, length: float
-) -> None:
-    """Shorten a stamp to `length`, turn it, put its middle at (column, row), and keep the wetter of each pixel."""
+def _lay(wet: Image, load_map: Image, stamp: _Stamp, column: float, row: float, moment: Moment) -> None:
+    """Shorten and turn a stamp as at the moment, put its middle there, and keep the wetter of each pixel."""
     h, w = stamp.wet.shape
     ox, oy = stamp.origin_px
     far = math.ceil(math.hypot(max(ox, w - ox), max(oy, h - oy))) + 1
     left, top = max(0, int(column) - far), max(0, int(row) - far)
     right, bottom = min(wet.shape[1], int(column) + far + 1), min(wet.shape[0], int(row) + far + 1)
-    cos, sin = math.cos(heading_rad), math.sin(heading_rad)
+    length, cos, sin = moment.length, math.cos(moment.heading_rad), math.sin(moment.heading_rad)
     # rows run against y; pixel centres lie on halves here and on integers in OpenCV
     linear = np.array([[length * cos, sin], [-length * sin, cos]])
     offset = np.array([column - left - 0.5, row - top - 0.5]) - linear @ np.array([ox - 0.5, oy - 0.5])

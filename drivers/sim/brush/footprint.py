@@ -69,7 +69,7 @@ class Flaw(StrEnum):
 class Trouble:
     """One flaw as it happens in one press; m hairs."""
 
-    flaw: Flaw
+    flaw: Flaw | None
     severity: float
     """From 0, none, to 1, the worst."""
     side: float
@@ -137,6 +137,10 @@ def draw_trouble(flaw: Flaw, severity: float, hairs: int, length_mm: float, rng:
     return Trouble(flaw, severity, side, cleft, thirst, length_mm)
 
 
+FLAWLESS = Trouble(None, 0.0, 1.0, 0.0, np.zeros(0), 0.0)
+"""Changes nothing."""
+
+
 def natural_split(ink_load: float, depth_mm: float, rng: np.random.Generator) -> float:
     """Severity of a split that happens by itself, mostly 0: an emptying brush loses the film that holds it together."""
     chance = SPLIT_CHANCE * max(0.0, 1.0 - ink_load / COHESIVE_LOAD)
@@ -178,24 +182,6 @@ class Bristles:
     """Sideways offset of the tip when pressed: no bundle is set quite straight."""
 
 
-@dataclass(frozen=True, slots=True)
-class Wander:
-    """What differs between two presses of one cell: how the wet bundle lies, and the ink per clump."""
-
-    spread: float
-    """Factor on the sideways spread."""
-    reach_mm: float
-    """Extra reach of the tip along the paper."""
-    bow_mm: float
-    """Extra sideways offset of the tip."""
-    clump_ink: Vector
-    """(CLUMPS,) relative ink per clump."""
-    strand_mm: Vector
-    """(m,) sideways stray of each hair."""
-    place_mm: tuple[float, float]
-    """Offset of the whole mark, (x, y)."""
-
-
 def grow_bristles(spec: BrushSpec, rng: np.random.Generator) -> Bristles:
     """Draw the bristles evenly over the unit disc, clumped by nearest of `CLUMPS` random centres."""
     # sunflower spiral with jitter: even cover without a visible lattice
@@ -212,15 +198,6 @@ def grow_bristles(spec: BrushSpec, rng: np.random.Generator) -> Bristles:
     short = np.abs(rng.normal(0.0, spec.uneven_mm, count)) * np.sqrt(ring)
     phase = STATION_MM * (rng.random(count) - 0.5)
     return Bristles(across, outward, short, phase, far.argmin(axis=1), float(rng.normal(0.0, spec.bow_mm)))
-
-
-def draw_wander(spec: BrushSpec, rng: np.random.Generator) -> Wander:
-    """Draw the natural variation of one press."""
-    spread = float(np.exp(spec.spread_wander * rng.standard_normal()))
-    reach, bow = rng.normal(0.0, spec.reach_wander_mm), rng.normal(0.0, spec.bow_wander_mm)
-    clump_ink, strand = rng.random(CLUMPS), rng.normal(0.0, spec.strand_mm, spec.bristles)
-    x, y = rng.normal(0.0, spec.place_wander_mm, 2)
-    return Wander(spread, float(reach), float(bow), clump_ink, strand, (float(x), float(y)))
 
 
 def clump_flow(clump_ink: Vector, ink_load: float) -> Vector:
@@ -240,17 +217,23 @@ TRAIL_STEPS = 2
 
 @dataclass(frozen=True, slots=True)
 class Tuft:
-    """A wet brush as it meets the paper: its mechanics, its hairs, how they lie in this press, and any flaw."""
+    """A wet brush as it meets the paper in one press: its mechanics, its hairs, how they lie, and any flaw."""
 
-    spec: BrushSpec
     bundle: Bundle
     bristles: Bristles
-    wander: Wander
-    trouble: Trouble | None = None
-
-    def load(self, ink_load: float) -> float:
-        """The load that the hairs carry to the paper."""
-        return ink_load if self.trouble is None else self.trouble.load(ink_load)
+    trouble: Trouble
+    spread: float
+    """Factor on the sideways spread."""
+    reach_mm: float
+    """Extra reach of the tip along the paper."""
+    bow_mm: float
+    """Sideways offset of the tip when pressed: that of the individual brush, and what this press adds."""
+    clump_ink: Vector
+    """(CLUMPS,) relative ink per clump."""
+    strand_mm: Vector
+    """(m,) sideways stray of each hair."""
+    place_mm: tuple[float, float]
+    """Offset of the whole mark, (x, y)."""
 
     def touch(self, shape: SpineShape, load: float) -> Dots:
         """Where the bristles of one spine shape come within the ink film of the paper.
@@ -258,11 +241,9 @@ class Tuft:
         A section that would reach below the paper is cut off flat by it, which lowers its mean half thickness
         from r to r - squash / 2; the half width rises to r (r / (r - squash / 2))^splay_power.
         """
-        bundle, bristles, wander = self.bundle, self.bristles, self.wander
-        flow = clump_flow(wander.clump_ink, load)[bristles.clump]
-        if self.trouble is not None:
-            flow = self.trouble.flow(flow)
-        film_mm = DRY_FILM_MM + (self.spec.film_mm - DRY_FILM_MM) * load
+        bundle, bristles, spec = self.bundle, self.bristles, self.bundle.spec
+        flow = self.trouble.flow(clump_flow(self.clump_ink, load)[bristles.clump])
+        film_mm = DRY_FILM_MM + (spec.film_mm - DRY_FILM_MM) * load
         link_mm = bundle.link_mm
         node = np.arange(bundle.radius_mm.size, dtype=np.float64)
         near = np.flatnonzero(shape.squash_mm > -film_mm)
@@ -272,55 +253,62 @@ class Tuft:
         first = max(0.0, float(near[0]) - 1.0)
         at = np.arange(first, node[-1], STATION_MM / link_mm)
         x, z, phi, radius = (np.interp(at, node, v) for v in (shape.x_mm, shape.z_mm, shape.phi_rad, bundle.radius_mm))
-        squash = np.interp(at, node, np.maximum(_smooth(shape.squash_mm, self.spec.splay_reach_mm / link_mm), 0.0))
+        squash = np.interp(at, node, np.maximum(_smooth(shape.squash_mm, spec.splay_reach_mm / link_mm), 0.0))
         flatter = radius / (radius - 0.5 * np.minimum(squash, 0.9 * radius))
-        half_width = wander.spread * radius * flatter**self.spec.splay_power
+        half_width = self.spread * radius * flatter**spec.splay_power
 
         # (m, stations): rows are bristles
         outward, across = bristles.outward[:, None], bristles.across[:, None]
         dot_z = z + outward * radius * np.sin(phi)
         dot_x = x - outward * radius * np.cos(phi)
         along = (at - first) / max(node[-1] - first, 1.0)
-        bow = (bristles.bow_mm + wander.bow_mm) * along**2
-        dot_y = across * half_width + bow + wander.strand_mm[:, None]
-        dot_x += bristles.phase_mm[:, None] - wander.reach_mm * along
-        if self.trouble is not None:
-            dot_x, dot_y = self.trouble.displace(dot_x, dot_y, across, (node[-1] - at) * link_mm, squash, half_width)
-        ends = (node[-1] - at) * link_mm >= bristles.short_mm[:, None]
+        dot_y = across * half_width + self.bow_mm * along**2 + self.strand_mm[:, None]
+        dot_x += bristles.phase_mm[:, None] - self.reach_mm * along
+        to_tip = (node[-1] - at) * link_mm
+        dot_x, dot_y = self.trouble.displace(dot_x, dot_y, across, to_tip, squash, half_width)
+        ends = to_tip >= bristles.short_mm[:, None]
         ink = flow[:, None] * np.clip(1.5 * (1.0 - np.maximum(dot_z, 0.0) / film_mm), 0.0, 1.0) * ends
         inked = ink > 0.0
-        aside_x, aside_y = wander.place_mm
+        aside_x, aside_y = self.place_mm
         return Dots(dot_x[inked] + aside_x, dot_y[inked] + aside_y, ink[inked])
+
+
+def wet_tuft(bundle: Bundle, bristles: Bristles, trouble: Trouble, rng: np.random.Generator) -> Tuft:
+    """Draw what differs between two presses of one condition: how the wet bundle lies, and the ink per clump."""
+    spec = bundle.spec
+    spread = float(np.exp(spec.spread_wander * rng.standard_normal()))
+    reach, bow = rng.normal(0.0, spec.reach_wander_mm), rng.normal(0.0, spec.bow_wander_mm)
+    clump_ink, strand = rng.random(CLUMPS), rng.normal(0.0, spec.strand_mm, spec.bristles)
+    x, y = rng.normal(0.0, spec.place_wander_mm, 2)
+    bow_mm = bristles.bow_mm + float(bow)
+    return Tuft(bundle, bristles, trouble, spread, float(reach), bow_mm, clump_ink, strand, (float(x), float(y)))
 
 
 def print_footprint(
     path: Sequence[SpineShape], tuft: Tuft, ink_load: float, px_per_mm: float, paper_rng: np.random.Generator
 ) -> Footprint:
     """Print the load path `path` of a tuft as ink on fresh paper."""
-    load = tuft.load(ink_load)
+    load, spec = tuft.trouble.load(ink_load), tuft.bundle.spec
     # newest first, so that the final shape is always among them
     dots = [tuft.touch(shape, load) for shape in path[::-1][::TRAIL_STEPS]]
-    shape_px, origin = frame_around(dots, px_per_mm, MARGIN_MM)
+    x_mm, y_mm = np.concatenate([d.x_mm for d in dots]), np.concatenate([d.y_mm for d in dots])
+    shape_px, origin = frame_around(x_mm, y_mm, px_per_mm, MARGIN_MM)
 
     # hairs slide over their own wet trail: the sheet keeps the wettest moment, not the sum
     wet = np.zeros(shape_px, np.float32)
     for moment, d in enumerate(dots):
-        laid = scatter(d, shape_px, origin, px_per_mm, load, tuft.spec)
-        np.maximum(wet, laid if moment == 0 else laid * np.float32(tuft.spec.trail_share), out=wet)
-    density = soak(wet, load, px_per_mm, paper_rng, tuft.spec)
-    if tuft.trouble is not None:
-        density = density * np.float32(tuft.trouble.tone)
+        laid = scatter(d, shape_px, origin, px_per_mm, load, spec)
+        np.maximum(wet, laid if moment == 0 else laid * np.float32(spec.trail_share), out=wet)
+    density = soak(wet, load, px_per_mm, paper_rng, spec) * np.float32(tuft.trouble.tone)
     return Footprint(density, px_per_mm, origin)
 
 
 def frame_around(
-    dots: Sequence[Dots], px_per_mm: float, margin_mm: float
+    x_mm: Vector, y_mm: Vector, px_per_mm: float, margin_mm: float
 ) -> tuple[tuple[int, int], tuple[float, float]]:
-    """(rows, columns) of a raster that holds the dots and the origin with a margin, and (column, row) of the origin."""
-    x = np.concatenate([d.x_mm for d in dots])
-    y = np.concatenate([d.y_mm for d in dots])
-    left, right = min(0.0, x.min(initial=0.0)) - margin_mm, max(0.0, x.max(initial=0.0)) + margin_mm
-    down, up = min(0.0, y.min(initial=0.0)) - margin_mm, max(0.0, y.max(initial=0.0)) + margin_mm
+    """(rows, columns) of a raster that holds points and the origin with a margin, and (column, row) of the origin."""
+    left, right = x_mm.min(initial=0.0) - margin_mm, x_mm.max(initial=0.0) + margin_mm
+    down, up = y_mm.min(initial=0.0) - margin_mm, y_mm.max(initial=0.0) + margin_mm
     shape_px = (int(np.ceil((up - down) * px_per_mm)), int(np.ceil((right - left) * px_per_mm)))
     return shape_px, (float(round(-left * px_per_mm)), float(round(up * px_per_mm)))
 

@@ -9,12 +9,13 @@ ACM TOG 39(4), 2020), by damped Newton.
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+
+from brushloop.drivers.sim.brush.spec import BrushSpec
 
 Vector = NDArray[np.float64]
 
@@ -44,6 +45,7 @@ ANGLE_TOLERANCE_RAD = 1e-6
 class Bundle:
     """Mechanical description of a free bundle cut into n links, ordered from the ferrule to the tip."""
 
+    spec: BrushSpec
     link_mm: float
     radius_mm: Vector
     """(n,) free radius at the far end of each link."""
@@ -51,11 +53,6 @@ class Bundle:
     """(n,) torsion stiffness of the joint at the near end of each link, N mm / rad."""
     rest_bend_rad: Vector
     """(n,) rest angle of each joint: the natural set of the bundle."""
-    squash_n_per_mm2: float
-    """Force per mm of length and per mm of squash."""
-    suction_n_per_mm2: float
-    """Peak capillary stress over the bundle's diameter, for sections just clear of the paper."""
-    friction: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,12 +83,13 @@ def press_spine(bundle: Bundle, depth_mm: float, tilt_rad: float) -> tuple[Spine
 
 def lower_spine(bundle: Bundle, lowered_mm: Iterable[float], tilt_rad: float) -> tuple[SpineShape, ...]:
     """The spine at each of the rising depths `lowered_mm`, which are the load steps of one descent."""
-    return tuple(_loaded(bundle, tilt_rad, ((0.0, float(lowered)) for lowered in lowered_mm)))
+    spine = _Spine(bundle, tilt_rad)
+    return tuple(spine.load(0.0, float(lowered)) for lowered in lowered_mm)
 
 
 def rest_spine(bundle: Bundle, tilt_rad: float) -> SpineShape:
     """The unloaded spine at zero touch."""
-    return _unloaded(bundle, tilt_rad).shape(tilt_rad + np.cumsum(bundle.rest_bend_rad))
+    return _Spine(bundle, tilt_rad).shape()
 
 
 def pull_spine(bundle: Bundle, depth_mm: int, tilt_rad: float) -> tuple[SpineShape, ...]:
@@ -100,48 +98,34 @@ def pull_spine(bundle: Bundle, depth_mm: int, tilt_rad: float) -> tuple[SpineSha
     Positions are relative to the ferrule as in `press_spine`. The bundle slides all the time, so the result does
     not depend on how it came down; the ferrule advances half a mm with each load step, and once more at each depth.
     """
+    spine, shapes = _Spine(bundle, tilt_rad), list[SpineShape]()
     lowered_mm = [lowered for depth in range(1, depth_mm + 1) for lowered in (depth - 0.5, depth, depth)]
-    steps = [(LOAD_STEP_MM * count, lowered) for count, lowered in enumerate(lowered_mm, 1)]
-    path = zip(steps, _loaded(bundle, tilt_rad, steps), strict=True)
-    shapes = [replace(shape, x_mm=shape.x_mm - gone) for (gone, _), shape in path]
+    for count, lowered in enumerate(lowered_mm, 1):
+        gone = LOAD_STEP_MM * count
+        shape = spine.load(gone, lowered)
+        shapes.append(replace(shape, x_mm=shape.x_mm - gone))
     return tuple(shapes[2::3])
 
 
-def _loaded(bundle: Bundle, tilt_rad: float, steps: Iterable[tuple[float, float]]) -> Iterator[SpineShape]:
-    """The spine after each load step: mm that the ferrule is then moved along +x, and down, since zero touch."""
-    start = _unloaded(bundle, tilt_rad)
-    phi, last_x, last_normal = tilt_rad + np.cumsum(bundle.rest_bend_rad), start.last_x, start.last_normal
-    for gone, lowered in steps:
-        step = start.moved(gone, lowered, last_x, last_normal)
-        phi = step.solve(phi)
-        shape = step.shape(phi)
-        last_x, last_normal = shape.x_mm, shape.normal_n
-        yield shape
+class _Spine:
+    """A bundle on its way over the paper, from zero touch; it holds how it lay at the end of the last load step."""
 
+    def __init__(self, bundle: Bundle, tilt_rad: float) -> None:
+        self.bundle = bundle
+        self.tilt_rad = tilt_rad
+        self.phi = tilt_rad + np.cumsum(bundle.rest_bend_rad)
+        self.start_x = self.clamp_x = bundle.link_mm * float(np.sin(self.phi).sum())
+        self.start_z = self.clamp_z = bundle.link_mm * float(np.cos(self.phi).sum())
+        self.last_x = self.shape().x_mm
+        self.last_normal = np.zeros_like(self.phi)
 
-def _unloaded(bundle: Bundle, tilt_rad: float) -> _LoadStep:
-    phi = tilt_rad + np.cumsum(bundle.rest_bend_rad)
-    clamp_x = bundle.link_mm * float(np.sin(phi).sum())
-    clamp_z = bundle.link_mm * float(np.cos(phi).sum())
-    x = clamp_x - bundle.link_mm * np.cumsum(np.sin(phi))
-    return _LoadStep(bundle, tilt_rad, clamp_x, clamp_z, x, np.zeros_like(phi))
-
-
-@dataclass(frozen=True, slots=True)
-class _LoadStep:
-    """The energy of one load step, given node positions and contact forces at the end of the last."""
-
-    bundle: Bundle
-    tilt_rad: float
-    clamp_x: float
-    clamp_z: float
-    last_x: Vector
-    last_normal: Vector
-
-    def moved(self, gone_mm: float, lowered_mm: float, last_x: Vector, last_normal: Vector) -> _LoadStep:
-        """The next load step, the ferrule moved along +x and down; positions and forces are those of the last step."""
-        clamp_x, clamp_z = self.clamp_x + gone_mm, self.clamp_z - lowered_mm
-        return _LoadStep(self.bundle, self.tilt_rad, clamp_x, clamp_z, last_x, last_normal)
+    def load(self, gone_mm: float, lowered_mm: float) -> SpineShape:
+        """Carry out a load step: the ferrule is then so far along +x, and down, from where it was at zero touch."""
+        self.clamp_x, self.clamp_z = self.start_x + gone_mm, self.start_z - lowered_mm
+        self.phi = self.solve(self.phi)
+        shape = self.shape()
+        self.last_x, self.last_normal = shape.x_mm, shape.normal_n
+        return shape
 
     def solve(self, phi: Vector) -> Vector:
         """Minimise the energy from `phi` by Newton with a backtracking line search; stops at `MAX_NEWTON`."""
@@ -159,12 +143,12 @@ class _LoadStep:
             energy, gradient, hessian = self.derivatives(phi)
         return phi
 
-    def shape(self, phi: Vector) -> SpineShape:
-        """Positions, squash and contact forces that belong to the angles `phi`."""
-        sin = np.sin(phi)
-        x, z = self._nodes(sin, np.cos(phi))
+    def shape(self) -> SpineShape:
+        """Positions, squash and contact forces as the spine lies."""
+        sin = np.sin(self.phi)
+        x, z = self._nodes(sin, np.cos(self.phi))
         squash = self.bundle.radius_mm * _broadside(sin) - z
-        return SpineShape(x, z, phi, squash, np.maximum(0.0, self._contact(squash)[1]))
+        return SpineShape(x, z, self.phi, squash, np.maximum(0.0, self._contact(squash)[1]))
 
     def energy(self, phi: Vector) -> float:
         """Bending, squash and lagged friction energy in N mm."""
@@ -174,7 +158,7 @@ class _LoadStep:
         squash = self.bundle.radius_mm * _broadside(sin) - z
         slid = np.hypot(x - self.last_x, SLIP_SMOOTHING_MM)
         stored = 0.5 * self.bundle.joint_n_mm @ bend**2 + self._contact(squash)[0].sum()
-        return float(stored + self.bundle.friction * self.last_normal @ slid)
+        return float(stored + self.bundle.spec.friction * self.last_normal @ slid)
 
     def derivatives(self, phi: Vector) -> tuple[float, Vector, Vector]:
         """Energy, its gradient (n,) and a Hessian (n, n), without its concave terms if it is not convex."""
@@ -187,12 +171,12 @@ class _LoadStep:
         stored, normal, stiffness = self._contact(squash)
         slip = x - self.last_x
         slid = np.hypot(slip, SLIP_SMOOTHING_MM)
-        limit = b.friction * self.last_normal
+        limit = b.spec.friction * self.last_normal
         drag = limit * slip / slid
         drag_stiffness = limit * SLIP_SMOOTHING_MM**2 / slid**3
 
         # rows: nodes, columns: angles; a node moves with every link above it, and `sink` is d(squash)
-        above = _minus_links(b.link_mm, n)
+        above = -b.link_mm * np.tri(n)
         along, sink = above * cos, above * sin
         sink.ravel()[:: n + 1] += b.radius_mm * sin * cos / broad
 
@@ -210,13 +194,13 @@ class _LoadStep:
         spring = b.joint_n_mm
         flat = hessian.ravel()
         diagonal = flat[:: n + 1]
-        diagonal += _with_next(spring)
+        diagonal += spring + np.append(spring[1:], 0.0)
         flat[1 :: n + 1] -= spring[1:]
         flat[n :: n + 1] -= spring[1:]
         diagonal += curve
         if not _is_convex(hessian):
             diagonal -= np.minimum(curve, 0.0)
-        total = float(0.5 * torque @ bend + stored.sum() + b.friction * self.last_normal @ slid)
+        total = float(0.5 * torque @ bend + stored.sum() + b.spec.friction * self.last_normal @ slid)
         return total, gradient, hessian
 
     def _nodes(self, sin: Vector, cos: Vector) -> tuple[Vector, Vector]:
@@ -225,20 +209,17 @@ class _LoadStep:
         return self.clamp_x - ds * np.cumsum(sin), self.clamp_z - ds * np.cumsum(cos)
 
     def _bend(self, phi: Vector) -> Vector:
-        bend = phi.copy()
-        bend[0] -= self.tilt_rad
-        bend[1:] -= phi[:-1]
-        return bend - self.bundle.rest_bend_rad
+        return np.diff(phi, prepend=self.tilt_rad) - self.bundle.rest_bend_rad
 
     def _contact(self, squash: Vector) -> tuple[Vector, Vector, Vector]:
         """Energy, force and stiffness (n,): soft, then packed, and pulled down when just clear."""
-        soft = self.bundle.squash_n_per_mm2 * self.bundle.link_mm
+        soft = self.bundle.spec.squash_n_per_mm2 * self.bundle.link_mm
         hard = PACKED_N_PER_MM2 * self.bundle.link_mm
         inside = np.maximum(0.0, squash)
         over = np.maximum(0.0, squash - HARD_CORE * self.bundle.radius_mm)
         # the pull is a parabola over the meniscus, 0 at touch and at its end, so that Newton sees no jump
         gap = np.minimum(np.maximum(-squash / MENISCUS_MM, 0.0), 1.0)
-        pull = 8.0 * self.bundle.suction_n_per_mm2 * self.bundle.radius_mm * self.bundle.link_mm
+        pull = 8.0 * self.bundle.spec.suction_n_per_mm2 * self.bundle.radius_mm * self.bundle.link_mm
         energy = 0.5 * soft * inside**2 + 0.5 * hard * over**2
         energy += pull * MENISCUS_MM * (gap**2 / 2.0 - gap**3 / 3.0)
         force = soft * inside + hard * over - pull * gap * (1.0 - gap)
@@ -250,21 +231,6 @@ class _LoadStep:
 def _broadside(sin: Vector) -> Vector:
     """|sin phi|, rounded where the spine is upright: how much of the local radius points at the paper."""
     return np.hypot(sin, UPRIGHT_SMOOTHING)
-
-
-@functools.lru_cache(maxsize=8)
-def _minus_links(link_mm: float, n: int) -> NDArray[np.float64]:
-    """(n, n) lower triangle of -`link_mm`; not to be written to."""
-    triangle = -link_mm * np.tri(n)
-    triangle.flags.writeable = False
-    return triangle
-
-
-def _with_next(values: Vector) -> Vector:
-    """Each value plus the one after it; the last has none."""
-    both = values.copy()
-    both[:-1] += values[1:]
-    return both
 
 
 def _is_convex(hessian: NDArray[np.float64]) -> bool:
