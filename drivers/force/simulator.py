@@ -41,22 +41,18 @@ class ForceBoard:
     def __init__(
         self, force: Callable[[float], Wrench], *, noise_n: float = 0.0, noise_nm: float = 0.0, seed: int = 1
     ) -> None:
-        self.commands: list[bytes] = []
-        """What was sent to the board, in order."""
         self.streaming = False
         self._force = force
         self._noise = (noise_n,) * 3 + (noise_nm,) * 3
         self._random = random.Random(seed)
         self.next_fault: Callable[[], str | None] = lambda: None
         """Asked for the fault of each round."""
-        self._before: Wrench | None = None
+        self._last: Wrench = (0.0,) * 6
 
     def obey(self, frame: CanFrame) -> None:
         """Carry out a command frame from the bus; ignore other frames."""
-        if frame.can_id == COMMAND_ID and not frame.error:
-            self.commands.append(frame.data)
-            if frame.data in (START, STOP):
-                self.streaming = frame.data == START
+        if frame.can_id == COMMAND_ID and not frame.error and frame.data in (START, STOP):
+            self.streaming = frame.data == START
 
     def round(self, t_s: float) -> Iterator[CanFrame]:
         """The frames of the round that is due at `t_s`; none while the board is stopped."""
@@ -69,12 +65,10 @@ class ForceBoard:
             self.streaming = fault != "bus-off"
             yield CanFrame(BUS_OFF if fault == "bus-off" else BUS_ERROR, bytes(8), error=True)
             return
-        values = self._force(t_s)
-        fx, fy, fz, mx, my, mz = (v + self._random.gauss(0.0, s) for v, s in zip(values, self._noise, strict=True))
-        if fault == "stuck" and self._before is not None:
-            fx, fy, fz, mx, my, mz = self._before
-        self._before = (fx, fy, fz, mx, my, mz)
-        wrench = (fx, fy, math.nan if fault == "nan" else fz, mx, my, mz)
+        if fault != "stuck":
+            pairs = zip(self._force(t_s), self._noise, strict=True)
+            self._last = tuple(value + self._random.gauss(0.0, sigma) for value, sigma in pairs)
+        wrench = tuple(math.nan if fault == "nan" and axis == 2 else value for axis, value in enumerate(self._last))
         for place, (can_id, data) in enumerate(encode_round(wrench)):
             if fault != "no-second" or place != 1:
                 yield CanFrame(can_id, data)
@@ -82,7 +76,6 @@ class ForceBoard:
 
 FRAME_S = 0.0002
 """From one frame of a round to the next on the bus."""
-MAX_LINE_BYTES = 256
 BACKLOG_BYTES = 32 * 1024
 """A client that does not read is sent nothing more until it has caught up."""
 
@@ -111,25 +104,24 @@ class SocketcandServer(LoopbackServer):
         writer.write(b"< hi >")
         try:
             while True:
-                words = (await _command(reader)).split(" ")
-                match words:
+                command = await reader.readuntil(b">")
+                match command.decode("ascii").strip(" \r\n<>").split(" "):
                     case ["open", name]:
                         writer.write(b"< ok >" if name == LOOPBACK_CHANNEL else b"< error could not open bus >")
                     case ["rawmode"]:
                         writer.write(b"< ok >")
                         self._listeners.add(writer)
-                    case ["send", can_id, length, *data]:
-                        await self._sent(_frame(can_id, length, data))
+                    case ["send", can_id, _, *data]:
+                        self.board.obey(CanFrame(int(can_id, 16), bytes(int(byte, 16) for byte in data)))
+                        if self._streaming is None or self._streaming.done():
+                            self._streaming = asyncio.create_task(self._stream(), name="force rounds")
                     case _:
                         writer.write(b"< error unknown command >")
                 await writer.drain()
+        except ValueError as error:
+            raise ProtocolViolation("socketcand", "read", f"not a command: {error}") from None
         finally:
             self._listeners.discard(writer)
-
-    async def _sent(self, frame: CanFrame) -> None:
-        self.board.obey(frame)
-        if self._streaming is None or self._streaming.done():
-            self._streaming = asyncio.create_task(self._stream(), name="force rounds")
 
     async def _stream(self) -> None:
         loop = asyncio.get_running_loop()
@@ -145,27 +137,6 @@ class SocketcandServer(LoopbackServer):
                     writer.write(text)
             due_s = max(due_s + self._period_s, loop.time())
             await asyncio.sleep(due_s - loop.time())
-
-
-async def _command(reader: asyncio.StreamReader) -> str:
-    """The words between `<` and `>`. Raises `ProtocolViolation`, `IncompleteReadError` if the client disconnected."""
-    try:
-        raw = await reader.readuntil(b">")
-    except asyncio.LimitOverrunError:
-        raise ProtocolViolation("socketcand", "read", "a command without an end") from None
-    if len(raw) > MAX_LINE_BYTES or not raw.isascii():
-        raise ProtocolViolation("socketcand", "read", f"not a command: {raw[:40]!r}")
-    return raw.decode().strip(" \r\n<>")
-
-
-def _frame(can_id: str, length: str, data: list[str]) -> CanFrame:
-    try:
-        frame = CanFrame(int(can_id, 16), bytes(int(byte, 16) for byte in data))
-        if len(frame.data) != int(length, 16):
-            raise ValueError("length")
-    except ValueError:
-        raise ProtocolViolation("socketcand", "send", f"not a frame: {can_id} {length} {data[:8]}") from None
-    return frame
 
 
 def _ascii(frame: CanFrame, at_s: float) -> str:

@@ -20,6 +20,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 import statistics
 import struct
 import threading
@@ -43,7 +44,7 @@ from brushloop.drivers.host import Clock
 if TYPE_CHECKING:
     import can
 
-Wrench = tuple[float, float, float, float, float, float]
+Wrench = tuple[float, ...]
 """Fx, Fy, Fz in N and Mx, My, Mz in Nm, in the sensor's frame."""
 
 LOOPBACK_CHANNEL = "loopback-force-board"
@@ -100,9 +101,7 @@ class RoundAssembler:
         self._values += _PAIR.unpack(data)
         if place < 2:
             return None
-        fx, fy, fz, mx, my, mz = self._values
-        self._values = []
-        wrench = (fx, fy, fz, mx, my, mz)
+        wrench, self._values = tuple(self._values), []
         # Written so that NaN fails the check.
         if not all(abs(value) <= limit for value, limit in zip(wrench, MEASURABLE, strict=True)):
             self.refused += 1
@@ -175,7 +174,6 @@ class RoundStream:
     def __init__(self, table: ForceTable, clock: Clock, on_round: Callable[[Round], None]) -> None:
         """`on_round` gets each round, in the reader's thread."""
         self._table = table
-        self._name = f"{table.interface} {table.channel}"
         self.assembler = RoundAssembler()
         """Counts the rounds that were dropped."""
         self._clock = clock
@@ -213,29 +211,29 @@ class RoundStream:
             bus = self._open()
         except Exception as error:
             # Back ends raise arbitrary exceptions if a library or a package is missing.
-            self._lose(f"cannot open {self._name}: {error}", "Check the adapter and that its interface is up.")
+            name = f"{self._table.interface} {self._table.channel}"
+            self.loss = (f"cannot open {name}: {error}", "Check the adapter and that its interface is up.")
             return
         try:
-            bus.send(command(START), timeout=1.0)
-            heard, quiet_s = False, 0.0
+            self._command(bus, START)
+            quiet_s = -math.inf  # until the board streams
             while self.loss is None and not self._closing.is_set():
-                message = bus.recv(RECEIVE_S)
-                if message is not None:
-                    heard, quiet_s = True, 0.0
+                if (message := bus.recv(RECEIVE_S)) is not None:
+                    quiet_s = 0.0
                     self._take(message)
                     continue
                 # Only time in which the bus was listened to: a computer that was held up has missed nothing.
                 quiet_s += RECEIVE_S
-                if heard and quiet_s > SILENT_S:
+                if quiet_s > SILENT_S:
                     self._lose_bus(f"has been silent for {SILENT_S:g} s")
         except (can.CanError, OSError) as error:
             self._lose_bus(f"failed: {error}")
         finally:
             with contextlib.suppress(can.CanError, OSError):
-                bus.send(command(STOP), timeout=1.0)
+                self._command(bus, STOP)
             bus.shutdown()
             if not self._closing.is_set() and self.loss is None:
-                self._lose("the reader failed", "Connect again.")
+                self.loss = ("the reader failed", "Connect again.")
 
     def _open(self) -> can.BusABC:
         import can
@@ -246,6 +244,11 @@ class RoundStream:
         logging.getLogger("can").setLevel(logging.ERROR)
         gateway: dict[str, Any] = {} if table.host is None else {"host": table.host, "port": table.port}
         return can.Bus(table.channel, table.interface, ignore_config=True, bitrate=table.bitrate, **gateway)
+
+    def _command(self, bus: can.BusABC, data: bytes) -> None:
+        import can
+
+        bus.send(can.Message(arbitration_id=COMMAND_ID, is_extended_id=False, data=data), timeout=1.0)
 
     def _take(self, message: can.Message) -> None:
         if message.is_error_frame:
@@ -273,21 +276,11 @@ class RoundStream:
         self._on_round(self.newest)
 
     def _lose_bus(self, what: str) -> None:
-        self._lose(
-            f"the bus {self._name} {what}",
+        self.loss = (
+            f"the bus {self._table.interface} {self._table.channel} {what}",
             f"Check wiring, termination and that both ends run at {self._table.bitrate} bit/s; "
             "then set the interface down and up, and connect again.",
         )
-
-    def _lose(self, what: str, remedy: str) -> None:
-        self.loss = (what, remedy)
-
-
-def command(data: bytes) -> can.Message:
-    """Make the CAN frame of a command to the board."""
-    import can
-
-    return can.Message(arbitration_id=COMMAND_ID, is_extended_id=False, data=data)
 
 
 class SriM8123:
@@ -378,9 +371,18 @@ class SriM8123:
             if len(rounds) < MIN_BIAS_ROUNDS:
                 what = f"{len(rounds)} rounds in {seconds:g} s, {MIN_BIAS_ROUNDS} are needed"
                 raise DeviceTimeout(DEVICE, "bias", what, remedy="Average for longer.")
-            axes = zip(*rounds, strict=True)
-            fx, fy, fz, mx, my, mz = (self._still_mean(name, axis) for name, axis in zip(AXES, axes, strict=True))
-            self.bias_wrench = (fx, fy, fz, mx, my, mz)
+            axes = list(zip(*rounds, strict=True))
+            for name, values in zip(AXES, axes, strict=True):
+                limit, unit = (STILL_N, "N") if name.startswith("F") else (STILL_NM, "Nm")
+                if (deviation := statistics.stdev(values)) > limit:
+                    raise DeviceError(
+                        DEVICE,
+                        "bias",
+                        f"{name} varied by {deviation:.4f} {unit} (standard deviation), limit {limit:g} {unit}",
+                        condition="The previous bias remains.",
+                        remedy="Let nothing touch the brush, wait until the arm is still, and try again.",
+                    )
+            self.bias_wrench = tuple(statistics.fmean(values) for values in axes)
 
     @property
     def stream(self) -> RoundStream:
@@ -406,16 +408,3 @@ class SriM8123:
     def _sample(self, stamp: Stamp, wrench: Wrench) -> ForceSample:
         fx, fy, fz, mx, my, mz = (raw - bias for raw, bias in zip(wrench, self.bias_wrench, strict=True))
         return ForceSample(stamp, (fx, fy, fz), (mx, my, mz))
-
-    def _still_mean(self, name: str, values: tuple[float, ...]) -> float:
-        limit, unit = (STILL_N, "N") if name.startswith("F") else (STILL_NM, "Nm")
-        deviation = statistics.stdev(values)
-        if deviation > limit:
-            raise DeviceError(
-                DEVICE,
-                "bias",
-                f"{name} varied by {deviation:.4f} {unit} (standard deviation), limit {limit:g} {unit}",
-                condition="The previous bias remains.",
-                remedy="Let nothing touch the brush, wait until the arm is still, and try again.",
-            )
-        return statistics.fmean(values)

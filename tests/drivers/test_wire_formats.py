@@ -29,7 +29,9 @@ from brushloop.drivers.arcs.wire import (
     numbers,
 )
 from brushloop.drivers.errors import DeviceError, ProtocolViolation
-from brushloop.drivers.force.sri_m8123 import Wrench, command, encode_round
+from brushloop.drivers.force.sri_m8123 import COMMAND_ID, Wrench, encode_round
+from brushloop.drivers.force.sri_m8123 import START as START_BOARD
+from brushloop.drivers.force.sri_m8123 import STOP as STOP_BOARD
 from brushloop.drivers.ink import pump, station
 from brushloop.drivers.ink.port import crc16
 from brushloop.drivers.ink.simulator import PumpFirmware, StationFirmware
@@ -117,7 +119,7 @@ PUBLISHED: list[tuple[bytes, bytes]] = [
         b"".join(can_id.to_bytes(2) + data for can_id, data in encode_round(WRENCH)),
         bytes.fromhex("0291 0000803f 000000c0  0292 00006040 0000803e  0293 000000bf 0000003e"),
     ),
-    (command(b"\x02").arbitration_id.to_bytes(2), bytes.fromhex("0080")),
+    (COMMAND_ID.to_bytes(2) + START_BOARD + STOP_BOARD, bytes.fromhex("0080 02 00")),
     (pump.write_register(1, 1, 5000), bytes.fromhex("01 06 00 01 13 88 D5 5C")),
     (START, bytes.fromhex("01 06 00 04 00 01 09 CB")),
     (pump.write_register(1, 4, 0), bytes.fromhex("01 06 00 04 00 00 C8 0B")),
