@@ -13,7 +13,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable
+from collections.abc import AsyncGenerator, Callable
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, Field
@@ -142,8 +142,9 @@ class SerialPort:
         self._turn = asyncio.Lock()
         self._closing = threading.Event()
 
-    async def open(self) -> None:
-        """Open the port for this process alone. Raises `ConnectionLost`."""
+    @contextlib.asynccontextmanager
+    async def opening(self) -> AsyncGenerator[None]:
+        """Open the port for this process alone; an error within the block closes it. Raises `ConnectionLost`."""
         import serial
 
         await self.close()
@@ -155,6 +156,11 @@ class SerialPort:
         except (OSError, ValueError) as error:
             why = f"cannot open {self._path}: {error}"
             raise ConnectionLost(self._device, "connect", why, remedy=REPLUG) from None
+        try:
+            yield
+        except BaseException:
+            await self.close()
+            raise
 
     async def exchange(
         self, op: str, request: bytes, find: Callable[[bytes], T | None], *, timeout_s: float, condition: str = ""
@@ -166,9 +172,13 @@ class SerialPort:
         """
         if self._port is None:
             raise NotConnected(self._device, op, "not connected")
-        asking = asyncio.create_task(self._in_turn(op, request, find, timeout_s))
+
+        async def in_turn() -> tuple[bytes, T | None]:
+            async with self._turn:
+                return await asyncio.to_thread(self._ask, op, request, find, timeout_s)
+
         try:
-            received, reply = await asyncio.shield(asking)
+            received, reply = await asyncio.shield(in_turn())
         except OSError as error:  # pyserial's own error is an OSError
             what = f"{self._path}: {error.strerror or error}"
             raise ConnectionLost(self._device, op, what, condition=condition, remedy=REPLUG) from None
@@ -192,12 +202,6 @@ class SerialPort:
             if port is not None:
                 with contextlib.suppress(OSError):
                     await asyncio.to_thread(port.close)
-
-    async def _in_turn(
-        self, op: str, request: bytes, find: Callable[[bytes], T | None], timeout_s: float
-    ) -> tuple[bytes, T | None]:
-        async with self._turn:
-            return await asyncio.to_thread(self._ask, op, request, find, timeout_s)
 
     def _ask(
         self, op: str, request: bytes, find: Callable[[bytes], T | None], timeout_s: float

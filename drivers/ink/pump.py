@@ -45,9 +45,7 @@ def seal(body: bytes) -> bytes:
 
 
 def write_register(unit: int, register: int, value: int) -> bytes:
-    """The request to write one register. Raises ValueError if a field does not fit."""
-    if not (1 <= unit <= 247 and 0 <= register <= 0xFFFF and 0 <= value <= 0xFFFF):
-        raise ValueError(f"unit {unit}, register {register}, value {value} do not fit a frame")
+    """The request to write one register."""
     return seal(struct.pack(">BBHH", unit, WRITE_REGISTER, register, value))
 
 
@@ -126,13 +124,9 @@ class ModbusPump(InkDevice):
     async def connect(self) -> Identity:
         """Open the port, check that the line does not echo, and stop the pump. `DeviceError` leaves the port closed."""
         self._connected, self._dosed_ml = False, 0.0
-        await self._port.open()
-        try:
+        async with self._port.opening():
             await self._refuse_echo()
             await self._halt()
-        except BaseException:
-            await self._port.close()
-            raise
         self._connected = True
         # A pump cannot say whether it is the loopback rig's.
         return Identity(DEVICE, f"Modbus RTU pump, unit {self._unit}", "", False)

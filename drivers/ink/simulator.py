@@ -16,7 +16,6 @@ from typing import Protocol, Self
 
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.ink import pump
-from brushloop.drivers.ink.pump import MAX_RPM, RUN_REGISTER, SPEED_REGISTER, START, STOP, WRITE_REGISTER, exception
 from brushloop.drivers.ink.station import number_of, seal, unseal
 
 GARBAGE = b"\xff\x00*\n\x86\x01ok 1*0000\n"
@@ -143,23 +142,20 @@ class Well:
 
 
 class StationFirmware:
-    """The ink station's side of docs/ink-station.md, with a well, a reservoir, a light and a lid."""
+    """The ink station's side of docs/ink-station.md, with a well, a reservoir and a light; its lid is always open."""
 
     def __init__(self, well: Well | None = None, reservoir_ml: float = 100.0) -> None:
         self.well = well or Well(10.0, capacity_ml=20.0)
         self.reservoir_ml = reservoir_ml
         self.light = 0.0
-        self.lid_open = True
         self._memory: tuple[bytes, bytes] = (b"", b"")
 
     def take(self, buffer: bytearray) -> bytes | None:
         """One line."""
-        end = buffer.find(b"\n") + 1
-        if not end:
+        if b"\n" not in buffer:
             return None
-        line = bytes(buffer[:end])
-        del buffer[:end]
-        return line
+        line, newline, buffer[:] = buffer.partition(b"\n")
+        return bytes(line + newline)
 
     def answer(self, request: bytes) -> bytes | None:
         """The reply; a repeated line is answered from memory, a damaged one not at all."""
@@ -188,17 +184,12 @@ class StationFirmware:
                     return "err 2 light goes to 1"
                 self.light = number_of(level)
                 return "ok"
-            case ["lid", ("open" | "close") as word]:
-                self.lid_open = word == "open"
-                return "ok"
             case ["level"]:
                 return f"ok {self.well.share:.3f}"
             case _:
                 return "err 1 unknown command"
 
     def _dose(self, volume_ml: float) -> str:
-        if not self.lid_open:
-            return "err 5 lid is closed"
         if volume_ml > self.reservoir_ml:
             return "err 4 reservoir is empty"
         if self.well.ml + volume_ml > self.well.capacity_ml:
@@ -215,25 +206,15 @@ class PumpFirmware:
     """A simulated pump, unit 1 on its line."""
 
     def __init__(
-        self,
-        *,
-        ml_per_revolution: float = 0.1,
-        reservoir_ml: float = math.inf,
-        on_pumped: Callable[[float], None] = lambda _volume_ml: None,
+        self, well: Well | None = None, *, ml_per_revolution: float = 0.1, reservoir_ml: float = 100.0
     ) -> None:
+        self.well = well or Well(10.0, capacity_ml=20.0)
+        self.reservoir_ml = reservoir_ml
         self.rpm = 0.0
         self.starts = 0
+        self.running = False
         self._ml_per_revolution = ml_per_revolution
-        self._reservoir_ml = reservoir_ml
-        self._on_pumped = on_pumped
-        self._run = STOP
-        self._pumped_ml = 0.0
         self._since_s = time.monotonic()
-
-    @property
-    def running(self) -> bool:
-        """Whether the rotor turns."""
-        return self._run != STOP
 
     def take(self, buffer: bytearray) -> bytes | None:
         """Take eight bytes, the length of every known request; None if there are fewer."""
@@ -248,24 +229,21 @@ class PumpFirmware:
         unit, function, register, value = struct.unpack(">BBHH", request[:-2])
         if pump.seal(request[:-2]) != request or unit != 1:
             return None
-        if function != WRITE_REGISTER:
-            return exception(unit, function & 0x7F, 1)
         self._settle()
-        if register not in (SPEED_REGISTER, RUN_REGISTER):
-            return exception(unit, function, 2)
-        if value > (MAX_RPM * 100 if register == SPEED_REGISTER else START):
-            return exception(unit, function, 3)
-        if register == SPEED_REGISTER:
-            self.rpm = value / 100
-        else:
-            self.starts += value != STOP and not self.running
-            self._run = value
+        match function, register:
+            case pump.WRITE_REGISTER, pump.SPEED_REGISTER:
+                self.rpm = value / 100
+            case pump.WRITE_REGISTER, pump.RUN_REGISTER:
+                self.starts += value != pump.STOP and not self.running
+                self.running = value != pump.STOP
+            case _:
+                return pump.exception(unit, function & 0x7F, 1)
         return request
 
     def _settle(self) -> None:
         now_s = time.monotonic()
         turned_ml = (self.rpm if self.running else 0.0) / 60.0 * self._ml_per_revolution * (now_s - self._since_s)
-        volume_ml = min(turned_ml, self._reservoir_ml - self._pumped_ml)  # an empty tube pumps air
-        self._pumped_ml += volume_ml
-        self._on_pumped(volume_ml)
+        volume_ml = min(turned_ml, self.reservoir_ml)  # an empty tube pumps air
+        self.reservoir_ml -= volume_ml
+        self.well.add(volume_ml)
         self._since_s = now_s

@@ -27,12 +27,9 @@ _NUMBER = re.compile(r"[0-9]{1,6}(\.[0-9]{1,6})?")
 
 
 def seal(number: int, text: str) -> bytes:
-    """A line as sent over the wire. Raises ValueError for text that a line cannot carry."""
+    """A line as sent over the wire; `number` is less than `NUMBERS`."""
     body = f"{number:03d} {text}".encode("ascii")
-    line = b"%b*%04X\n" % (body, crc16(body))
-    if not 0 <= number < NUMBERS or len(line) > MAX_LINE_BYTES or not _SEALED.fullmatch(line):
-        raise ValueError(f"not a line: {number} {text!r}")
-    return line
+    return b"%b*%04X\n" % (body, crc16(body))
 
 
 def unseal(line: bytes) -> tuple[int, str]:
@@ -118,18 +115,24 @@ class InkStation(InkDevice):
     async def connect(self) -> Identity:
         """Open the port and learn who answers; moves nothing. Raises `DeviceError`; nothing is left open then."""
         self._number, self._dosed_ml = 0, 0.0
-        await self._port.open()
-        try:
-            return await self._identify()
-        except BaseException:
-            await self._port.close()
-            raise
+        async with self._port.opening():
+            answer = await self._ask("identify", attempts=CONNECT_ATTEMPTS)
+            match answer.split(" "):
+                case [model, version, firmware, ("real" | "loopback") as kind] if (model, version) == (MODEL, PROTOCOL):
+                    return Identity(DEVICE, MODEL, firmware, kind == "loopback")
+                case _:
+                    raise ProtocolViolation(
+                        DEVICE,
+                        "connect",
+                        f"identifies as {answer!r}, expected {MODEL} with protocol {PROTOCOL}",
+                        remedy="Check that the path is that of the ink station, and its firmware.",
+                    )
 
     async def _give(self, volume_ml: float) -> None:
         """Return when the ink is in the well. A dose that was sent cannot be interrupted, which is why it is small."""
         unknown = f"Between 0 and {volume_ml:.3f} ml may be in the well."
-        values = await self._ask("dose", f"{volume_ml:.3f}", takes_s=volume_ml * DOSE_S_PER_ML, condition=unknown)
-        given_ml = _only_number("dose", values)
+        answer = await self._ask(f"dose {volume_ml:.3f}", takes_s=volume_ml * DOSE_S_PER_ML, condition=unknown)
+        given_ml = number_of(answer)
         if abs(given_ml - volume_ml) > max(2 * SMALLEST_ML, 0.05 * volume_ml):
             raise DeviceError(DEVICE, "dose", f"gave {given_ml:.3f} ml instead of {volume_ml:.3f} ml")
 
@@ -146,12 +149,12 @@ class InkStation(InkDevice):
     async def light(self) -> float | None:
         """Set the light as the table says; return it, None if the table says nothing. Raises as `level` does."""
         if self._light is not None:
-            await self._ask("light", f"{self._light:.3f}")
+            await self._ask(f"light {self._light:.3f}")
         return self._light
 
     async def level(self) -> float:
         """Fill level of the well, 0 to 1. Raises `InkRefused`, `DeviceError`."""
-        level = _only_number("level", await self._ask("level"))
+        level = number_of(await self._ask("level"))
         if level > 1.0:
             raise ProtocolViolation(DEVICE, "level", f"level is {level:g}, above 1")
         return level
@@ -160,27 +163,15 @@ class InkStation(InkDevice):
         """Close the port; light and lid stay as they are."""
         await self._port.close()
 
-    async def _identify(self) -> Identity:
-        match await self._ask("identify", attempts=CONNECT_ATTEMPTS):
-            case [model, protocol, firmware, ("real" | "loopback") as kind] if (model, protocol) == (MODEL, PROTOCOL):
-                return Identity(DEVICE, MODEL, firmware, kind == "loopback")
-            case other:
-                raise ProtocolViolation(
-                    DEVICE,
-                    "connect",
-                    f"identifies as {' '.join(other)!r}, expected {MODEL} with protocol {PROTOCOL}",
-                    remedy="Check that the path is that of the ink station, and its firmware.",
-                )
-
-    async def _ask(self, *words: str, takes_s: float = 0.0, attempts: int = ATTEMPTS, condition: str = "") -> list[str]:
-        """The values of the reply `ok`. Raises `InkRefused` for `err`, and what `SerialPort.exchange` raises."""
+    async def _ask(self, words: str, *, takes_s: float = 0.0, attempts: int = ATTEMPTS, condition: str = "") -> str:
+        """What follows `ok` in the reply. Raises `InkRefused` for `err`, and what `SerialPort.exchange` raises."""
         number, self._number = self._number, (self._number + 1) % NUMBERS
-        request, text = seal(number, " ".join(words)), None
+        op, request, text = words.partition(" ")[0], seal(number, words), None
         while text is None:
             attempts -= 1
             try:
                 text = await self._port.exchange(
-                    words[0],
+                    op,
                     request,
                     lambda received: find_reply(received, number),
                     timeout_s=REPLY_S + takes_s,
@@ -189,22 +180,10 @@ class InkStation(InkDevice):
             except (DeviceTimeout, ProtocolViolation):
                 if not attempts:
                     raise
-        first, *values = text.split(" ")
+        first, _, values = text.partition(" ")
         if first == "ok":
             return values
-        code = int(values[0])
-        raise InkRefused(
-            DEVICE,
-            words[0],
-            code,
-            " ".join(values[1:]),
-            condition=condition if code == FAILED else "Nothing was done.",
-            remedy=REMEDIES.get(code, ""),
-        )
-
-
-def _only_number(op: str, values: list[str]) -> float:
-    """The only value of a reply. Raises `ProtocolViolation`."""
-    if len(values) != 1:
-        raise ProtocolViolation(DEVICE, op, f"expected one number, got {' '.join(values)!r}")
-    return number_of(values[0])
+        code_text, _, reason = values.partition(" ")
+        code = int(code_text)
+        condition = condition if code == FAILED else "Nothing was done."
+        raise InkRefused(DEVICE, op, code, reason, condition=condition, remedy=REMEDIES.get(code, ""))

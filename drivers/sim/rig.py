@@ -72,9 +72,7 @@ class LoopbackRig:
         if config.ink_device == "station":
             self.ink = PtyLine(StationFirmware(self.world.well))
         elif config.ink_device == "pump":
-            pumped = self.world.well.add
-            pump = PumpFirmware(ml_per_revolution=PUMP_ML, reservoir_ml=100.0, on_pumped=pumped)
-            self.ink = PtyLine(pump)
+            self.ink = PtyLine(PumpFirmware(self.world.well, ml_per_revolution=PUMP_ML))
         missing = {Device.INK: self.ink, Device.FORCE: self.force}
         self.faults = FaultBoard(self.world, [device for device, server in missing.items() if server is None])
         """One board for all servers."""

@@ -147,13 +147,11 @@ def test_every_line_of_the_ink_stations_documented_transcript_is_sound():
     "refused",
     [
         lambda: encode_bare_request(1, "rob1.MotionControl.stopLine", {"acc": 1.0}),
-        *(lambda a=a: pump.write_register(*a) for a in ((248, 1, 1), (1, 0x10000, 1), (1, 1, -1))),
-        *(lambda a=a: station.seal(*a) for a in ((1000, "ok"), (1, "a*b"), (1, "a\nb"), (1, "x" * 90))),
         *(lambda v=v: numbers("getTcpPose", v, 3) for v in ("123", [1, 2], [1, 2, "3"], [1, 2, True], [1, 2, 10**400])),
     ],
 )
 def test_what_a_format_cannot_carry_is_refused(refused: Callable[[], object]):
-    with pytest.raises(ValueError, match=r"stopLine|do not fit|not a line|expected 3"):
+    with pytest.raises(ValueError, match=r"stopLine|expected 3"):
         refused()
 
 
