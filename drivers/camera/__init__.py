@@ -12,6 +12,8 @@ frame.
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import io
 import threading
 import time
 from collections import Counter, deque
@@ -28,7 +30,6 @@ from brushloop.drivers.camera.source import (
     Locked,
     Picture,
     found_settings,
-    gray_levels,
     is_patched,
     is_repeated,
     open_source,
@@ -78,12 +79,23 @@ LIKELY = {
 
 
 def looked_at(picture: Picture) -> NDArray[np.uint8] | FrameFault:
-    """The picture as (h, w) uint8 gray levels, or the first fault that it shows by itself."""
-    import numpy as np
+    """The picture as (h, w) uint8 gray levels, or the first fault that it shows by itself.
 
-    image = gray_levels(picture)
-    if image is None:
-        return FrameFault.TORN
+    The colour of ink on paper is not worth three times the disk space.
+    """
+    import cv2
+    import numpy as np
+    from PIL import Image  # unlike OpenCV's, its decoder does not write on the terminal
+
+    if isinstance(picture, bytes):
+        try:
+            with Image.open(io.BytesIO(picture), formats=("JPEG",)) as jpeg:
+                jpeg.draft("L", jpeg.size)
+                image = np.asarray(jpeg.convert("L"))
+        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+            return FrameFault.TORN  # cut off or broken
+    else:
+        image = picture if picture.ndim == 2 else np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), np.uint8)
     sample = image[::SAMPLE_STEP, ::SAMPLE_STEP]
     if np.count_nonzero(sample >= BLACK_BELOW) < LIGHT_SHARE * sample.size:
         return FrameFault.BLACK
@@ -205,7 +217,7 @@ class _Grabber:
         self._on_notice = on_notice
         self._newest: _Arrival | None = None
         self._skipped: Counter[FrameFault] = Counter()
-        """Frames that the thread has passed over."""
+        """Frames that were passed over, by the thread or when somebody looked at them."""
         self._lost_ns: int | None = None
         """Since when a live source has been gone."""
         self._ended: DeviceError | None = None
@@ -218,7 +230,6 @@ class _Grabber:
     async def fresh(self, after_ns: int) -> Frame:
         """The first valid frame exposed after `after_ns`. Raises `DeviceTimeout`, `ConnectionLost`."""
         until_s, skipped_before = time.monotonic() + self._table.timeout_s, self._skipped.copy()
-        faulty: Counter[FrameFault] = Counter()
         while True:
             newest = self._newest
             if self.closing.is_set():
@@ -227,7 +238,7 @@ class _Grabber:
                 image = await asyncio.to_thread(looked_at, newest.picture)
                 if not isinstance(image, FrameFault):
                     return Frame(newest.stamp, newest.exposed_after_ns, image)
-                faulty[image] += 1
+                self._skipped[image] += 1
                 after_ns = newest.exposed_after_ns + 1
             elif self._ended is not None:
                 raise self._ended
@@ -236,7 +247,7 @@ class _Grabber:
                     DEVICE,
                     "fresh",
                     f"no valid new frame from {self._table.source} in {self._table.timeout_s:g} s"
-                    + self._why(self._skipped.copy() - skipped_before + faulty),
+                    + self._why(self._skipped.copy() - skipped_before),
                     remedy="Check cable, light and stream; the arm does not move meanwhile.",
                 )
             await asyncio.sleep(POLL_S)
@@ -262,13 +273,11 @@ class _Grabber:
                         raise
                     self.closing.wait(REOPEN_AFTER_S)
                     continue
-                try:
+                with contextlib.closing(source):
                     if self._lost_ns is not None:
                         self._on_notice(f"camera is back after {(self._clock.now_ns() - self._lost_ns) / 1e9:.1f} s")
                         self._lost_ns = None
                     self._read_all(source, opening_ns)
-                finally:
-                    source.release()
                 if self.closing.is_set():
                     return
                 if not source.live:

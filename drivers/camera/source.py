@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import http.client
-import io
 import os
 import time
 import urllib.error
@@ -98,7 +97,6 @@ class JpegStream:
     def __init__(self, table: CameraTable) -> None:
         """Raises `OSError` where nothing answers, and ValueError for an answer of another kind."""
         self.settings: dict[str, float] = {}
-        self._timeout_s = table.timeout_s
         opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
         try:
             self._response = opener.open(table.source, timeout=table.timeout_s)
@@ -111,7 +109,7 @@ class JpegStream:
                 raise ValueError("not a stream of pictures")
             self._first: bytes | None = self._part()
         except BaseException:
-            self.release()
+            self.close()
             raise
 
     def read(self) -> bytes | None:
@@ -122,7 +120,7 @@ class JpegStream:
         except (OSError, ValueError, http.client.HTTPException):
             return None
 
-    def release(self) -> None:
+    def close(self) -> None:
         """Close the connection."""
         self._response.close()
 
@@ -138,15 +136,10 @@ class JpegStream:
         length = int(http.client.parse_headers(self._response)["Content-Length"] or 0)
         if not 0 < length <= MAX_JPEG_BYTES:
             raise ValueError(f"a part of {length} bytes")
-        jpeg, until_s = bytearray(), time.monotonic() + self._timeout_s
-        while len(jpeg) < length:
-            piece = self._response.read1(length - len(jpeg))
-            if not piece:
-                raise ConnectionError("the stream ended")
-            if time.monotonic() > until_s:
-                raise TimeoutError("a picture takes longer than the timeout")
-            jpeg += piece
-        return bytes(jpeg)
+        jpeg = self._response.read(length)
+        if len(jpeg) < length:
+            raise ConnectionError("the stream ended")
+        return jpeg
 
 
 class Capture:
@@ -182,7 +175,7 @@ class Capture:
             self.patches = not is_device and fourcc == cv2.VideoWriter.fourcc(*"MJPG")
             self.settings = self._lock(table.locked) if is_device else {}
         except BaseException:
-            self.release()
+            self.close()
             raise
 
     def read(self) -> NDArray[np.uint8] | None:
@@ -190,7 +183,7 @@ class Capture:
         ok, raw = self._capture.read()
         return cast("NDArray[np.uint8]", raw) if ok else None
 
-    def release(self) -> None:
+    def close(self) -> None:
         """Close the capture."""
         self._capture.release()
 
@@ -265,25 +258,6 @@ PATCH_PX, WHITE = 16, 254
 """Rows at the end of a picture that are compared, and the level from which all of them count as glare."""
 SCAN = b"\xff\xda"
 """Begins the picture in a JPEG, after the headers."""
-
-
-def gray_levels(picture: Picture) -> NDArray[np.uint8] | None:
-    """The picture as (h, w) uint8; None for a JPEG that is cut off or broken.
-
-    The colour of ink on paper is not worth three times the disk space.
-    """
-    import cv2
-    import numpy as np
-    from PIL import Image  # unlike OpenCV's, its decoder does not write on the terminal
-
-    if not isinstance(picture, bytes):
-        return picture if picture.ndim == 2 else cast("NDArray[np.uint8]", cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
-    try:
-        with Image.open(io.BytesIO(picture), formats=("JPEG",)) as image:
-            image.draft("L", image.size)
-            return np.asarray(image.convert("L"))
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
-        return None
 
 
 def is_patched(picture: Picture, before: Picture | None) -> bool:

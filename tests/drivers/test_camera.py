@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from brushloop.drivers import camera as camera_module
 from brushloop.drivers.camera import Backlog, CameraTable, FrameFault, Locked, OpenCvCamera, looked_at
-from brushloop.drivers.camera.source import Capture, JpegStream, gray_levels, is_patched, is_repeated, open_source
+from brushloop.drivers.camera.source import Capture, JpegStream, is_patched, is_repeated, open_source
 from brushloop.drivers.devices import Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout
 from brushloop.drivers.host import HostClock
@@ -61,7 +61,7 @@ class Feed:
         self.t_ns += 100_000_000
         return picture
 
-    def release(self) -> None:
+    def close(self) -> None:
         self.released.set()
 
 
@@ -339,7 +339,7 @@ async def test_pushed_jpegs_are_handed_over_as_they_came_until_the_stream_ends(a
         for _ in range(jpegs):
             assert await asyncio.to_thread(source.read) == JPEG
         assert await asyncio.to_thread(source.read) is None
-        source.release()
+        source.close()
 
 
 async def test_a_stream_without_lengths_is_read_by_ffmpeg():
@@ -366,7 +366,7 @@ async def test_a_file_that_is_missing_or_over_is_a_lost_connection(tmp_path: Pat
     with pytest.raises(ConnectionLost):
         await camera_at(str(tmp_path / "nowhere.avi")).connect()
     path = tmp_path / "short.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (640, 480), isColor=False)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (640, 480), isColor=False)
     for _ in range(5):
         writer.write(page())
     writer.release()
@@ -440,7 +440,7 @@ def test_a_jpeg_that_says_that_it_is_huge_is_torn() -> None:
     jpeg = bytearray(jpeg_of(page()))
     at = jpeg.index(b"\xff\xc0") + 5  # height and width in the frame's header
     jpeg[at : at + 4] = (20_000).to_bytes(2, "big") * 2
-    assert gray_levels(bytes(jpeg)) is None
+    assert looked_at(bytes(jpeg)) is FrameFault.TORN
 
 
 def test_an_address_with_a_password_is_left_to_ffmpeg(monkeypatch: pytest.MonkeyPatch) -> None:
