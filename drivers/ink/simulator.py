@@ -19,6 +19,8 @@ from brushloop.drivers.ink import pump
 from brushloop.drivers.ink.station import number_of, seal, unseal
 
 GARBAGE = b"\xff\x00*\n\x86\x01ok 1*0000\n"
+LATE_S = 0.3
+RESERVOIR_ML = 100.0
 
 
 class Instrument(Protocol):
@@ -40,10 +42,9 @@ class PtyLine:
     terminal to the next one, so a driver that connects again by number would reach another instrument.
     """
 
-    def __init__(self, instrument: Instrument, *, late_s: float = 0.3) -> None:
+    def __init__(self, instrument: Instrument) -> None:
         self.instrument = instrument
         self.path = ""
-        self._late_s = late_s
         self.next_fault: Callable[[], str | None] = lambda: None
         """Asked for the fault of each request."""
         self._terminal: tuple[int, int] | None = None
@@ -97,7 +98,7 @@ class PtyLine:
             case "garbage":
                 self._write(GARBAGE)
             case "late":
-                asyncio.get_running_loop().call_later(self._late_s, self._write, reply)
+                asyncio.get_running_loop().call_later(LATE_S, self._write, reply)
             case _:
                 self._write(reply)
 
@@ -144,9 +145,9 @@ class Well:
 class StationFirmware:
     """The ink station's side of docs/ink-station.md, with a well, a reservoir and a light; its lid is always open."""
 
-    def __init__(self, well: Well | None = None, reservoir_ml: float = 100.0) -> None:
+    def __init__(self, well: Well | None = None) -> None:
         self.well = well or Well(10.0, capacity_ml=20.0)
-        self.reservoir_ml = reservoir_ml
+        self.reservoir_ml = RESERVOIR_ML
         self.light = 0.0
         self._memory: tuple[bytes, bytes] = (b"", b"")
 
@@ -205,11 +206,9 @@ REQUEST_BYTES = 8
 class PumpFirmware:
     """A simulated pump, unit 1 on its line."""
 
-    def __init__(
-        self, well: Well | None = None, *, ml_per_revolution: float = 0.1, reservoir_ml: float = 100.0
-    ) -> None:
+    def __init__(self, well: Well | None = None, *, ml_per_revolution: float = 0.1) -> None:
         self.well = well or Well(10.0, capacity_ml=20.0)
-        self.reservoir_ml = reservoir_ml
+        self.reservoir_ml = RESERVOIR_ML
         self.rpm = 0.0
         self.starts = 0
         self.running = False

@@ -18,7 +18,7 @@ from brushloop.drivers.geometry import brush_pose, columns, from_wire, interpola
 from brushloop.drivers.ink.simulator import Well
 from brushloop.drivers.sim.brush.brush import MAX_TILT_DEG, Brush, BrushSpec
 from brushloop.drivers.sim.brush.drag import Waypoint, ink_left
-from brushloop.drivers.sim.brush.footprint import Flaw, flaw_of_load, natural_split
+from brushloop.drivers.sim.brush.footprint import Flaw, natural_split
 from brushloop.drivers.sim.brush.paper import Paper
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.kinematics import Matrix, matrix_of
@@ -126,7 +126,7 @@ class Press:
     heading_deg: float
     ink_load: float
     flaw: Flaw | None = None
-    """The flaw of the mark: scripted, a spontaneous split, or caused by the ink load."""
+    """The flaw of the mark: scripted, or a spontaneous split."""
 
 
 class World:
@@ -228,9 +228,6 @@ class World:
             severity=severity,
         )
         self.paper.lay_later(make, x_mm, y_mm, heading_deg)
-        want = flaw_of_load(self.ink_load)
-        if want is Flaw.BLANK or (flaw is None and want is not None):
-            flaw = want  # no ink on the hairs, or too little for the mark
         self.presses.append(Press(x_mm, y_mm, depth_mm, tilt_deg, heading_deg, self.ink_load, flaw))
         self.ink_load = max(0.0, self.ink_load - INK_PER_PRESS)
         self.version += 1

@@ -64,7 +64,8 @@ def test_a_mark_has_the_area_and_the_place_of_the_press_that_it_stands_for() -> 
     ink, moved, deeper = (
         draw(BrushSpec(), place, [(4.0, 5.0)], GRID)[0, 0] for place in (HERE, (0.0, 1.0, 2.0), (0.5, 0.0, 0.0))
     )
-    mark = Brush(BrushSpec()).press(4.0, 5.0, ink_load=1.0, press_seed=0, px_per_mm=5.0)
+    brush = Brush(BrushSpec())
+    mark = brush.print_descent(brush.descents([4.0], 5.0)[4.0], ink_load=1.0, press_seed=0, px_per_mm=5.0)
     inked = mark.density > 0.3
     assert ink.sum() * GRID.px_mm**2 == pytest.approx(inked.sum() / 25.0, rel=0.01)
     rows, columns = np.nonzero(inked)

@@ -33,7 +33,7 @@ from brushloop.drivers.sim.brush.mechanics import (
     pull_spine,
     rest_spine,
 )
-from brushloop.drivers.sim.brush.paper import Footprint
+from brushloop.drivers.sim.brush.paper import PX_PER_MM, Footprint
 from brushloop.drivers.sim.brush.spec import BrushSpec, within
 
 __all__ = ["Brush", "BrushSpec", "Flaw", "Footprint", "Waypoint"]
@@ -67,7 +67,6 @@ class Brush:
         *,
         ink_load: float,
         press_seed: int,
-        px_per_mm: float = 10.0,
         flaw: Flaw | None = None,
         severity: float = 1.0,
     ) -> Footprint:
@@ -77,19 +76,18 @@ class Brush:
         +x by `tilt_deg` and then descends. Columns grow with +x, rows with -y. The upright bundle bends
         toward -x, its set. A depth of 0 or less leaves the paper blank; a flaw of severity 0 has no effect. Raises
         ValueError, naming value and range, if `depth_mm` exceeds 0.9 length cos(tilt), or tilt is outside
-        0 .. 30 deg, `ink_load` or `severity` outside 0 .. 1 (1 = freshly dipped), `px_per_mm` outside 2 .. 40,
-        or `press_seed` is negative.
+        0 .. 30 deg, `ink_load` or `severity` outside 0 .. 1 (1 = freshly dipped), or `press_seed` is negative.
         """
-        self._check(depth_mm, tilt_deg, ink_load, press_seed, px_per_mm)
+        self._check(depth_mm, tilt_deg, ink_load, press_seed)
         within("severity", severity, 0.0, 1.0)
         if depth_mm <= 0.0:
-            return blank_footprint(px_per_mm)
+            return blank_footprint()
         trouble = FLAWLESS
         if flaw is not None and severity > 0.0:
             rng = np.random.default_rng([self.spec.seed, press_seed, 2])
             trouble = draw_trouble(flaw, severity, self.spec.bristles, self.spec.length_mm, rng)
         spine = _spine(self.spec, float(depth_mm), float(tilt_deg))
-        return self.print_descent(spine, ink_load=ink_load, press_seed=press_seed, px_per_mm=px_per_mm, trouble=trouble)
+        return self.print_descent(spine, ink_load=ink_load, press_seed=press_seed, trouble=trouble)
 
     def descents(self, depths_mm: Sequence[float], tilt_deg: float) -> dict[float, Descent]:
         """The way down to each of the depths, all taken from one descent to the deepest, which is quicker than many.
@@ -109,7 +107,13 @@ class Brush:
         }
 
     def print_descent(
-        self, descent: Descent, *, ink_load: float, press_seed: int, px_per_mm: float, trouble: Trouble = FLAWLESS
+        self,
+        descent: Descent,
+        *,
+        ink_load: float,
+        press_seed: int,
+        px_per_mm: float = PX_PER_MM,
+        trouble: Trouble = FLAWLESS,
     ) -> Footprint:
         """The mark that a descent leaves, as `press` prints it."""
         tuft = self._tuft(press_seed, trouble)
@@ -133,14 +137,7 @@ class Brush:
         return np.array([0.0, *(float(shape.normal_n.sum()) for shape in path)])
 
     def drag(
-        self,
-        path: Sequence[Waypoint],
-        tilt_deg: float,
-        heading_deg: float,
-        *,
-        ink_load: float,
-        press_seed: int,
-        px_per_mm: float = 10.0,
+        self, path: Sequence[Waypoint], tilt_deg: float, heading_deg: float, *, ink_load: float, press_seed: int
     ) -> Footprint:
         """Draw the brush along straight lines between waypoints; equal arguments give equal bytes.
 
@@ -151,23 +148,16 @@ class Brush:
         if not path:
             raise ValueError("a drag needs at least one waypoint")
         deepest = max(w.depth_mm for w in path)
-        self._check(deepest, tilt_deg, ink_load, press_seed, px_per_mm)
+        self._check(deepest, tilt_deg, ink_load, press_seed)
         if deepest <= LEAST_DEPTH_MM:
-            return blank_footprint(px_per_mm)
-        return draw_drag(
-            path,
-            _stances(self.spec, math.ceil(deepest), float(tilt_deg)),
-            math.radians(heading_deg),
-            self._tuft(press_seed),
-            ink_load,
-            px_per_mm,
-            self._paper(press_seed),
-        )
+            return blank_footprint()
+        stances = _stances(self.spec, math.ceil(deepest), float(tilt_deg))
+        tuft, paper_rng = self._tuft(press_seed), self._paper(press_seed)
+        return draw_drag(path, stances, math.radians(heading_deg), tuft, ink_load, paper_rng)
 
-    def _check(self, depth_mm: float, tilt_deg: float, ink_load: float, press_seed: int, px_per_mm: float) -> None:
+    def _check(self, depth_mm: float, tilt_deg: float, ink_load: float, press_seed: int) -> None:
         within("tilt_deg", tilt_deg, 0.0, MAX_TILT_DEG)
         within("ink_load", ink_load, 0.0, 1.0)
-        within("px_per_mm", px_per_mm, 2.0, 40.0)
         within("press_seed", press_seed, 0, 2**63 - 1)
         within("depth_mm", depth_mm, -math.inf, self.deepest_mm(tilt_deg))
 

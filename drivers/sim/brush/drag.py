@@ -12,7 +12,7 @@ import numpy as np
 
 from brushloop.drivers.sim.brush.footprint import MARGIN_MM, Tuft, frame_around
 from brushloop.drivers.sim.brush.mechanics import SpineShape, Vector
-from brushloop.drivers.sim.brush.paper import Footprint, Image, scatter, soak
+from brushloop.drivers.sim.brush.paper import PX_PER_MM, Footprint, Image, scatter, soak
 
 STEP_MM = 0.3
 """Longest distance that the commanded tip travels between two moments of a drag."""
@@ -162,7 +162,6 @@ def draw_drag(
     heading_rad: float,
     tuft: Tuft,
     ink_load: float,
-    px_per_mm: float,
     paper_rng: np.random.Generator,
 ) -> Footprint:
     """Lay the patch along the path, in a frame parallel to the paper's with its origin at the first waypoint."""
@@ -176,17 +175,17 @@ def draw_drag(
         load = round(ink_left(ink_load, moment.travel_mm) / LOAD_STEP) * LOAD_STEP
         key = (max(1, round(moment.depth_mm / DEPTH_STEP_MM)) * DEPTH_STEP_MM, min(load, 1.0), moment.pulled)
         if key not in stamps:
-            stamps[key] = _stamp(stances.at(key[0], key[2]), tuft, key[1], px_per_mm)
+            stamps[key] = _stamp(stances.at(key[0], key[2]), tuft, key[1])
         laid.append((stamps[key], moment))
-    corners = np.concatenate([_corners_mm(*item, px_per_mm) for item in laid])
-    shape_px, origin = frame_around(corners[:, 0], corners[:, 1], px_per_mm, MARGIN_MM)
+    corners = np.concatenate([_corners_mm(*item) for item in laid])
+    shape_px, origin = frame_around(corners[:, 0], corners[:, 1], PX_PER_MM, MARGIN_MM)
     wet = np.zeros(shape_px, np.float32)
     load_map = np.zeros(shape_px, np.float32)
     for stamp, moment in laid:
-        column, row = origin[0] + moment.x_mm * px_per_mm, origin[1] - moment.y_mm * px_per_mm
+        column, row = origin[0] + moment.x_mm * PX_PER_MM, origin[1] - moment.y_mm * PX_PER_MM
         _lay(wet, load_map, stamp, column, row, moment)
-    density = soak(wet, load_map, px_per_mm, paper_rng, tuft.bundle.spec)
-    return Footprint(density, px_per_mm, origin)
+    density = soak(wet, load_map, PX_PER_MM, paper_rng, tuft.bundle.spec)
+    return Footprint(density, PX_PER_MM, origin)
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,18 +197,18 @@ class _Stamp:
     load: float
 
 
-def _stamp(shape: SpineShape, tuft: Tuft, load: float, px_per_mm: float) -> _Stamp:
+def _stamp(shape: SpineShape, tuft: Tuft, load: float) -> _Stamp:
     dots = tuft.touch(shape, load)
     dots = replace(dots, x_mm=dots.x_mm - middle_mm(shape))
-    shape_px, origin = frame_around(dots.x_mm, dots.y_mm, px_per_mm, STAMP_MARGIN_MM)
-    return _Stamp(scatter(dots, shape_px, origin, px_per_mm, load, tuft.bundle.spec), origin, load)
+    shape_px, origin = frame_around(dots.x_mm, dots.y_mm, PX_PER_MM, STAMP_MARGIN_MM)
+    return _Stamp(scatter(dots, shape_px, origin, PX_PER_MM, load, tuft.bundle.spec), origin, load)
 
 
-def _corners_mm(stamp: _Stamp, moment: Moment, px_per_mm: float) -> Vector:
+def _corners_mm(stamp: _Stamp, moment: Moment) -> Vector:
     """(4, 2) corners of a laid stamp at its full length."""
     h, w = stamp.wet.shape
-    u = (np.array([0.0, w, 0.0, w]) - stamp.origin_px[0]) / px_per_mm
-    v = (stamp.origin_px[1] - np.array([0.0, 0.0, h, h])) / px_per_mm
+    u = (np.array([0.0, w, 0.0, w]) - stamp.origin_px[0]) / PX_PER_MM
+    v = (stamp.origin_px[1] - np.array([0.0, 0.0, h, h])) / PX_PER_MM
     cos, sin = math.cos(moment.heading_rad), math.sin(moment.heading_rad)
     return np.column_stack([moment.x_mm + cos * u - sin * v, moment.y_mm + sin * u + cos * v])
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.drivers.sim.brush.mechanics import Bundle, SpineShape, Vector
-from brushloop.drivers.sim.brush.paper import Dots, Footprint, scatter, soak
+from brushloop.drivers.sim.brush.paper import PX_PER_MM, Dots, Footprint, scatter, soak
 from brushloop.drivers.sim.brush.spec import BrushSpec
 
 CLEFT_RAD = math.radians(13.0)
@@ -46,8 +46,8 @@ SPLIT_CHANCE = 0.6
 SPLIT_DEPTH_MM = 3.0
 """Shallower presses do not push the hairs apart."""
 
-FAINT_LOAD, DRY_LOAD, BLANK_LOAD = 0.5, 0.3, 0.02
-"""Ink loads below which a flawless brush leaves a faint, a dry, a blank mark."""
+BLANK_LOAD = 0.02
+"""Ink load below which a brush leaves no mark."""
 
 
 class Flaw(StrEnum):
@@ -146,15 +146,6 @@ def natural_split(ink_load: float, depth_mm: float, rng: np.random.Generator) ->
     chance = SPLIT_CHANCE * max(0.0, 1.0 - ink_load / COHESIVE_LOAD)
     hit, severity = rng.random() < chance, rng.uniform(0.5, 1.0)
     return float(severity) if hit and depth_mm >= SPLIT_DEPTH_MM and ink_load > BLANK_LOAD else 0.0
-
-
-def flaw_of_load(ink_load: float) -> Flaw | None:
-    """The flaw that lack of ink alone causes in a mark; None if there is enough ink."""
-    if ink_load <= BLANK_LOAD:
-        return Flaw.BLANK
-    if ink_load <= DRY_LOAD:
-        return Flaw.DRY
-    return Flaw.FAINT if ink_load <= FAINT_LOAD else None
 
 
 STATION_MM = 0.25
@@ -313,10 +304,10 @@ def frame_around(
     return shape_px, (float(round(-left * px_per_mm)), float(round(up * px_per_mm)))
 
 
-def blank_footprint(px_per_mm: float) -> Footprint:
+def blank_footprint() -> Footprint:
     """An untouched patch of paper around the zero-touch point."""
-    half = int(np.ceil(MARGIN_MM * px_per_mm))
-    return Footprint(np.zeros((2 * half, 2 * half), np.float32), px_per_mm, (float(half), float(half)))
+    half = round(MARGIN_MM * PX_PER_MM)
+    return Footprint(np.zeros((2 * half, 2 * half), np.float32), PX_PER_MM, (float(half), float(half)))
 
 
 def _smooth(values: Vector, sigma: float) -> Vector:

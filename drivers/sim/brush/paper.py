@@ -17,6 +17,9 @@ from brushloop.drivers.sim.brush.spec import BrushSpec
 
 Image = NDArray[np.float32]
 
+PX_PER_MM = 10.0
+"""Scale of the sheet, and of the marks that are laid on it."""
+
 TEXTURE_PX_PER_MM = 10.0
 """Paper texture is drawn at this scale and resized, so that fibres keep their size on any raster."""
 
@@ -112,9 +115,6 @@ def _fibre_kernel(angle_rad: float) -> Image:
     return np.exp(-0.5 * ((along / 6.0) ** 2 + (aside / 0.6) ** 2)).astype(np.float32)
 
 
-PX_PER_MM = 10.0
-
-
 class Paper:
     """Ink per area on a sheet of (width, height) mm; row 0 is the far edge (largest y), as a camera sees it."""
 
@@ -150,13 +150,14 @@ class Paper:
         self._coming.append((make, x_mm, y_mm, heading_deg))
 
     def lay(self, footprint: Footprint, x_mm: float, y_mm: float, heading_deg: float) -> None:
-        """Lay a footprint with its zero-touch point at (x, y) and its +x along the heading, on top of earlier ink."""
+        """Lay a footprint with its zero-touch point at (x, y) and its +x along the heading, on top of earlier ink.
+
+        Its scale is that of the sheet.
+        """
         self.lay_later(lambda: footprint, x_mm, y_mm, heading_deg)
 
     def _lay(self, footprint: Footprint, x_mm: float, y_mm: float, heading_deg: float) -> None:
-        scale = PX_PER_MM / footprint.px_per_mm
-        phi = math.radians(heading_deg)
-        cos, sin = scale * math.cos(phi), scale * math.sin(phi)
+        cos, sin = math.cos(math.radians(heading_deg)), math.sin(math.radians(heading_deg))
         # Rows run against y, so a counter-clockwise heading is clockwise in row and column.
         linear = np.array([[cos, sin], [-sin, cos]])
         anchor = np.array([x_mm * PX_PER_MM, (self.size_y_mm - y_mm) * PX_PER_MM])
@@ -164,12 +165,7 @@ class Paper:
         half = np.array([0.5, 0.5])
         offset = anchor - linear @ (np.array(footprint.origin_px) - half) - half
         rows, columns = self._density.shape
-        laid = cv2.warpAffine(
-            footprint.density,
-            np.column_stack([linear, offset]),
-            (columns, rows),
-            flags=cv2.INTER_LINEAR if scale >= 0.5 else cv2.INTER_AREA,
-        )
+        laid = cv2.warpAffine(footprint.density, np.column_stack([linear, offset]), (columns, rows))
         height, width = footprint.density.shape
         corners = offset + np.array([(-1, -1), (width, -1), (width, height), (-1, height)]) @ linear.T
         left, top = np.maximum(np.floor(corners.min(axis=0)).astype(int) - 1, 0)
