@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from brushloop.calibrate.commands import PathOrCommand
-from brushloop.collect.chains import PROTOCOL_FILE, RIG_FILE, Arm, Rig, Tui, on_screen
+from brushloop.calibrate.commands import PathOrCommand, command
+from brushloop.collect.engine import PROTOCOL_FILE, RIG_FILE, CollectRequest, Rig
 from brushloop.sessions.terminal import say
 
 if TYPE_CHECKING:
@@ -49,50 +49,7 @@ def _check_output(option: str, path: Path, *endings: str) -> None:
         raise ConfigError(option, "", f"{path} is a folder")
 
 
-@app.command("strokes")
-def collect(
-    config: Rig = RIG_FILE,
-    protocol: Annotated[Path, typer.Option(help="The protocol to carry out.")] = PROTOCOL_FILE,
-    out: Annotated[Path, typer.Option(help="Folder that holds sessions.")] = Path("sessions"),
-    new: Annotated[bool, typer.Option("--new", help="Start a new session although one is open.")] = False,
-    sheet: Annotated[
-        int | None,
-        typer.Option(min=1, help="Confirm that sheet N of the session is in. Repeating it is safe."),
-    ] = None,
-    arm: Arm = False,
-    dry_run: Annotated[
-        float | None,
-        typer.Option(help="Only move, lifted by this many mm: nothing is pressed, dipped or kept."),
-    ] = None,
-    tui: Tui = None,
-    set_up: Annotated[
-        bool, typer.Option("--set-up", help="On the screen: accept what each set-up step measured, or measure again.")
-    ] = False,
-    live: Annotated[bool, typer.Option("--live", help="Let a Foxglove viewer on this machine watch the run.")] = False,
-    live_port: Annotated[int, typer.Option(min=0, max=65535, help="Port of --live; 0: any.")] = 8765,
-) -> None:
-    """Collect strokes. Ctrl-C stops the arm; run the same command again to resume."""
-    from brushloop.collect import start
-    from brushloop.collect.engine.live import LiveView
-    from brushloop.collect.errors import StrokesLeftOut
-
-    screen = on_screen(tui)
-    request = start.CollectRequest(
-        config,
-        protocol,
-        out,
-        new=new,
-        sheet=sheet,
-        armed=arm,
-        on_screen=screen,
-        guided=set_up and screen,
-        live=LiveView(live_port) if live else None,
-        dry_run_mm=dry_run,
-    )
-    if dry_run is not None:
-        start.dry_run(request)
-    elif left_out := start.collect(request).left_out:
-        raise StrokesLeftOut(left_out)
+app.command("strokes")(command(CollectRequest, "collect.start:run", lambda run, request: run(request)))
 
 
 def browse() -> None:

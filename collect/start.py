@@ -7,19 +7,21 @@ from __future__ import annotations
 
 import contextlib
 import json
+import sys
 import tempfile
 import time
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from brushloop.calibrate.artefact import FITS, current
 from brushloop.calibrate.commands import CalibrateRequest, FitRequest, show_work
+from brushloop.collect.engine import CollectRequest
 from brushloop.collect.engine.engine import Engine
-from brushloop.collect.engine.open_or_resume import CollectRequest, Opening, find_resumable
+from brushloop.collect.engine.live import LiveView
+from brushloop.collect.engine.open_or_resume import Opening, find_resumable
 from brushloop.collect.engine.snapshot import REFRESH_S, eta_text, no_pose_text
+from brushloop.collect.errors import StrokesLeftOut
 from brushloop.collect.operator import stop_signals
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import load_rig
@@ -49,14 +51,35 @@ def engine_for(opening: Opening) -> Engine:
     return Engine(opening, resume, HostClock())
 
 
+def run(request: CollectRequest) -> None:
+    """Do what `brushloop collect` asks. Raises the error that ended the run, and `StrokesLeftOut`.
+
+    The recording of a dry run is thrown away, so that no patch counts as used.
+    """
+    if request.dry_run_mm is not None:
+        with tempfile.TemporaryDirectory(prefix="brushloop-dry-") as folder:
+            in_the_air = replace(_settled(request), out=Path(folder), new=False, sheet=None, guided=False)
+            _run(Opening.load(in_the_air))
+        say("dry run done; nothing was kept")
+    elif left_out := collect(request).left_out:
+        raise StrokesLeftOut(left_out)
+
+
+def _settled(request: CollectRequest) -> CollectRequest:
+    """The request with or without a screen: as asked for, else if there is a terminal."""
+    screen = sys.stdin.isatty() and sys.stdout.isatty() if request.on_screen is None else request.on_screen
+    return replace(request, on_screen=screen, guided=request.guided and screen)
+
+
 def collect(request: CollectRequest) -> Collected:
     """Run to the end and print where the recording lies and what comes next. Raises the error that ended the run."""
-    opening = Opening.load(request)
-    engine = engine_for(opening)
-    with contextlib.nullcontext() if request.live is None else contextlib.closing(request.live):
-        if request.live is not None:
-            request.live.start()
-        now = _run(engine, partial(_resumed, opening), on_screen=request.on_screen).snapshot()
+    opening = Opening.load(_settled(request))
+    with contextlib.ExitStack() as stack:
+        if request.live:
+            live = stack.enter_context(contextlib.closing(LiveView(request.live_port)))
+            live.start()
+            opening = replace(opening, live=live)
+        now = _run(opening).snapshot()
     folder = Path(now.folder)
     say(*ending(folder, opening.protocol.kind))
     return Collected(folder, now.given_up)
@@ -70,16 +93,8 @@ def collect_session(
     `sheet` confirms that this sheet is in, `armed` lets real hardware move. An open session of the same files is
     resumed. Raises `ConfigError`, `CollectAborted`, `SessionError` and what the devices raise.
     """
-    return collect(CollectRequest(Path(config), Path(protocol), Path(out), sheet=sheet, armed=armed)).folder
-
-
-def dry_run(request: CollectRequest) -> None:
-    """Move through the protocol in the air; the recording is thrown away, so that no patch counts as used."""
-    with tempfile.TemporaryDirectory(prefix="brushloop-dry-") as folder:
-        in_the_air = replace(request, out=Path(folder), new=False, sheet=None, guided=False, live=None)
-        opening = Opening.load(in_the_air)
-        _run(engine_for(opening), partial(_resumed, opening), on_screen=request.on_screen)
-    say("dry run done; nothing was kept")
+    request = CollectRequest(Path(config), Path(protocol), Path(out), sheet=sheet, armed=armed, on_screen=False)
+    return collect(request).folder
 
 
 def ending(folder: Path, kind: str) -> list[str]:
@@ -92,16 +107,16 @@ def ending(folder: Path, kind: str) -> list[str]:
     return lines
 
 
-def _resumed(opening: Opening, session_id: str) -> Engine:
-    """An engine that resumes a session of the same files."""
-    return engine_for(replace(opening, request=replace(opening.request, new=False, resume=session_id)))
-
-
-def _run(engine: Engine, again: Callable[[str], Engine], *, on_screen: bool) -> Engine:
+def _run(opening: Opening) -> Engine:
     """Run to the end; return the engine that ran last, as the operator may resume after a stop."""
-    if not on_screen:
+    engine = engine_for(opening)
+    if not opening.request.on_screen:
         run_headless(engine)
         return engine
+
+    def again(session_id: str) -> Engine:
+        return engine_for(replace(opening, request=replace(opening.request, new=False, resume=session_id)))
+
     from brushloop.collect.tui.app import OperatorApp, run_app
     from brushloop.collect.tui.pictures import look_for_pixels
 

@@ -18,8 +18,9 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from brushloop.collect.engine import CollectRequest
 from brushloop.collect.engine.engine import Engine
-from brushloop.collect.engine.open_or_resume import CollectRequest, Opening
+from brushloop.collect.engine.open_or_resume import Opening
 from brushloop.collect.photograph.measure import Mark
 from brushloop.collect.protocols.steps import PressStep
 from brushloop.collect.rig.config import InkConfig, QualityConfig, RigConfig

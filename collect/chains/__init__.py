@@ -14,12 +14,7 @@ from typing import Annotated
 from typer import Argument, Option
 
 from brushloop.calibrate.commands import CharacterData
-
-RIG_FILE, PROTOCOL_FILE = Path("rig.toml"), Path("protocol.toml")
-Rig = Annotated[Path, Option(help="The rig: addresses, frames, limits.")]
-Arm = Annotated[bool, Option("--arm", help="Let real hardware move.")]
-Tui = Annotated[bool | None, Option("--tui/--no-tui", help="Show the screen; default: if there is a terminal.")]
-NewSheet = Annotated[int | None, Option(min=1, help="Confirm that sheet N is in, as for collect.")]
+from brushloop.collect.engine import RIG_FILE, Arm, NewSheet, Rig, Tui
 
 
 @dataclass(frozen=True, slots=True)

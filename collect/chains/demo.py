@@ -22,7 +22,8 @@ from brushloop.collect.chains.loop import PROTOCOL as REPLAY
 from brushloop.collect.chains.loop import run_loop
 from brushloop.collect.chains.writing import PAGE as WRITTEN_PAGE
 from brushloop.collect.chains.writing import write
-from brushloop.collect.engine.open_or_resume import CollectRequest, open_sessions
+from brushloop.collect.engine import CollectRequest
+from brushloop.collect.engine.open_or_resume import open_sessions
 from brushloop.collect.errors import StrokesLeftOut
 from brushloop.collect.start import calibrated, collected, finished_session, fitted
 from brushloop.drivers.loopback import LoopbackRig, start
@@ -147,7 +148,7 @@ class Demo:
             self._session = session
             return
         sheet = 1 if earlier else None
-        request = CollectRequest(self._started().config, self._protocol, self._sessions, sheet=sheet)
+        request = CollectRequest(self._started().config, self._protocol, self._sessions, sheet=sheet, on_screen=False)
         self._session, self._left_out = collected(request)
 
     def _fit(self) -> None:

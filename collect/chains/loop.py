@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import csv
 import io
+from dataclasses import replace
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from brushloop.calibrate.commands import CompareLoopRequest, RecoverRequest, show_work
 from brushloop.calibrate.files import read_bounded, write_whole
-from brushloop.collect.chains import LoopRequest, on_screen
-from brushloop.collect.engine.open_or_resume import CollectRequest, check_fresh_sheet
+from brushloop.collect.chains import LoopRequest
+from brushloop.collect.engine import CollectRequest
+from brushloop.collect.engine.open_or_resume import check_fresh_sheet
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.config_file import read_text
@@ -66,10 +68,8 @@ def run_loop(request: LoopRequest) -> Path:
         chosen = settings.model_dump(include={"depth_range_mm", "tilt_range_deg", "presses", "repeats", "seed"})
         show_work(recover, RecoverRequest(folder, out / RECOVERED, fit=fit, **chosen))
     check_recovered(out / RECOVERED)
-    screen = on_screen(request.tui)
-    again = collected_session(
-        CollectRequest(request.config, out / PROTOCOL, root, sheet=request.sheet, armed=request.armed, on_screen=screen)
-    )
+    wanted = CollectRequest(request.config, out / PROTOCOL, root, sheet=request.sheet, armed=request.armed)
+    again = collected_session(replace(wanted, on_screen=request.tui))
 
     from brushloop.calibrate.loop import compare  # slow to import
 

@@ -19,8 +19,9 @@ from brushloop.calibrate.commands import (
     show_work,
 )
 from brushloop.calibrate.writing import PROTOCOL, load_plan
-from brushloop.collect.chains import WritingRequest, on_screen
-from brushloop.collect.engine.open_or_resume import CollectRequest, check_fresh_sheet
+from brushloop.collect.chains import WritingRequest
+from brushloop.collect.engine import CollectRequest
+from brushloop.collect.engine.open_or_resume import check_fresh_sheet
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.kinds import WriteConfig
@@ -136,7 +137,7 @@ class Writing:
             request.sessions,
             sheet=sheet,
             armed=request.armed,
-            on_screen=on_screen(request.tui),
+            on_screen=request.tui,
         )
         return collected_session(wanted)
 

@@ -8,8 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from brushloop.collect.commission.visit import Step, Taught, Visit, rig_of
+from brushloop.collect.engine import CollectRequest
 from brushloop.collect.engine.engine import Engine
-from brushloop.collect.engine.open_or_resume import CollectRequest, Opening
+from brushloop.collect.engine.open_or_resume import Opening
 from brushloop.collect.errors import NotAccepted
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.doctor import examine

@@ -63,7 +63,7 @@ class Engine:
     """Makes the event loop of the run."""
 
     def __init__(self, opening: Opening, resumes: Path | None, clock: Clock) -> None:
-        """`resumes`: folder of the session that is resumed; None for a new one. The live view was already started."""
+        """`resumes`: folder of the session that is resumed; None for a new one."""
         self._opening = opening
         self._request = opening.request
         self._rig_config = opening.rig
@@ -71,7 +71,7 @@ class Engine:
         layout = sheet_of(opening.rig, opening.protocol)
         self._progress = Progress(opening.protocol, clock, layout, resumes)
         self._clock = clock
-        self._asker = Asker(watched=self._request.on_screen, waiting=self._waiting)
+        self._asker = Asker(watched=bool(self._request.on_screen), waiting=self._waiting)
         self._telemetry = Telemetry()
         self._requests = OperatorRequests()
         self._control = RunControl(self._progress.doing)
@@ -231,7 +231,7 @@ class Engine:
             self._rig = rig
             await self._permitted(rig)
             store = self._store = open_store(self._opening, self._resumes, rig, self._clock)
-            dry, live = self._request.dry_run_mm is not None, self._request.live
+            dry, live = self._request.dry_run_mm is not None, self._opening.live
             try:
                 strokes = self._progress.opened(store)
                 begun = f"resumed with {strokes} strokes" if strokes else "session"

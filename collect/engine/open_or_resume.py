@@ -15,6 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast
 
+from brushloop.collect.engine import CollectRequest
 from brushloop.collect.engine.live import LiveView
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
@@ -44,31 +45,6 @@ CLEAR_MM = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class CollectRequest:
-    """What is collected, and how: the options of a command, or what a screen asks for."""
-
-    config: Path
-    protocol: Path
-    out: Path = Path("sessions")
-    """Folder that holds sessions."""
-    new: bool = False
-    """Start a new session although one is open."""
-    resume: str | None = None
-    """Id of the session to resume, and no other."""
-    sheet: int | None = None
-    """Number of the sheet that is in, from 1, as the operator gave it."""
-    armed: bool = False
-    """The operator has looked at the robot cell: real hardware may move."""
-    on_screen: bool = False
-    """A screen shows run and camera, and can answer questions."""
-    guided: bool = False
-    """The operator accepts on the screen what each set-up step measured."""
-    live: LiveView | None = None
-    dry_run_mm: float | None = None
-    """Only move, with paper and ink lifted by this much: nothing is pressed, dipped or kept."""
-
-
-@dataclass(frozen=True, slots=True)
 class Opening:
     """A request with its configuration, which is read only once."""
 
@@ -77,6 +53,8 @@ class Opening:
     protocol: ProtocolConfig
     snapshots: dict[str, str]
     """Texts of the files that a new session keeps, by name."""
+    live: LiveView | None = None
+    """Shows the run to viewers; it has been started."""
 
     @classmethod
     def load(cls, request: CollectRequest) -> Opening:

@@ -88,7 +88,8 @@ class SessionBrowser:
 
         A session goes on with its own protocol. Connects nothing yet. Raises `ConfigError`.
         """
-        from brushloop.collect.engine.open_or_resume import PROTOCOL_EFFECTIVE, CollectRequest, Opening
+        from brushloop.collect.engine import CollectRequest
+        from brushloop.collect.engine.open_or_resume import PROTOCOL_EFFECTIVE, Opening
 
         request = CollectRequest(self.config, self.protocol, self.root, on_screen=True, guided=True)
         if session_id is None:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from brushloop.collect import start
+from brushloop.collect.engine import CollectRequest
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.engine import Engine
-from brushloop.collect.engine.open_or_resume import CollectRequest, Opening
+from brushloop.collect.engine.open_or_resume import Opening
 from brushloop.collect.engine.snapshot import Snapshot
 from brushloop.collect.errors import Parked
 from brushloop.collect.protocols.kinds import GridConfig
@@ -27,7 +28,7 @@ from brushloop.drivers.sim.faults import Phase
 from brushloop.drivers.sim.rig import rig_toml
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.store import SessionStore
-from tests.collect.tui.fake import FakeEngine, picture, watched
+from tests.collect.tui.fake import picture, watched
 from tests.rigs import Lab
 from tests.runs import until, wait_for_end
 from tests.waiting import PATIENCE_S, wait_until
@@ -88,7 +89,7 @@ def test_a_session_that_is_open_elsewhere_is_refused_before_anything_moves(lab: 
     engine.park()
     with pytest.raises(Parked):
         wait_for_end(engine)
-    elsewhere = SessionStore(lab.session, lab.rig.time.now_ns)
+    elsewhere = SessionStore(lab.session, HandClock().now_ns)
     at = lab.rig.world.tool()
     ran = lab.command()
     assert (ran.returncode, lab.rig.world.tool()) == (2, at)
@@ -186,21 +187,18 @@ async def test_the_run_screen_is_not_green_without_a_pose() -> None:
 def test_without_a_screen_it_is_one_line_when_it_begins_and_one_when_it_ends(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    class Scripted(FakeEngine):
-        def __init__(self, shots: Iterator[Snapshot]) -> None:
-            super().__init__(next(shots))
-            self._shots = shots
+    shots = [picture(messages=(), no_pose_s=s) for s in (None, None, 1.04, 1.1, 2.0, None)]
 
-        def snapshot(self) -> Snapshot:
-            self.now = next(self._shots, self.now)
-            return self.now
-
+    class Scripted:
         @property
         def finished(self) -> bool:
-            return self.now.state is State.DONE
+            return len(shots) == 1
 
-    shots = [picture(messages=(), no_pose_s=s) for s in (None, None, 1.04, 1.1, 2.0, None)]
+        def snapshot(self) -> Snapshot:
+            return shots.pop(0)
+
+    scripted: Any = Scripted()
     monkeypatch.setattr(start, "REFRESH_S", 0.0)
-    start.show_progress(Scripted(iter([*shots, picture(state=State.DONE, messages=())])))
+    start.show_progress(scripted)
     printed = [line for line in capsys.readouterr().err.splitlines() if "pose" in line]
     assert printed == ["warning: no pose for 1.0 s", "the arm sends its pose again"]

@@ -27,7 +27,7 @@ from brushloop.collect.chains import LoopRequest, WritingRequest, demo, writing
 from brushloop.collect.chains.loop import SETTINGS as FILE
 from brushloop.collect.chains.loop import Settings, begun_with, check_recovered, keep_settings
 from brushloop.collect.chains.writing import FOOTPRINT, Writing
-from brushloop.collect.engine.open_or_resume import CollectRequest
+from brushloop.collect.engine import CollectRequest
 from brushloop.collect.errors import ConfigError, StrokesLeftOut
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import load_rig

@@ -21,9 +21,11 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from mcap_protobuf.schema import build_file_descriptor_set
 
+from brushloop.collect import start
+from brushloop.collect.engine import CollectRequest
 from brushloop.collect.engine.live import BACKLOG, HOST, LiveView
 from brushloop.collect.errors import ConfigError
-from brushloop.collect.start import CollectRequest, collect
+from brushloop.collect.start import collect
 from brushloop.drivers.devices import Frame, Stamp
 from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.mcap_writer import Outgoing
@@ -55,7 +57,8 @@ def frame(t_ns: int = 0, gray: int = 200) -> Frame:
 class Viewer:
     """Speaks as much of Foxglove's protocol as it takes to look on."""
 
-    socket: aiohttp.ClientWebSocketResponse
+    socket: Any
+    """An `aiohttp.ClientWebSocketResponse`."""
 
     async def next(self) -> dict[str, Any] | bytes | None:
         """A JSON message, or the bytes of a binary one; None once the server has hung up."""
@@ -149,6 +152,7 @@ async def test_frames_are_shown_as_small_jpegs(live: LiveView) -> None:
     shown = CompressedImage.FromString(data)
     image = cv2.imdecode(np.frombuffer(shown.data, np.uint8), cv2.IMREAD_GRAYSCALE)
     assert shown.format == "jpeg"
+    assert image is not None
     assert image.shape == (768, 1024)
     assert abs(float(image.mean()) - 200.0) < 2.0
 
@@ -184,9 +188,12 @@ def test_without_the_extra_the_error_says_how_to_get_it(monkeypatch: pytest.Monk
     assert caught.value.exit_code == 2
 
 
-def test_a_run_with_a_viewer_shows_what_it_records_and_records_the_same(lab: Lab) -> None:
+def test_a_run_with_a_viewer_shows_what_it_records_and_records_the_same(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
     live = LiveView(port=0)
-    request = CollectRequest(lab.folder / "rig.toml", lab.folder / "protocol.toml", lab.sessions, live=live)
+    request = CollectRequest(lab.folder / "rig.toml", lab.folder / "protocol.toml", lab.sessions, live=True)
+    monkeypatch.setattr(start, "LiveView", lambda _port: live)
     seen: set[str] = set()
 
     async def look() -> None:
