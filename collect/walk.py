@@ -50,8 +50,8 @@ from brushloop.collect.protocols.steps import (
 from brushloop.collect.rig.config import BrushConfig, PaperConfig, RigConfig, TouchConfig
 from brushloop.collect.rig.devices import limits_of
 from brushloop.collect.rig.paper import PaperPlane, Patch, Sheet
-from brushloop.collect.touch.camera import SPOTS_PER_DIP
-from brushloop.collect.touch.heights import EXTENT_MM, lowest_z_mm, patch_spots, touch_rects
+from brushloop.collect.touch.camera import most_dips
+from brushloop.collect.touch.measure import touched_regions
 from brushloop.collect.touch.selfcheck import partners, triangle_on
 from brushloop.drivers.arcs.controller import only_asking
 from brushloop.drivers.arcs.wire import numbers
@@ -140,16 +140,14 @@ def _touches(config: RigConfig, plane: PaperPlane, step: ZeroTouchStep | TouchSt
             return StepMoves([*visit_moves(config, plane, step.x_mm, step.y_mm)])
         return StepMoves([*visit_moves(config, PaperPlane(config.paper.touch_z_mm), *config.paper.touch_point_mm)])
     segments: list[Segment] = []
-    for rect_mm in touch_rects(config.paper, touch):
+    for rect_mm, floor_mm in touched_regions(config.paper, touch):
         x_mm, y_mm, *_ = rect_mm
         above = over(config, x_mm, y_mm)
-        extent_mm = EXTENT_MM if touch.method == "camera" else 0.0
-        floor_mm = lowest_z_mm(config.paper, touch, x_mm, y_mm, extent_mm)
         speed_mm_s = max(config.motion.travel_speed_mm_s, config.motion.press_speed_mm_s, touch.speed_mm_s)
         segments += [above, Region.over(config, rect_mm, floor_mm, speed_mm_s), above]
     if touch.method != "camera":
         return StepMoves(segments)
-    count = sum(-(-spots // SPOTS_PER_DIP) for spots in patch_spots(config.paper, touch))
+    count = most_dips(config.paper, touch)
     inked = [move for number in range(count) for move in inking_moves(config, dips + number)]
     return StepMoves([*photograph_moves(config), *inked, *segments, *photograph_moves(config)], dips=count)
 

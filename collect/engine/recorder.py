@@ -26,7 +26,7 @@ from brushloop.collect.protocols.config import ProtocolConfig
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import Rig
 from brushloop.collect.rig.paper import Patch, Sheet
-from brushloop.collect.touch.heights import used_patches as touched_patches
+from brushloop.collect.touch.measure import used_patches as touched_patches
 from brushloop.collect.walk import PlannedPose, check_poses, sheet_of
 from brushloop.drivers.devices import ForceSample, Frame, PoseSample, Stamp
 from brushloop.drivers.errors import DeviceError, MotionFailed

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -19,27 +20,13 @@ from brushloop.calibrate.stroke import PX_PER_MM, rectify
 from brushloop.collect.errors import StepError
 from brushloop.collect.motion import Dip, Move, Procedures, touching, up
 from brushloop.collect.photograph.frames import Gray, undistorted
-from brushloop.collect.rig.config import RigConfig, TouchConfig
+from brushloop.collect.rig.config import PaperConfig, RigConfig, TouchConfig
 from brushloop.collect.rig.paper import PaperPlane, fit_plane
-from brushloop.collect.touch.force import Floats
-from brushloop.collect.touch.heights import (
-    COARSE_STEP_MM,
-    EXTENT_MM,
-    FINE_COUNT,
-    FINE_STEP_MM,
-    PITCH_MM,
-    SPOTS_PER_PHOTO,
-    KnownHeights,
-    Reach,
-    Touch,
-    at_one_point,
-    coarse_count,
-    lowest_z_mm,
-    spots,
-)
+from brushloop.collect.touch.heights import KnownHeights, Reach, Touch, at_one_point
 from brushloop.drivers.devices import Frame
 from brushloop.sessions.events import TouchedPoint
 
+Floats = NDArray[np.float64]
 DARK_SHARE = 0.5
 """Pixels darker than this share of the paper are not paper, and are ignored in measuring the change of light."""
 DARKER = 0.2
@@ -123,32 +110,76 @@ def new_marks(before: Gray, after: Gray, image_to_paper: Floats, least_ink_mm2: 
     return sorted((m for m in marks if m.ink_mm2 >= least_ink_mm2), key=lambda m: -m.ink_mm2)
 
 
-def first_ink(ink_mm2: Floats, least_mm2: float) -> int:
-    """Index of the first spot with ink in a row of spots, (m,) from the highest to the lowest.
+def first_ink(inked: NDArray[np.bool_]) -> int:
+    """Index of the first spot with ink in a row of spots, (m,) from the highest to the lowest; one has ink at least.
 
-    Raises `StepError` if the first spot has ink, if none has, or if a spot below an inked one has none: otherwise a
-    brush that ran dry would be mistaken for one that did not touch.
+    Raises `StepError` if the first spot has ink, or if a spot below an inked one has none: otherwise a brush that ran
+    dry would be mistaken for one that did not touch.
     """
-    seen = np.asarray(ink_mm2) >= least_mm2
-    if not seen.any():
-        raise StepError("no spot of the row left ink: nothing was touched")
-    first = int(np.argmax(seen))
+    first = int(np.argmax(inked))
     if first == 0:
         raise StepError("the highest spot of the row has ink already: the paper lies higher than expected")
-    if not seen[first:].all():
-        missing = first + int(np.argmin(seen[first:]))
+    if not inked[first:].all():
+        missing = first + int(np.argmin(inked[first:]))
         raise StepError(f"spot {missing + 1} of the row left no ink though a higher one did: is the brush dry?")
     return first
 
 
-Spot = tuple[float, float, float]
-"""x and y in the paper frame, z of the tip in the base frame."""
+COARSE_STEP_MM, FINE_STEP_MM = 0.5, 0.08
+"""Steps of the rows of touches by camera; the error of a touch is about half of a fine step."""
+PITCH_MM, COLUMNS = 4.0, 9
+"""Distance between spots, and spots in a row of a point's patch: a shallow touch leaves a mark of one to three
+millimetres, and camera and arm must agree on the place within a quarter of the pitch."""
+EXTENT_MM = (COLUMNS - 1) * PITCH_MM
+SPOTS_PER_PHOTO = 2
+"""Touches per photograph in the coarse row, which ends when ink is seen; few, so that spots stay small."""
+SLACK_STEPS = 2
+"""Fine steps beyond the coarse step, on either side: a coarse touch is accurate only to its step."""
+FINE_COUNT = 1 + 2 * SLACK_STEPS + math.ceil(COARSE_STEP_MM / FINE_STEP_MM)
+"""Spots of one fine row."""
 WINDOW_MM = 0.75 * PITCH_MM
 """Side of the window in which a spot's ink is measured."""
 SPOTS_PER_DIP = 2
 """Touches after which the brush is dipped again: a tip that dries leaves no ink at first."""
 LEAST_INK_MM2 = 0.25
 """Darkening that counts as ink: area times how much darker it became, 1 being black."""
+Spot = tuple[float, float, float]
+"""x and y in the paper frame, z of the tip in the base frame."""
+
+
+def spots(at_mm: tuple[float, float], sheet_mm: tuple[float, float]) -> Iterator[tuple[float, float]]:
+    """Fresh spots around one point, to and fro from the lower left, so that consecutive touches are neighbours.
+
+    Raises `StepError` where the next one does not lie on the sheet.
+    """
+    for number in itertools.count():
+        row, column = divmod(number, COLUMNS)
+        column = COLUMNS - 1 - column if row % 2 else column
+        x_mm, y_mm = at_mm[0] + column * PITCH_MM, at_mm[1] + row * PITCH_MM
+        if not (0.0 <= x_mm <= sheet_mm[0] and 0.0 <= y_mm <= sheet_mm[1]):
+            raise StepError(
+                f"the touches at ({at_mm[0]:g}, {at_mm[1]:g}) mm do not fit on the sheet: "
+                f"spot {number + 1} would lie at ({x_mm:g}, {y_mm:g}) mm"
+            )
+        yield x_mm, y_mm
+
+
+def coarse_count(reach: Reach) -> int:
+    """Spots of a whole coarse row, which ends early where ink is seen; all of them are photographed."""
+    heights = math.ceil((reach.start_z_mm - reach.lowest_z_mm) / COARSE_STEP_MM) + 1
+    return math.ceil(heights / SPOTS_PER_PHOTO) * SPOTS_PER_PHOTO
+
+
+def most_spots(paper: PaperConfig, config: TouchConfig) -> list[tuple[Reach, int]]:
+    """The first approach at each point, and the most spots that its patch may take."""
+    known = KnownHeights(paper, config, EXTENT_MM)
+    reaches = [known.reach(*point) for point in config.points_mm]
+    return [(reach, coarse_count(reach) + config.touches * FINE_COUNT) for reach in reaches]
+
+
+def most_dips(paper: PaperConfig, config: TouchConfig) -> int:
+    """The most dips that the touches of all points may take."""
+    return sum(math.ceil(count / SPOTS_PER_DIP) for _, count in most_spots(paper, config))
 
 
 class FirstInkTouch:
@@ -159,7 +190,7 @@ class FirstInkTouch:
         self._rig = procedures.rig
         self._config = config
         self._dip = dip
-        self._since_dip: int | None = None
+        self._since_dip = SPOTS_PER_DIP
         self._last: Frame | None = None
 
     async def measure(self, points_mm: list[tuple[float, float]]) -> list[TouchedPoint]:
@@ -168,21 +199,20 @@ class FirstInkTouch:
         Without that plane, the sheet's lean along a row would be mistaken for height. Raises `StepError`.
         """
         paper, touches = self._rig.config.paper, self._config.touches
-        known = KnownHeights(paper, self._config)
-        fresh = [spots(point, paper.size_mm) for point in points_mm]
-        rough: list[Touch] = []
-        for row, point in zip(fresh, points_mm, strict=True):
-            rough.append(await self._coarse(row, known.reach(*point, EXTENT_MM)))
+        known, rough = KnownHeights(paper, self._config, EXTENT_MM), list[Touch]()
+        patches = list[tuple[Iterator[tuple[float, float]], Reach]]()
+        for point in points_mm:
+            fresh, reach = spots(point, paper.size_mm), known.reach(*point)
+            patches.append((fresh, reach))
+            rough.append(await self._coarse(fresh, reach))
             known.add(rough[-1].x_mm, rough[-1].y_mm, rough[-1].z_mm)
         rounds = [rough]
         for k in range(touches):
             lean = _plane(rounds[-1])
             # Staggered by parts of a step: equal heights would only repeat the same result.
             higher_mm = 0.5 * FINE_STEP_MM * (FINE_COUNT - 1) - k / touches * FINE_STEP_MM
-            rounds.append([])
-            for row, point, around in zip(fresh, points_mm, rough, strict=True):
-                lowest_mm = lowest_z_mm(paper, self._config, *point, EXTENT_MM)
-                rounds[-1].append(await self._fine(row, around, lean, higher_mm, lowest_mm))
+            places = zip(patches, rough, strict=True)
+            rounds.append([await self._fine(*patch, around, lean, higher_mm) for patch, around in places])
         by_point = [list(point) for point in zip(*rounds[1:], strict=True)]
         lean = _plane([touch for point in by_point for touch in point])
         return [at_one_point(point, self._config, lean) for point in by_point]
@@ -194,7 +224,7 @@ class FirstInkTouch:
         return await self._row(spots, COARSE_STEP_MM, SPOTS_PER_PHOTO)
 
     async def _fine(
-        self, fresh: Iterator[tuple[float, float]], around: Touch, lean: PaperPlane, higher_mm: float, lowest_mm: float
+        self, fresh: Iterator[tuple[float, float]], reach: Reach, around: Touch, lean: PaperPlane, higher_mm: float
     ) -> Touch:
         """Touch a whole row in fine steps along the leaning sheet."""
         touched = list[Spot]()
@@ -202,7 +232,7 @@ class FirstInkTouch:
             x, y = next(fresh)
             along_mm = lean.touch_z_mm(x, y) - lean.touch_z_mm(around.x_mm, around.y_mm)
             z_mm = around.z_mm + along_mm + higher_mm - k * FINE_STEP_MM
-            touched.append((x, y, max(z_mm, lowest_mm)))
+            touched.append((x, y, max(z_mm, reach.lowest_z_mm)))
         return await self._row(touched, FINE_STEP_MM, FINE_COUNT)
 
     async def _row(self, spots: Iterable[Spot], step_mm: float, per_photograph: int) -> Touch:
@@ -212,19 +242,16 @@ class FirstInkTouch:
             touched.append(spot)
             await self._touch(spot)
             if len(touched) % per_photograph == 0:
-                ink = await self._ink(before, touched)
-                if (ink >= LEAST_INK_MM2).any():
-                    return self._between(touched, ink, step_mm)
+                inked = await self._inked(before, touched)
+                if inked.any():
+                    # Half way to the last clean spot: every height between them is equally likely.
+                    first = first_ink(inked)
+                    x, y, z = (0.5 * (a + b) for a, b in zip(touched[first - 1], touched[first], strict=True))
+                    return Touch(x, y, z, step_mm / math.sqrt(12.0))
         raise StepError(f"nothing was touched down to {touched[-1][2]:.2f} mm: no spot of the row left ink")
 
-    def _between(self, touched: list[Spot], ink_mm2: NDArray[np.float64], step_mm: float) -> Touch:
-        """Half way between the last clean spot and the first inked one; every height between them is equally likely."""
-        first = first_ink(ink_mm2, LEAST_INK_MM2)
-        x, y, z = (0.5 * (a + b) for a, b in zip(touched[first - 1], touched[first], strict=True))
-        return Touch(x, y, z, step_mm / math.sqrt(12.0))
-
     async def _touch(self, spot: Spot) -> None:
-        if self._since_dip is None or self._since_dip >= SPOTS_PER_DIP:
+        if self._since_dip >= SPOTS_PER_DIP:
             await self._dip()
             self._since_dip = 0
         x, y, z = spot
@@ -239,10 +266,11 @@ class FirstInkTouch:
             self._last = await self._procedures.capture()
         return self._last
 
-    async def _ink(self, before: Frame, touched: list[Spot]) -> NDArray[np.float64]:
+    async def _inked(self, before: Frame, touched: list[Spot]) -> NDArray[np.bool_]:
         after = await self._photograph()
         frames = await asyncio.to_thread(before_and_after, self._rig.config, before, after)
-        return await asyncio.to_thread(ink_at, *frames, [(x, y) for x, y, _ in touched], WINDOW_MM)
+        places_mm = [(x, y) for x, y, _ in touched]
+        return (await asyncio.to_thread(ink_at, *frames, places_mm, WINDOW_MM)) >= LEAST_INK_MM2
 
 
 def _plane(touches: list[Touch]) -> PaperPlane:

@@ -18,8 +18,6 @@ from brushloop.collect.touch.heights import Reach
 from brushloop.drivers.devices import ForceSample
 
 Floats = NDArray[np.float64]
-
-
 SPRING_CHANGES = 0.05
 """Share by which a brush's stiffness may change from one touch to the next, as it dries or meets a leaning sheet."""
 
@@ -51,7 +49,7 @@ def find_contact(
     force_n: Floats,
     samples: NDArray[np.int64],
     sample_sd_n: float,
-    run: NDArray[np.int64] | None = None,
+    run: NDArray[np.int64],
     spring: Spring | None = None,
 ) -> Contact:
     """Least squares of force = offset + stiffness * max(0, contact - z) through means at rest.
@@ -68,8 +66,7 @@ def find_contact(
     if len(heights) < needed or sample_sd_n <= 0.0:
         raise StepError(f"rests at {len(heights)} heights give no contact, {needed} are needed")
     weights = samples.astype(np.float64)
-    runs = np.zeros(len(z_mm), np.int64) if run is None else run
-    descents = np.unique(runs)[:, None] == runs[None, :]
+    descents = np.unique(run)[:, None] == run[None, :]
 
     def free_of_offsets(rows: Floats) -> Floats:
         """(..., m) less each descent's weighted mean: what is left once the offsets have been fitted."""
@@ -270,40 +267,34 @@ while the arm moves, `force.stale_ms` is the limit."""
 
 
 class ForceTap:
-    """Collects force samples while an average is asked for. Hand every sample to `take`, in the event loop."""
+    """Averages force samples on request. Hand every sample to `take`, in the event loop."""
 
     def __init__(self) -> None:
-        self._after_ns = 0
-        self._wanted: list[ForceSample] | None = None
-        self._came = asyncio.Event()
+        self._wanted: asyncio.Queue[ForceSample] | None = None
 
     def take(self, sample: ForceSample) -> None:
         """Accept one sample of the sensor."""
-        if self._wanted is not None and sample.stamp.host_ns > self._after_ns:
-            self._wanted.append(sample)
-        self._came.set()
+        if self._wanted is not None:
+            self._wanted.put_nowait(sample)
 
-    async def average(
-        self, samples: int, push_axis: tuple[float, float, float], after_ns: int
-    ) -> tuple[float, float, int]:
-        """(mean push in N, standard deviation of one sample, samples) of the next ones received after `after_ns`.
+    async def average(self, samples: int, push_axis: tuple[float, float, float], after_ns: int) -> tuple[float, float]:
+        """(mean push in N, standard deviation of one sample) of the next ones received after `after_ns`.
 
         Raises `StepError` if the sensor falls silent.
         """
-        length = math.hypot(*push_axis)
-        self._after_ns, self._wanted = after_ns, []
-        wanted = self._wanted
+        self._wanted, pushes_n = asyncio.Queue(), list[float]()
         try:
-            while len(wanted) < samples:
-                self._came.clear()
+            while len(pushes_n) < samples:
                 async with asyncio.timeout(SILENT_S):
-                    await self._came.wait()
+                    sample = await self._wanted.get()
+                if sample.stamp.host_ns > after_ns:
+                    along = zip(sample.force_n, push_axis, strict=True)
+                    pushes_n.append(sum(f * a for f, a in along) / math.hypot(*push_axis))
         except TimeoutError:
-            raise StepError(f"the force sensor fell silent after {len(wanted)} of {samples} samples") from None
+            raise StepError(f"the force sensor fell silent after {len(pushes_n)} of {samples} samples") from None
         finally:
             self._wanted = None
-        pushes = [sum(f * a for f, a in zip(s.force_n, push_axis, strict=True)) / length for s in wanted]
-        return statistics.fmean(pushes), statistics.stdev(pushes), len(pushes)
+        return statistics.fmean(pushes_n), statistics.stdev(pushes_n)
 
 
 def resting(procedures: Procedures, tap: ForceTap, at_mm: tuple[float, float], config: TouchConfig) -> Rest:
@@ -317,7 +308,7 @@ def resting(procedures: Procedures, tap: ForceTap, at_mm: tuple[float, float], c
         rests_z_mm = await procedures.lower(*at_mm, z_mm, config.speed_mm_s)
         last_z_mm = z_mm
         after_ns = procedures.rig.clock.now_ns() + round(config.force.settle_s * 1e9)
-        force_n, sd_n, count = await tap.average(samples, config.force.push_axis, after_ns)
-        return Reading(rests_z_mm, force_n, count, sd_n)
+        force_n, sd_n = await tap.average(samples, config.force.push_axis, after_ns)
+        return Reading(rests_z_mm, force_n, samples, sd_n)
 
     return rest

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Sequence
+import math
+from collections.abc import Callable
 
 from brushloop.collect.errors import NeedsOperator, StepError
 from brushloop.collect.motion import Dip, Procedures
 from brushloop.collect.operator import Asker, Choice, Prompt
-from brushloop.collect.rig.config import TouchConfig
-from brushloop.collect.touch.camera import FirstInkTouch
-from brushloop.collect.touch.force import ForceTap, Rest, Spring, resting, touch_by_force
+from brushloop.collect.rig.config import PaperConfig, TouchConfig
+from brushloop.collect.rig.paper import Sheet
+from brushloop.collect.touch.camera import COLUMNS, EXTENT_MM, PITCH_MM, FirstInkTouch, most_spots
+from brushloop.collect.touch.force import ForceTap, Spring, resting, touch_by_force
 from brushloop.collect.touch.heights import KnownHeights, Reach, Touch, at_one_point, taught, through
 from brushloop.sessions.events import TouchedPoint, ZeroTouchResult
+
+Point = tuple[float, float]
 
 
 async def measure_plane(
@@ -31,93 +35,122 @@ async def measure_plane(
     nobody can jog or the operator gives up; the brush is lifted then, too.
     """
     paper = procedures.rig.config.paper
-    points_mm = config.points_mm or [paper.touch_point_mm]
     if config.method == "taught":
         return taught(paper, await procedures.zero_touch())
+    points_mm = config.points_mm or [paper.touch_point_mm]
+    if config.method == "force" and procedures.rig.force is None:
+        raise StepError("zero touch by force needs a force sensor: [force] is missing")
     async with procedures.lifted_after():
-        match config.method:
-            case "camera":
-                points = await FirstInkTouch(procedures, config, dip).measure(points_mm)
-            case "force":
-                points = await _at_points(procedures, config, points_mm, _by_force(procedures, config, tap, tell))
-            case "jog":
-                points = await _at_points(procedures, config, points_mm, _by_jog(procedures, config, asker))
+        if config.method == "camera":
+            points = await FirstInkTouch(procedures, config, dip).measure(points_mm)
+        else:
+            points = await _by_force_or_jog(procedures, config, points_mm, tap, asker, tell)
     return through(points, config)
 
 
-Point = tuple[float, float]
-TouchOnce = Callable[[str, Point, Reach, Sequence[Touch]], Awaitable[Touch]]
-"""Touches once: its name for the person, its place, the approach, and the touches there before it."""
-
-
-async def _at_points(
-    procedures: Procedures, config: TouchConfig, points_mm: list[Point], touch: TouchOnce
+async def _by_force_or_jog(
+    procedures: Procedures,
+    config: TouchConfig,
+    points_mm: list[Point],
+    tap: ForceTap,
+    asker: Asker,
+    tell: Callable[[str], None],
 ) -> list[TouchedPoint]:
-    known, points, count = KnownHeights(procedures.rig.config.paper, config), list[TouchedPoint](), 0
+    known, points = KnownHeights(procedures.rig.config.paper, config), list[TouchedPoint]()
+    spring: Spring | None = None
     for point in points_mm:
         reach, touches = known.reach(*point), list[Touch]()
+        rest = resting(procedures, tap, point, config)
         await procedures.approach(*point, reach.start_z_mm)
-        for _ in range(config.touches):
-            count += 1
-            touches.append(await touch(f"touch {count} of {len(points_mm) * config.touches}", point, reach, touches))
+        for count in range(len(points) * config.touches + 1, (len(points) + 1) * config.touches + 1):
+            name = f"touch {count} of {len(points_mm) * config.touches}"
+            if config.method == "jog":
+                touches.append(Touch(*point, await _jogged(procedures, config, asker, name, point, reach)))
+                continue
+            tell(f"{name}: down to the paper until the force is known to {config.force.sigma_mm:g} mm")
+            near_z_mm = touches[-1].z_mm if touches else None
+            contact = await touch_by_force(rest, reach, config.force, spring, near_z_mm)
+            touches.append(Touch(*point, contact.z_mm, contact.sigma_mm))
+            spring = contact.spring
         await procedures.lift()
-        mean = at_one_point(touches, config)
-        points.append(mean)
-        known.add(mean.x_mm, mean.y_mm, mean.z_mm)
+        points.append(at_one_point(touches, config))
+        known.add(*point, points[-1].z_mm)
     return points
-
-
-def _by_force(procedures: Procedures, config: TouchConfig, tap: ForceTap, tell: Callable[[str], None]) -> TouchOnce:
-    if procedures.rig.force is None:
-        raise StepError("zero touch by force needs a force sensor: [force] is missing")
-
-    rest: Rest | None = None
-    spring: Spring | None = None
-
-    async def once(name: str, point: Point, reach: Reach, before: Sequence[Touch]) -> Touch:
-        nonlocal rest, spring
-        tell(f"{name}: down to the paper until the force is known to {config.force.sigma_mm:g} mm")
-        near_z_mm = before[-1].z_mm if before else None
-        if rest is None or not before:
-            rest = resting(procedures, tap, point, config)
-        contact = await touch_by_force(rest, reach, config.force, spring, near_z_mm)
-        spring = contact.spring
-        return Touch(*point, contact.z_mm, contact.sigma_mm)
-
-    return once
 
 
 JOG_MM = {"1": -1.0, "2": -0.1, "3": -0.02, "8": 0.02, "9": 0.1, "0": 1.0}
 """Step of each key, positive up."""
 TOUCHES, GIVE_UP = "t", "x"
+JOG_CHOICES = (
+    *(Choice(key, f"{'down' if step < 0 else 'up'} {abs(step):g} mm") for key, step in JOG_MM.items()),
+    Choice(TOUCHES, "the tip just touches"),
+    Choice(GIVE_UP, "give up: the height of the paper stays unchanged"),
+)
 ROUNDING_MM = 1e-6
 
 
-def _by_jog(procedures: Procedures, config: TouchConfig, asker: Asker) -> TouchOnce:
-    choices = (
-        *(Choice(key, f"{'down' if step < 0 else 'up'} {abs(step):g} mm") for key, step in JOG_MM.items()),
-        Choice(TOUCHES, "the tip just touches"),
-        Choice(GIVE_UP, "give up: the height of the paper stays unchanged"),
-    )
+async def _jogged(
+    procedures: Procedures, config: TouchConfig, asker: Asker, name: str, point: Point, reach: Reach
+) -> float:
+    """The height at which the operator said that the tip touches, in mm; the brush is left there.
 
-    async def once(name: str, point: Point, reach: Reach, _before: Sequence[Touch]) -> Touch:
-        """Leaves the brush where the operator stopped. A step beyond either end of the approach is shortened."""
-        z_mm = reach.start_z_mm
-        while True:
-            rests_mm = await procedures.lower(*point, z_mm, config.speed_mm_s)
-            question = (
-                f"{name.capitalize()}. Jog until the tip just touches the paper. "
-                f"It is {rests_mm - reach.expected_z_mm:+.2f} mm from the expected height."
+    A step beyond either end of the approach is shortened. Raises `NeedsOperator` if the operator gives up.
+    """
+    z_mm = reach.start_z_mm
+    while True:
+        rests_mm = await procedures.lower(*point, z_mm, config.speed_mm_s)
+        question = (
+            f"{name.capitalize()}. Jog until the tip just touches the paper. "
+            f"It is {rests_mm - reach.expected_z_mm:+.2f} mm from the expected height."
+        )
+        if z_mm <= reach.lowest_z_mm + ROUNDING_MM:
+            question += (
+                " This is the end of the travel: if nothing touches, give up, and correct touch_z_mm in rig.toml."
             )
-            if z_mm <= reach.lowest_z_mm + ROUNDING_MM:
-                question += (
-                    " This is the end of the travel: if nothing touches, give up, and correct touch_z_mm in rig.toml."
-                )
-            key = await asker.ask(Prompt(question, choices, GIVE_UP))
-            if key == GIVE_UP:
-                raise NeedsOperator(f"the operator gave up at {name}")
-            if key == TOUCHES:
-                return Touch(*point, rests_mm)
-            z_mm = min(max(z_mm + JOG_MM[key], reach.lowest_z_mm), reach.start_z_mm)
+        key = await asker.ask(Prompt(question, JOG_CHOICES, GIVE_UP))
+        if key == GIVE_UP:
+            raise NeedsOperator(f"the operator gave up at {name}")
+        if key == TOUCHES:
+            return rests_mm
+        z_mm = min(max(z_mm + JOG_MM[key], reach.lowest_z_mm), reach.start_z_mm)
 
-    return once
+
+# What a plan has to know before anything is touched
+
+
+MARK_MM = 3.0
+"""Half the side of the paper that one mark may cover; a shallow touch leaves less."""
+Rect = tuple[float, float, float, float]
+"""x, y, width, height in the paper frame."""
+
+
+def touched_regions(paper: PaperConfig, config: TouchConfig) -> list[tuple[Rect, float]]:
+    """Where a measured zero touch may lower the tip, and how low, in mm of the base frame: over points or, by camera,
+    over a patch around each point; nowhere for the taught height."""
+    if config.method == "taught":
+        return []
+    if config.method == "camera":
+        patches = zip(config.points_mm, most_spots(paper, config), strict=True)
+        return [
+            ((x, y, EXTENT_MM, (math.ceil(count / COLUMNS) - 1) * PITCH_MM), reach.lowest_z_mm)
+            for (x, y), (reach, count) in patches
+        ]
+    known, points_mm = KnownHeights(paper, config), config.points_mm or [paper.touch_point_mm]
+    return [((x, y, 0.0, 0.0), known.reach(x, y).lowest_z_mm) for x, y in points_mm]
+
+
+def used_patches(sheet: Sheet, paper: PaperConfig, config: TouchConfig) -> set[int]:
+    """The patches whose middle parts zero touch may ink; none for the taught height.
+
+    A patch counts if a mark reaches more than `MARK_MM` into it: touch points in the sheet's margin cost no patch.
+    """
+    m = MARK_MM
+    rects = [(x - m, y - m, w + 2 * m, h + 2 * m) for (x, y, w, h), _ in touched_regions(paper, config)]
+    patches = [sheet.patch(index) for index in range(sheet.capacity)]
+    return {patch.index for patch in patches for rect in rects if _reaches_into(rect, patch.rect_mm)}
+
+
+def _reaches_into(rect: Rect, patch: Rect) -> bool:
+    (ax, ay, aw, ah), (bx, by, bw, bh) = rect, patch
+    across, along = min(ax + aw, bx + bw) - max(ax, bx), min(ay + ah, by + bh) - max(ay, by)
+    return across > MARK_MM and along > MARK_MM

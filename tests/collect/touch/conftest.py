@@ -129,12 +129,10 @@ class BenchTap(ForceTap):
         self._bench = bench
         self._weight_n = bench.world.wrench()[2]
 
-    async def average(
-        self, samples: int, push_axis: tuple[float, float, float], after_ns: int
-    ) -> tuple[float, float, int]:
+    async def average(self, samples: int, push_axis: tuple[float, float, float], after_ns: int) -> tuple[float, float]:
         push_n = self._weight_n - self._bench.world.wrench()[2]
         drawn = self._bench.rng.normal(push_n, self._bench.sim.force_noise_n, samples)
-        return float(drawn.mean()), float(drawn.std(ddof=1)), samples
+        return float(drawn.mean()), float(drawn.std(ddof=1))
 
 
 class BenchHands(Procedures):

@@ -18,8 +18,8 @@ from brushloop.collect.protocols.steps import SelfCheckStep, ZeroTouchStep
 from brushloop.collect.rig.config import PaperConfig, RigConfig, TouchConfig
 from brushloop.collect.rig.paper import PaperPlane, Sheet
 from brushloop.collect.touch import camera
-from brushloop.collect.touch.heights import Touch, at_one_point, plane_of, used_patches
-from brushloop.collect.touch.measure import measure_plane
+from brushloop.collect.touch.heights import Touch, at_one_point, plane_of
+from brushloop.collect.touch.measure import measure_plane, used_patches
 from brushloop.collect.touch.selfcheck import partners, self_check, triangle_on
 from brushloop.collect.walk import check_poses, moves_of, step_poses
 from brushloop.drivers.devices import Pose
