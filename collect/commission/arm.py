@@ -10,7 +10,7 @@ from contextlib import AbstractAsyncContextManager
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from brushloop.collect.commission.visit import Asked, Notebook, Step, Taught, Visit
+from brushloop.collect.commission.visit import Notebook, Step, Taught, Visit, line_of
 from brushloop.collect.rig.doctor import Finding, Scrubber, numbers_only, transcript, write_archive
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, Controller, only_asking
 from brushloop.drivers.arcs.settings import read_back
@@ -45,8 +45,8 @@ def address_of(text: str) -> tuple[str, int]:
     return parts.hostname, parts.port or ARCS_PORT
 
 
-ADDRESS = Asked(
-    "aside.address",
+ADDRESS = "aside.address"
+ASK_ADDRESS = line_of(
     f"Address of the cabinet (pendant: Settings, Network), as 192.0.2.7 or 192.0.2.7:{ARCS_PORT}",
     read=lambda line: "{}:{}".format(*address_of(line)),
 )
@@ -92,7 +92,7 @@ def tip_of(flange: Pose, offset_mm: Sequence[float]) -> tuple[float, float, floa
 
 def taught_arm(notebook: Notebook) -> AbstractAsyncContextManager[Controller]:
     """The arm that was taught, for reading only."""
-    return only_asking(str(notebook.get("robot.host")), int(notebook.number("robot.port")), notebook.framing)
+    return only_asking(notebook.get("robot.host"), notebook.get("robot.port"), notebook.get("robot.framing"))
 
 
 async def touch(visit: Visit, arm: Controller, thing: str, how: str, *, may_skip: bool = False) -> Pose | None:
@@ -139,13 +139,11 @@ class ArmStep(Step):
     name = "arm"
     title = "Find the arm"
     minutes = 3
-    needs = ()
-    observes = (ADDRESS.field,)
+    observes = (ADDRESS,)
 
     async def carry_out(self, visit: Visit) -> None:
         """Ask for the address and read everything else. Raises `DeviceError`."""
-        await visit.values(ADDRESS)
-        host, port = address_of(str(visit.notebook.get(ADDRESS.field)))
+        host, port = address_of(await visit.value(ADDRESS, ASK_ADDRESS))
         visit.working(f"asking {host}:{port} who it is")
         framing, name = await find_framing(host, port)
         async with only_asking(host, port, framing) as controller:
@@ -175,8 +173,8 @@ class ArmStep(Step):
             "robot.host": Taught(host, "typed, and answered"),
             "robot.port": Taught(port, "answered"),
             "robot.framing": Taught(framing, "the first that the controller answered"),
-            "robot.payload_kg": Taught(payload_kg, as_set, "kg", known="not weighed"),
-            "robot.payload_cog_mm": Taught(cog_mm, as_set, "mm", known="not measured"),
+            "robot.payload_kg": Taught(payload_kg, as_set, known="not weighed"),
+            "robot.payload_cog_mm": Taught(cog_mm, as_set, known="not measured"),
         }
         if await answers(host, RTDE_PORT):
             values["robot.rtde_port"] = Taught(RTDE_PORT, "answered, and sends poses")
@@ -192,13 +190,13 @@ async def write_first_report(path: Path, notebook: Notebook) -> None:
     """
     scrubber = Scrubber({str(notebook.get(field) or ""): stands_for for field, stands_for in NAMES.items()})
     how = "" if (kind := notebook.values.get("robot.kind")) is None else kind.how
-    typed = str(notebook.get(ADDRESS.field) or "")
+    typed, framing = str(notebook.get(ADDRESS) or ""), notebook.get("robot.framing") or FRAMINGS[0]
     known = {
-        "framing": notebook.framing,
+        "framing": framing,
         "findings": [scrubber.value(Finding("robot", typed, answers=bool(how), notes=how).as_json())],
         "done": notebook.done,
         "taught": numbers_only(notebook.table("")),
         "touched": {name: touch.position_mm for name, touch in notebook.touches.items()},
     }
-    said = await transcript(*address_of(typed), notebook.framing, scrubber) if typed else ""
+    said = await transcript(*address_of(typed), framing, scrubber) if typed else ""
     write_archive(path, known, {"arcs.jsonl": said})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+from collections.abc import Sequence
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -11,9 +12,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from brushloop.collect.commission.sheet import inside_corners
-from brushloop.collect.commission.visit import Asked, Notebook, Step, Taught, Visit
+from brushloop.collect.commission.visit import Notebook, Step, Taught, Visit, choice_of, line_of, number_of
 from brushloop.collect.errors import NotAccepted
-from brushloop.collect.operator import Choice
+from brushloop.collect.operator import Choice, Prompt
 from brushloop.collect.rig.check import brush_shorter_than_tool, deepest_press
 from brushloop.collect.rig.paper import PaperPlane
 from brushloop.drivers.devices import ForceSample
@@ -26,30 +27,22 @@ DEEPEST_SHARE = 0.45
 """A bundle that is pressed deeper than this share of its length comes near to its ferrule."""
 PRIME_ML = 0.5
 NONE, STATION, PUMP = Choice("n", "nothing: by hand"), Choice("i", "an ink station"), Choice("p", "a Modbus pump")
-BRUSH = (
-    Asked("brush.radius_mm", "R: radius of the wet bundle at the ferrule, by calipers", "mm", 0.5, 50.0, 0.1),
-    Asked(
-        "brush.length_mm",
-        "L: length of the hair from the ferrule to the tip, by calipers",
-        "mm",
-        3.0,
-        200.0,
-        0.5,
-        check=lambda book, length_mm: brush_shorter_than_tool(book.numbers("robot.tcp_offset_mm"), length_mm),
-    ),
-    Asked(
-        "brush.max_depth_mm",
-        f"Deepest press that this brush can take; {DEEPEST_SHARE:.0%} of L is cautious",
-        "mm",
-        1.0,
-        100.0,
-        default=lambda book: f"{int(DEEPEST_SHARE * book.number('brush.length_mm'))}",
-        check=lambda book, depth_mm: deepest_press(depth_mm, book.number("brush.length_mm")),
-    ),
-    Asked("brush.name", "Name of the brush, for the record", default="brush"),
-    Asked("aside.ink", "What keeps the ink well filled?", choices=(NONE, STATION, PUMP)),
-)
-NAME_OF_INK = Asked("ink.name", "Name of the ink, for the record", default="ink")
+RADIUS = number_of("R: radius of the wet bundle at the ferrule, by calipers", 0.5, 50.0, "mm")
+RADIUS_SIGMA_MM, LENGTH_SIGMA_MM = 0.1, 0.5
+"""Standard errors of calipers on wet hair."""
+
+
+def ask_length(offset_mm: Sequence[float]) -> Prompt:
+    """The question for L, which is a part of the tool."""
+    question = "L: length of the hair from the ferrule to the tip, by calipers"
+    return number_of(question, 3.0, 200.0, "mm", check=lambda length_mm: brush_shorter_than_tool(offset_mm, length_mm))
+
+
+def ask_depth(length_mm: float) -> Prompt:
+    """The question for the deepest press."""
+    question = f"Deepest press that this brush can take; {DEEPEST_SHARE:.0%} of L is cautious"
+    cautious = f"{int(DEEPEST_SHARE * length_mm)}"
+    return number_of(question, 1.0, 100.0, "mm", cautious, check=lambda depth_mm: deepest_press(depth_mm, length_mm))
 
 
 def _line_named(line: str) -> str:
@@ -59,8 +52,8 @@ def _line_named(line: str) -> str:
     return line
 
 
-PORT = Asked("ink.device.port", "Its serial line, such as /dev/serial/by-id/usb-…", read=_line_named)
-DELIVERY = Asked("ink.device.ml_per_revolution", "Delivery per revolution, by weighing ten of them", "ml", 0.001, 10.0)
+ASK_PORT = line_of("Its serial line, such as /dev/serial/by-id/usb-…", read=_line_named)
+DELIVERY = number_of("Delivery per revolution, by weighing ten of them", 0.001, 10.0, "ml")
 
 
 class BrushStep(Step):
@@ -69,24 +62,25 @@ class BrushStep(Step):
     name = "brush"
     title = "Brush and ink"
     minutes = 4
-    needs = ("tip", "places")
     observes = ("brush.", "ink.device.", "ink.name", "aside.ink")
 
     async def carry_out(self, visit: Visit) -> None:
         """Ask for what calipers say, and find the device at the well. Raises `NotAccepted`, `DeviceError`."""
-        await visit.values(*BRUSH)
-        kind = visit.notebook.get("aside.ink")
+        await visit.value("brush.radius_mm", RADIUS, RADIUS_SIGMA_MM)
+        ask = ask_length(visit.notebook.get("robot.tcp_offset_mm"))
+        length_mm = await visit.value("brush.length_mm", ask, LENGTH_SIGMA_MM)
+        await visit.value("brush.max_depth_mm", ask_depth(length_mm))
+        await visit.value("brush.name", line_of("Name of the brush, for the record", "brush"))
+        kind = await visit.value("aside.ink", choice_of("What keeps the ink well filled?", (NONE, STATION, PUMP)))
         if kind != NONE.key and "ink.device.kind" not in visit.notebook.values:
-            await visit.values(PORT)
-            port = str(visit.notebook.get(PORT.field))
+            port = await visit.value("ink.device.port", ASK_PORT)
             device: InkTable = InkStationConfig(kind="ink-station", port=port)
             if kind == PUMP.key:
-                await visit.values(DELIVERY)
-                ml = visit.notebook.number(DELIVERY.field)
+                ml = await visit.value("ink.device.ml_per_revolution", DELIVERY)
                 device = ModbusPumpConfig(kind="modbus-pump", port=port, ml_per_revolution=ml)
             await self._primed(visit, device)
             visit.keep({"ink.device.kind": Taught(device.kind, "answered on its line")})
-        await visit.values(NAME_OF_INK)
+        await visit.value("ink.name", line_of("Name of the ink, for the record", "ink"))
 
     async def _primed(self, visit: Visit, config: InkTable) -> None:
         visit.working(f"asking {config.port} who it is")
@@ -122,9 +116,7 @@ def _bus(line: str) -> str:
     return line
 
 
-BUS = Asked(
-    "aside.bus", "CAN bus of the force sensor: can0, or HOST:PORT/can0 of a gateway; Enter: no sensor", read=_bus
-)
+ASK_BUS = line_of("CAN bus of the force sensor: can0, or HOST:PORT/can0 of a gateway; Enter: no sensor", read=_bus)
 REST_S = 1.0
 """How long the sensor is listened to with nothing touching, before the push and after it."""
 LEAST_PUSH_N, MOST_PUSH_N = 0.3, 60.0
@@ -145,19 +137,18 @@ class ForceStep(Step):
     name = "force"
     title = "Force sensor"
     minutes = 3
-    needs = ("sheet",)
     observes = ("force.", "touch.", "aside.bus")
 
     async def carry_out(self, visit: Visit) -> None:
         """Find the sensor and have it pushed. Raises `NotAccepted`, `DeviceError`."""
-        await visit.values(BUS)
-        addressed = _addressed(str(visit.notebook.get("aside.bus")))
+        bus = await visit.value("aside.bus", ASK_BUS)
+        addressed = _addressed(bus)
         values = {f"force.{field}": Taught(value, "typed") for field, value in addressed.items()}
         if addressed.get("channel") == LOOPBACK_CHANNEL:
             how = "simulated time may run faster than rounds arrive: allowed on the loopback rig's bus alone"
-            values["force.stale_ms"] = Taught(LOOPBACK_STALE_MS, how, "ms")
+            values["force.stale_ms"] = Taught(LOOPBACK_STALE_MS, how)
         visit.keep(values)
-        if not visit.notebook.get("aside.bus"):
+        if not bus:
             visit.say(
                 "Without a force sensor the height of the paper is found by jogging with keys, when a session starts."
             )
@@ -200,8 +191,8 @@ class ForceStep(Step):
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """How zero touch is done: by force, or by jogging, at four points."""
         method, why = ("force", "a sensor was found") if notebook.get("aside.bus") else ("jog", "no sensor")
-        points = inside_corners(notebook.numbers("paper.size_mm"), INSET_MM)
-        lean_deg = PaperPlane(*notebook.numbers("aside.plane")).slope_deg
+        points = inside_corners(notebook.get("paper.size_mm"), INSET_MM)
+        lean_deg = PaperPlane(*notebook.get("aside.plane")).slope_deg
         widest_deg = min(max(math.ceil(10.0 * (lean_deg + LEAN_ROOM_DEG)) / 10.0, 1.0), 3.0)
         leans = f"the sheet leans by {lean_deg:.2f} deg, and {LEAN_ROOM_DEG:g} deg more"
         return {

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import hashlib
 from collections.abc import AsyncGenerator, Sequence
+from contextlib import AbstractAsyncContextManager
 from pathlib import Path
 
 import cv2
@@ -17,7 +18,7 @@ from brushloop.calibrate.board.lens import GOOD_VIEWS, fit_lens, guidance, held,
 from brushloop.calibrate.board.spec import BoardSpec, BoardView, describe
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_gray
-from brushloop.collect.commission.visit import NO, YES, Asked, Notebook, Step, Taught, Visit
+from brushloop.collect.commission.visit import NO, YES, Notebook, Step, Taught, Visit, choice_of, line_of, number_of
 from brushloop.collect.errors import NotAccepted
 from brushloop.collect.operator import Prompt
 from brushloop.collect.photograph.frames import gray
@@ -62,24 +63,13 @@ def _squares(line: str) -> list[float]:
     return [int(across), int(along)]
 
 
-PRINT = (
-    Asked(
-        "board.squares",
-        "Squares of the print of `brushloop camera board`, along its longer and its shorter side, as 26x20",
-        read=_squares,
-    ),
-    Asked("board.square_mm", "Side of a square (ten of them by calipers, divided by ten)", "mm", 2.0, 100.0),
-    Asked(
-        "board.marker_mm",
-        "Side of a marker",
-        "mm",
-        1.0,
-        100.0,
-        default=lambda book: f"{0.75 * book.number('board.square_mm'):g}",
-    ),
-    Asked("board.dictionary", "Markers of the print", default="DICT_5X5_1000"),
+ASK_SQUARES = line_of(
+    "Squares of the print of `brushloop camera board`, along its longer and its shorter side, as 26x20", read=_squares
 )
-PRINTED = tuple(asked.field for asked in PRINT)
+SQUARE = number_of("Side of a square (ten of them by calipers, divided by ten)", 2.0, 100.0, "mm")
+MARKER_SHARE = 0.75
+"""Side of a marker as a share of its square's, as `brushloop camera board` prints them."""
+PRINTED = ("board.squares", "board.square_mm", "board.marker_mm", "board.dictionary")
 
 
 class CameraStep(Step):
@@ -88,12 +78,15 @@ class CameraStep(Step):
     name = "camera"
     title = "Find the camera"
     minutes = 12
-    needs = ("arm",)
     observes = ("camera.", *PRINTED, VIEW)
 
     async def carry_out(self, visit: Visit) -> None:
         """Ask for source and print, measure the rest. Raises `NotAccepted`, `DeviceError`, `CalibrationError`."""
-        await visit.values(*PRINT)
+        await visit.value("board.squares", ASK_SQUARES)
+        square_mm = await visit.value("board.square_mm", SQUARE)
+        marker = number_of("Side of a marker", 1.0, 100.0, "mm", f"{MARKER_SHARE * square_mm:g}")
+        await visit.value("board.marker_mm", marker)
+        await visit.value("board.dictionary", line_of("Markers of the print", "DICT_5X5_1000"))
         with visit.asked_again_if_refused(*PRINTED):
             try:
                 board_of(visit.notebook)
@@ -101,7 +94,7 @@ class CameraStep(Step):
                 raise NotAccepted(f"no such board: {error}".splitlines()[0] + ".", "Read the print again.") from None
         if "camera.source" not in visit.notebook.values:
             await self._source(visit)
-        async with taught_camera(visit.notebook, visit.clock) as camera:
+        async with taught_camera(visit) as camera:
             visit.working("looking for the board")
             await _board_in(visit, await still(camera, visit.clock), "camera", lying=True)
             await self._lens(visit, camera)
@@ -120,9 +113,9 @@ class CameraStep(Step):
             view = await _board_in(visit, picture, source, lying=False)
             corners, (height, width) = 0 if view is None else len(view.ids), picture.shape
             visit.say(f"{source}: {width} x {height} px; {corners} corners of the board are seen", picture=picture)
-            over_sheet = await visit.choose(
-                "Is this the picture of the camera over the sheet?", (YES, NO), (YES if corners else NO).key
-            )
+            probably = YES if corners else NO
+            asked = choice_of("Is this the picture of the camera over the sheet?", (YES, NO), probably.key)
+            over_sheet = await visit.ask(asked)
         # What a device chose by itself; the settings of a stream only its own set-up can change.
         locked = await asyncio.to_thread(found_settings, int(source), SETTLE_S) if source.isdecimal() else {}
         if not locked:
@@ -217,14 +210,7 @@ def still_missing(views: Sequence[BoardView]) -> tuple[str, ...]:
 
 def board_of(notebook: Notebook) -> BoardSpec:
     """The print as it was described, its lower left corner at the origin. Raises ValueError where there is none."""
-    across, along = notebook.numbers("board.squares")
-    return BoardSpec(
-        squares=(int(across), int(along)),
-        square_mm=notebook.number("board.square_mm"),
-        marker_mm=notebook.number("board.marker_mm"),
-        dictionary=str(notebook.get("board.dictionary")),
-        origin_mm=(0.0, 0.0),
-    )
+    return BoardSpec.model_validate(notebook.table("board.") | {"origin_mm": (0.0, 0.0)})
 
 
 @contextlib.asynccontextmanager
@@ -240,12 +226,10 @@ async def opened(source: str, clock: Clock, locked: Locked | None = None) -> Asy
         await camera.close()
 
 
-@contextlib.asynccontextmanager
-async def taught_camera(notebook: Notebook, clock: Clock) -> AsyncGenerator[OpenCvCamera]:
+def taught_camera(visit: Visit) -> AbstractAsyncContextManager[OpenCvCamera]:
     """The camera that was taught, with its settings locked."""
-    locked = Locked.model_validate(notebook.table("camera.locked."))
-    async with opened(str(notebook.get("camera.source")), clock, locked) as camera:
-        yield camera
+    locked = Locked.model_validate(visit.notebook.table("camera.locked."))
+    return opened(visit.notebook.get("camera.source"), visit.clock, locked)
 
 
 async def still(camera: OpenCvCamera, clock: Clock) -> Gray:

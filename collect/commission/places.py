@@ -12,10 +12,21 @@ from brushloop.calibrate.files import read_gray
 from brushloop.collect.commission.arm import taught_arm, tip_of, touch
 from brushloop.collect.commission.camera import shown_live, still, taught_camera
 from brushloop.collect.commission.sheet import Point, corners_of
-from brushloop.collect.commission.visit import NO, YES, Asked, Notebook, Step, Taught, Value, Visit, rig_of
+from brushloop.collect.commission.visit import (
+    NO,
+    YES,
+    Notebook,
+    Step,
+    Taught,
+    Value,
+    Visit,
+    choice_of,
+    number_of,
+    rig_of,
+)
 from brushloop.collect.errors import ConfigError, NotAccepted
 from brushloop.collect.photograph.frames import ARM_SHARE, Thumbnail, changed_share, thumbnail
-from brushloop.collect.rig.check import draw_rig
+from brushloop.collect.rig.check import draw_rig, places_of
 from brushloop.collect.rig.config import TRAVEL_CLEARANCE_MM, PaperConfig, RigConfig
 from brushloop.collect.rig.paper import PaperPlane, to_base, to_paper
 from brushloop.collect.walk import ask_reach
@@ -41,26 +52,22 @@ AWAY = {
 }
 PARKED = "aside.parked"
 INK = ("well-rim", "well", "wash-rim", "wash-pot")
-WIPE = Asked(
-    "aside.wipe",
-    "Shall each dip end with a wipe across the rim of the well, which takes the drop off?",
-    choices=(YES, NO),
-)
-WASH = Asked("aside.wash", "Is there a pot of water to wash the brush in?", choices=(YES, NO))
+WIPE = choice_of("Shall each dip end with a wipe across the rim of the well, which takes the drop off?", (YES, NO))
+WASH = choice_of("Is there a pot of water to wash the brush in?", (YES, NO))
 MARGIN_MM = 25.0
 """Room beside what was taught: a brush lifted along a tool axis that leans by 15 deg moves aside by as much."""
 BELOW_MM = 2.0
 """Room below the deepest press and the dip, for a sheet that is found a little lower."""
 BOX = tuple(f"robot.limits.{axis}_mm" for axis in "xyz")
 AGREED = "aside.agreed_box"
-SPEEDS = (
-    Asked("robot.limits.tilt_deg", "Widest lean of the brush", "deg", 1.0, 30.0, default="15"),
-    Asked("robot.limits.speed_mm_s", "Highest speed of the tip in any motion", "mm/s", 1.0, 500.0, default="150"),
-    Asked("robot.limits.acc_mm_s2", "Highest acceleration in any motion", "mm/s2", 1.0, 5000.0, default="800"),
-    Asked("motion.travel_speed_mm_s", "Speed of travel above the sheet", "mm/s", 1.0, 500.0, default="100"),
-    Asked("motion.press_speed_mm_s", "Speed down into a press", "mm/s", 1.0, 100.0, default="15"),
-    Asked("motion.acc_mm_s2", "Acceleration of travel and press", "mm/s2", 1.0, 5000.0, default="500"),
-)
+SPEEDS = {
+    "robot.limits.tilt_deg": number_of("Widest lean of the brush", 1.0, 30.0, "deg", "15"),
+    "robot.limits.speed_mm_s": number_of("Highest speed of the tip in any motion", 1.0, 500.0, "mm/s", "150"),
+    "robot.limits.acc_mm_s2": number_of("Highest acceleration in any motion", 1.0, 5000.0, "mm/s2", "800"),
+    "motion.travel_speed_mm_s": number_of("Speed of travel above the sheet", 1.0, 500.0, "mm/s", "100"),
+    "motion.press_speed_mm_s": number_of("Speed down into a press", 1.0, 100.0, "mm/s", "15"),
+    "motion.acc_mm_s2": number_of("Acceleration of travel and press", 1.0, 5000.0, "mm/s2", "500"),
+}
 """With cautious defaults, and the most that `rig.toml` takes."""
 
 
@@ -70,8 +77,7 @@ class PlacesStep(Step):
     name = "places"
     title = "Well, wash and park"
     minutes = 5
-    needs = ("camera", "tip", "sheet")
-    observes = (*INK, *AWAY, WIPE.field, "ink.wipe.", WASH.field, "ink.wash.", PARKED)
+    observes = (*INK, *AWAY, "aside.wipe", "ink.wipe.", "aside.wash", "ink.wash.", PARKED)
 
     async def carry_out(self, visit: Visit) -> None:
         """Have the tip brought to each place; look whether the parked arm is out of the picture."""
@@ -81,14 +87,12 @@ class PlacesStep(Step):
             await touch(visit, arm, "well 0", how)
             with visit.asked_again_if_refused("well-rim", "well"):
                 check_pot(visit.notebook, "well-rim 0", "well 0", "well")
-            await visit.values(WIPE)
-            if visit.notebook.get(WIPE.field) == YES.key:
+            if await visit.value("aside.wipe", WIPE) == YES.key:
                 how = "Bring the tip to the rim on the side where the drop shall be wiped off, away from the sheet."
                 await touch(visit, arm, "well-rim 1", how)
                 with visit.asked_again_if_refused("well-rim 1"):
                     check_wipe(visit.notebook)
-            await visit.values(WASH)
-            if visit.notebook.get(WASH.field) == YES.key:
+            if await visit.value("aside.wash", WASH) == YES.key:
                 await touch(visit, arm, "wash-rim 0", "Bring the tip to the rim of the pot of water.")
                 how = "Bring the tip into the middle of the pot of water, as deep as a wash should go."
                 await touch(visit, arm, "wash-pot 0", how)
@@ -105,7 +109,7 @@ class PlacesStep(Step):
         # One place alone may be left, after going back or a power cut: its picture needs the arm there again.
         visit.forget(*AWAY)
         pictures: list[Thumbnail] = []
-        async with taught_camera(visit.notebook, visit.clock) as camera:
+        async with taught_camera(visit) as camera:
             for kind, how in AWAY.items():
                 async with shown_live(visit, camera):
                     await touch(visit, arm, f"{kind} 0", how)
@@ -140,7 +144,7 @@ class PlacesStep(Step):
         by_hand = "the tip was brought there by hand"
 
         def at(value: Value, how: str = by_hand, known: str = "one touch by hand, within a mm") -> Taught:
-            return Taught(value, how, "mm", known=known)
+            return Taught(value, how, known=known)
 
         travel = f"the higher of sheet + {TRAVEL_MM:g} mm and highest rim + {RIM_CLEAR_MM:g} mm"
         lifted = "" if park_z >= safe_mm else ", and lifted to travel height"
@@ -164,7 +168,7 @@ class PlacesStep(Step):
 
 def tips(notebook: Notebook) -> dict[str, Point]:
     """The tip at everything that was touched, by name, in the base frame."""
-    offset_mm = notebook.numbers("robot.tcp_offset_mm")
+    offset_mm = notebook.get("robot.tcp_offset_mm")
     return {name: tip_of(flange, offset_mm) for name, flange in notebook.touches.items()}
 
 
@@ -175,7 +179,7 @@ def paper_of(notebook: Notebook) -> PaperConfig:
 
 def sheet_corners(notebook: Notebook) -> list[Point]:
     """The corners of the sheet in the base frame, at touch height."""
-    paper, plane = paper_of(notebook), PaperPlane(*notebook.numbers("aside.plane"))
+    paper, plane = paper_of(notebook), PaperPlane(*notebook.get("aside.plane"))
     return [(*to_base(paper, x, y), plane.touch_z_mm(x, y)) for x, y in corners_of(*paper.size_mm).tolist()]
 
 
@@ -205,7 +209,7 @@ def check_wipe(notebook: Notebook) -> None:
     """Raise `NotAccepted` for a wipe that leads over the sheet, or that begins elsewhere than in the well."""
     check_pot(notebook, "well-rim 1", "well 0", "well", "Touch the rim of the same well; only it is asked again.")
     (x, y), _ = wipe_of(notebook)
-    width, height = notebook.numbers("paper.size_mm")
+    width, height = notebook.get("paper.size_mm")
     if 0.0 <= x <= width and 0.0 <= y <= height:
         raise NotAccepted(
             "the wipe would end over the sheet, and the drop would fall on it.",
@@ -219,12 +223,12 @@ class LimitsStep(Step):
     name = "limits"
     title = "Limits"
     minutes = 3
-    needs = ("tip", "sheet", "places", "brush")
-    observes = (AGREED, *(asked.field for asked in SPEEDS))
+    observes = (AGREED, *SPEEDS)
 
     async def carry_out(self, visit: Visit) -> None:
         """Have each limit and the box confirmed, and ask the controller whether the arm reaches every corner."""
-        await visit.values(*SPEEDS)
+        for field, prompt in SPEEDS.items():
+            await visit.value(field, prompt)
         box = _box(visit.notebook)
         rig = rig_of(visit.notebook.with_values(box), visit.rig_path)
         picture = visit.rig_path.with_name(f"{visit.rig_path.stem}.limits.png")
@@ -234,7 +238,7 @@ class LimitsStep(Step):
             f"{picture} shows box, sheet, board, well and park from above.",
             picture=await asyncio.to_thread(read_gray, picture),
         )
-        text = "; ".join(f"{field} {value.value} {value.unit}: {value.how}" for field, value in box.items())
+        text = "; ".join(f"{field} {value.value} mm: {value.how}" for field, value in box.items())
         if visit.notebook.get(AGREED) != text:
             if not await visit.yes(f"The box of the tip in the base frame. {text}. Agreed?"):
                 raise NotAccepted(
@@ -243,13 +247,13 @@ class LimitsStep(Step):
                 )
             visit.keep({AGREED: Taught(text, "agreed")})
         try:
-            count = await ask_reach(visit.rig_path, rig, _to_reach(rig, visit.notebook))
+            count = await ask_reach(visit.rig_path, rig, _to_reach(rig))
         except ConfigError as error:
             raise NotAccepted(
                 f"the arm does not reach the whole sheet: {error.what}.",
                 "Move the board with the sheet nearer to the arm, and teach sheet and places again.",
             ) from None
-        visit.say(f"The controller finds joints for all {count} corners of the space above sheet and well.")
+        visit.say(f"The controller finds joints for all {count} poses at and over the places of the tip.")
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """The box around what was taught."""
@@ -261,17 +265,17 @@ def _box(notebook: Notebook) -> dict[str, Taught]:
     places, corners = tips(notebook), sheet_corners(notebook)
     x, y, lowest_mm = min(corners, key=lambda corner: corner[2])
     heights_mm = (
-        notebook.number("motion.safe_z_mm"),
-        lowest_mm - notebook.number("brush.max_depth_mm") - BELOW_MM,
-        notebook.number("ink.dip_z_mm") - BELOW_MM,
+        notebook.get("motion.safe_z_mm"),
+        lowest_mm - notebook.get("brush.max_depth_mm") - BELOW_MM,
+        notebook.get("ink.dip_z_mm") - BELOW_MM,
     )
-    park_x, park_y, park_z = notebook.numbers("motion.park_mm")
+    park_x, park_y, park_z = notebook.get("motion.park_mm")
     reached = [point for name, point in places.items() if name.split(" ")[0] in INK]
     points = [*reached, (park_x, park_y, park_z), *corners, *((x, y, z) for z in heights_mm)]
     beside = f"the smallest around sheet, well, wipe, pot and park position, and {MARGIN_MM:g} mm beside and above"
     floor = f"{BELOW_MM:g} mm below the deepest press and the dip; {MARGIN_MM:g} mm above travel and park"
     ranges = zip(BOX, hull(points, MARGIN_MM), (beside, beside, floor), strict=True)
-    return {field: Taught(range_mm, how, "mm") for field, range_mm, how in ranges}
+    return {field: Taught(range_mm, how) for field, range_mm, how in ranges}
 
 
 def hull(points: Sequence[Point], margin_mm: float) -> list[list[float]]:
@@ -281,15 +285,13 @@ def hull(points: Sequence[Point], margin_mm: float) -> list[list[float]]:
     return [[float(least), float(most)] for least, most in zip(floors, high, strict=True)]
 
 
-def _to_reach(rig: RigConfig, notebook: Notebook) -> list[tuple[Pose, float, str]]:
-    """Poses over and in the sheet's corners and the well, and the park position, upright and at the cone's edge."""
-    yaw, speed, tilt = rig.paper.yaw_deg, rig.motion.press_speed_mm_s, rig.robot.limits.tilt_deg
-    poses: list[tuple[Pose, float, str]] = []
-    for number, (x, y, z) in enumerate(sheet_corners(notebook), 1):
-        poses.append((brush_pose(x, y, rig.motion.safe_z_mm, heading_deg=yaw), speed, f"over corner {number}"))
-        low_mm = z - rig.brush.max_depth_mm
-        poses.append((brush_pose(x, y, low_mm, heading_deg=yaw, tilt_deg=tilt), speed, f"pressed at corner {number}"))
-    x, y, z = tips(notebook)["well 0"]
-    poses.append((brush_pose(x, y, z, heading_deg=yaw), speed, "in the well"))
-    poses.append((brush_pose(*rig.motion.park_mm, heading_deg=yaw), speed, "parked"))
+def _to_reach(rig: RigConfig) -> list[tuple[Pose, float, str]]:
+    """Every place of the tip, at travel height and at its lowest; pressed into the sheet, the brush leans to the cone's
+    edge."""
+    yaw_deg, speed_mm_s, poses = rig.paper.yaw_deg, rig.motion.press_speed_mm_s, list[tuple[Pose, float, str]]()
+    for name, (x, y, z) in places_of(rig).items():
+        over = brush_pose(x, y, max(z, rig.motion.safe_z_mm), heading_deg=yaw_deg)
+        tilt_deg = rig.robot.limits.tilt_deg if name.startswith("sheet") else 0.0
+        at = brush_pose(x, y, z, heading_deg=yaw_deg, tilt_deg=tilt_deg)
+        poses += [(over, speed_mm_s, f"over {name}"), (at, speed_mm_s, f"at {name}")]
     return poses

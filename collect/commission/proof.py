@@ -40,7 +40,6 @@ class ProofStep(Step):
     name = "proof"
     title = "Proof"
     minutes = 20
-    needs = ("arm", "camera", "tip", "sheet", "places", "brush", "force", "limits")
 
     async def carry_out(self, visit: Visit) -> None:
         """Prove what was taught, and measure height and delay by it. Raises `NotAccepted` and what the run raises."""
@@ -111,8 +110,8 @@ class ProofStep(Step):
         self, visit: Visit, touch: ZeroTouchResult, check: SelfCheckResult, captures: list[CaptureResult]
     ) -> None:
         plane = PaperPlane(touch.touch_z_mm, touch.slope_x, touch.slope_y)
-        by_hand_mm = visit.notebook.number(HEIGHT)
-        x_mm, y_mm = visit.notebook.numbers("paper.touch_point_mm")
+        by_hand_mm = visit.notebook.get(HEIGHT)
+        x_mm, y_mm = visit.notebook.get("paper.touch_point_mm")
         z_mm, worst_mm = plane.touch_z_mm(x_mm, y_mm), max(map(abs, touch.residuals_mm), default=0.0)
         sigmas_mm = [sigma_mm for point in touch.points for sigma_mm in point.sigma_mm if sigma_mm is not None]
         sigma_mm = max([*sigmas_mm, LEAST_SIGMA_MM])
@@ -123,9 +122,9 @@ class ProofStep(Step):
         later = "the arm was seen to leave the picture later than it did"
         visit.keep(
             {
-                HEIGHT: Taught(z_mm, how, "mm", sigma_mm, known),
-                "aside.plane": Taught([plane.z0_mm, plane.slope_x, plane.slope_y], how, "mm", sigma_mm),
-                "camera.latency_ms": Taught(delay_ms, later, "ms", known=f"trips differ by {jitter_ms:.0f} ms"),
+                HEIGHT: Taught(z_mm, how, sigma_mm, known),
+                "aside.plane": Taught([plane.z0_mm, plane.slope_x, plane.slope_y], how, sigma_mm),
+                "camera.latency_ms": Taught(delay_ms, later, known=f"trips differ by {jitter_ms:.0f} ms"),
             }
         )
         visit.say(

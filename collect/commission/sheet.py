@@ -51,7 +51,6 @@ class SheetStep(Step):
     name = "sheet"
     title = "Sheet and board"
     minutes = 8
-    needs = ("camera", "tip")
     observes = (BOARD, SHEET)
 
     async def carry_out(self, visit: Visit) -> None:
@@ -100,13 +99,13 @@ class SheetStep(Step):
         leaning = f"the sheet leans by {plane.slope_deg:.2f} deg; not yet measured by touch"
         slopes = [plane.z0_mm, plane.slope_x, plane.slope_y]
         return {
-            "paper.origin_mm": Taught(list(fit.origin_mm), how, "mm", sigma_mm, known),
-            "paper.yaw_deg": Taught(fit.yaw_deg, how, "deg", fit.yaw_sigma_deg, known),
-            "paper.size_mm": Taught(list(fit.size_mm), how, "mm", sigma_mm, known),
-            "paper.touch_point_mm": Taught(list(point), "beside every patch", "mm"),
-            "paper.touch_z_mm": Taught(plane.touch_z_mm(*point), how, "mm", fit.depth_sigma_mm, leaning),
-            "board.origin_mm": Taught(list(fit.board_origin_mm), how, "mm", sigma_mm, known),
-            "aside.plane": Taught(slopes, how, "mm", fit.depth_sigma_mm, known),
+            "paper.origin_mm": Taught(list(fit.origin_mm), how, sigma_mm, known),
+            "paper.yaw_deg": Taught(fit.yaw_deg, how, fit.yaw_sigma_deg, known),
+            "paper.size_mm": Taught(list(fit.size_mm), how, sigma_mm, known),
+            "paper.touch_point_mm": Taught(list(point), "beside every patch"),
+            "paper.touch_z_mm": Taught(plane.touch_z_mm(*point), how, fit.depth_sigma_mm, leaning),
+            "board.origin_mm": Taught(list(fit.board_origin_mm), how, sigma_mm, known),
+            "aside.plane": Taught(slopes, how, fit.depth_sigma_mm, known),
         }
 
 
@@ -119,7 +118,7 @@ def touch_point(fit: SheetFit) -> tuple[float, float]:
 
 def all_corners(notebook: Notebook, kind: str) -> dict[str, list[Point]]:
     """The tip at every touch of each corner, in the base frame. Raises `NotAccepted` where a corner was skipped."""
-    offset_mm, corners = notebook.numbers("robot.tcp_offset_mm"), defaultdict[str, list[Point]](list)
+    offset_mm, corners = notebook.get("robot.tcp_offset_mm"), defaultdict[str, list[Point]](list)
     for name, flange in notebook.touched(kind).items():
         corners[name.split(" ", 1)[1]].append(tip_of(flange, offset_mm))
     if missing := [f"{kind.removesuffix('-corner')} {name}" for name in CORNERS if name not in corners]:

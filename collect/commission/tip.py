@@ -193,7 +193,6 @@ class TipStep(Step):
     name = "tip"
     title = "Tip of the brush"
     minutes = 9
-    needs = ("arm",)
     observes = ("pin", "upright")
 
     async def carry_out(self, visit: Visit) -> None:
@@ -297,12 +296,12 @@ class TipStep(Step):
         fit = find_tip(touches)
         known = f"residuals up to {max(fit.residuals_mm):.2f} mm"
         how = f"the same pin touched from {len(touches)} sides by hand"
-        offset = Taught(list(fit.offset_mm), how, "mm", fit.error_mm, known)
+        offset = Taught(list(fit.offset_mm), how, fit.error_mm, known)
         if (axis := measured_axis(notebook)) is None:
-            turn = Taught([0.0, 0.0, 0.0], "taken as square to the flange", "deg", known="not measured")
+            turn = Taught([0.0, 0.0, 0.0], "taken as square to the flange", known="not measured")
         else:
             how = f"held upright along a set square {axis.holds} times"
-            turn = Taught(list(axis.rotation_deg), how, "deg", axis.sigma_deg)
+            turn = Taught(list(axis.rotation_deg), how, axis.sigma_deg)
         return {"robot.tcp_offset_mm": offset, "robot.tcp_rotation_deg": turn}
 
 

@@ -15,7 +15,7 @@ import tomllib
 from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Callable, Generator, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_args
@@ -31,7 +31,6 @@ from brushloop.collect.operator import Asker, Choice, Prompt
 from brushloop.collect.rig.check import Check, unmeasured
 from brushloop.collect.rig.config import RigConfig, with_optics
 from brushloop.collect.rig.config_file import Config, Finite, read_text, refusal
-from brushloop.drivers.arcs.wire import Framing
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.host import Clock
 from brushloop.sessions.disk import fsync_folder, number, set_aside, sync
@@ -41,7 +40,7 @@ ENDING, ASIDE = ".taught.json", "aside."
 Value = bool | int | float | str | list[Finite] | list[list[Finite]]
 """What a field of `rig.toml` can hold."""
 StepName = Literal["arm", "camera", "tip", "sheet", "places", "brush", "force", "limits", "proof"]
-"""In the order in which they are taught: the box of the limits needs the deepest press."""
+"""In the order in which they are taught; each may depend on all before it, as the box of the limits on the brush."""
 STEPS: tuple[StepName, ...] = get_args(StepName)
 UNKNOWN = "not "
 """Beginning of the text for a value that was taken over without a measurement."""
@@ -66,17 +65,16 @@ class Taught:
     value: Value
     how: str
     """How it was obtained, as a clause."""
-    unit: str = ""
     sigma: float | None = None
-    """One standard error, in the unit; None where none can be given."""
+    """One standard error, in the unit of the field; None where none can be given."""
     known: str = ""
     """How well it is known, in words."""
     at: str = field(default_factory=now_utc)
     """When, in UTC."""
 
-    def comment(self) -> str:
+    def comment(self, unit: str) -> str:
         """One line for `rig.toml`."""
-        error = "" if self.sigma is None else f", standard error {self.sigma:.3g} {self.unit}".rstrip()
+        error = "" if self.sigma is None else f", standard error {self.sigma:.3g} {unit}"
         return f"{self.how}{error}{'; ' if self.known else ''}{self.known} ({self.at})"
 
 
@@ -111,27 +109,10 @@ class Notebook(Config):
         except OSError as error:
             raise ConfigError(path, "", error.strerror or str(error)) from None
 
-    @property
-    def framing(self) -> Framing:
-        """Framing that the controller answered; `sof` until that is known."""
-        return "bare" if self.get("robot.framing") == "bare" else "sof"
-
-    def get(self, field: str) -> Value | None:
+    def get(self, field: str) -> Any:
         """The value of a field; None where it was not taught."""
         known = self.values.get(field)
         return None if known is None else known.value
-
-    def number(self, field: str) -> float:
-        """A value that is one number. Raises KeyError where it was not taught."""
-        value = self.values[field].value
-        assert isinstance(value, int | float)
-        return float(value)
-
-    def numbers(self, field: str) -> tuple[float, ...]:
-        """A value that is a list of numbers. Raises KeyError where it was not taught."""
-        value = self.values[field].value
-        assert isinstance(value, list)
-        return tuple(float(v) for v in value if not isinstance(v, list))
 
     def table(self, beginning: str) -> dict[str, Value]:
         """The values whose paths begin like this, by the rest of their paths."""
@@ -181,7 +162,7 @@ def gaps(notebook: Notebook) -> Iterator[Check]:
             yield unmeasured(f"step {step}", "not done since something was taught", f"brushloop rig teach {step}{arm}")
     for path, known in notebook.values.items():
         if known.known.startswith(UNKNOWN) and not path.startswith(ASIDE):
-            yield unmeasured(path, f"{known.value} {known.unit}".rstrip(), f"{known.how}, {known.known}")
+            yield unmeasured(path, f"{known.value} {unit_of(path)}", f"{known.how}, {known.known}")
 
 
 def rig_of(notebook: Notebook, rig_path: Path) -> RigConfig:
@@ -204,11 +185,17 @@ def rig_text(notebook: Notebook, rig_path: Path) -> str:
             continue
         table, _, name = path.rpartition(".")
         if (known := notebook.values.get(path)) is not None:
-            tables[table] += [f"# {line}" for line in textwrap.wrap(known.comment().replace("\n", " "), 116)]
+            comment = known.comment(unit_of(path)).replace("\n", " ")
+            tables[table] += [f"# {line}" for line in textwrap.wrap(comment, 116)]
         tables[table].append(f"{name} = {toml_value(value)}")
     for table in sorted(tables, key=lambda name: (name != "", name.split(".")[0] != "robot", name)):
         lines += ["", *([f"[{table}]"] if table else []), *tables[table]]
     return "\n".join(lines) + "\n"
+
+
+def unit_of(field: str) -> str:
+    """The unit of a field that was measured: its name ends with it."""
+    return field.rpartition("_")[2]
 
 
 def write_rig(rig_path: Path, notebook: Notebook) -> Path | None:
@@ -254,51 +241,33 @@ class WentBack(Exception):
     """The person wants to go back one question: what was answered before this one is taken back, and asked again."""
 
 
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """One value that a person types or chooses: its field in `rig.toml`, the question, its range, and its check."""
+def choice_of(question: str, choices: tuple[Choice, ...], default: str = "") -> Prompt:
+    """A question with answers on keys; Enter stands for the default, or for nothing if there is none."""
+    return Prompt(question, choices, default, answers={"enter": default} if default else {})
 
-    field: str
-    question: str
-    unit: str = ""
-    low: float = 0.0
-    high: float = 0.0
-    """Range of a number; a text or a choice has none."""
-    sigma: float | None = None
-    default: str | Callable[[Notebook], str] = ""
-    """What an empty line stands for; an empty text if it is no answer."""
-    choices: tuple[Choice, ...] = ()
-    check: Callable[[Notebook, float], Check] | None = None
-    """Compares the number with what is known already."""
-    read: Callable[[str], Value] = str
-    """Reads a text; raises ValueError, worded for the person, where it cannot be used."""
 
-    def prompt(self, notebook: Notebook) -> Prompt:
-        """The question, with what its empty line stands for."""
-        default = self.default if isinstance(self.default, str) else self.default(notebook)
-        if self.choices:
-            return choice_of(self.question, self.choices, default)
-        allowed = f"{self.low:g} to {self.high:g} {self.unit}" if self.high > self.low else ""
-        return Prompt(self.question, default=default, read=lambda line: self.value(line, notebook), allowed=allowed)
+def line_of(question: str, default: str = "", read: Callable[[str], Value] = str) -> Prompt:
+    """A question for a line, which `read` may refuse by a ValueError that is worded for the person."""
+    return Prompt(question, default=default, read=read)
 
-    def value(self, line: str, notebook: Notebook) -> Value:
-        """What a line stands for. Raises ValueError, worded for the person, where it cannot be the value."""
-        if self.high <= self.low:
-            return self.read(line)
+
+def number_of(
+    question: str, low: float, high: float, unit: str, default: str = "", check: Callable[[float], Check] | None = None
+) -> Prompt:
+    """A question for a number of this range; `check` compares it with what is known already."""
+
+    def read(line: str) -> float:
         try:
             value = number(line.replace(",", "."))
         except ValueError:
             raise ValueError(f"{line!r} is not a number") from None
-        if not self.low <= value <= self.high:
-            raise ValueError(f"{value:g} is outside {self.low:g} to {self.high:g} {self.unit}")
-        if self.check is not None and (check := self.check(notebook, value)).verdict == "contradicts":
-            raise ValueError(f"{value:g} {self.unit} cannot be ({check.allowed}). {check.remedy}")
+        if not low <= value <= high:
+            raise ValueError(f"{value:g} is outside {low:g} to {high:g} {unit}")
+        if check is not None and (checked := check(value)).verdict == "contradicts":
+            raise ValueError(f"{value:g} {unit} cannot be ({checked.allowed}). {checked.remedy}")
         return value
 
-
-def choice_of(question: str, choices: tuple[Choice, ...], default: str = "") -> Prompt:
-    """A question with answers on keys; Enter stands for the default, or for nothing if there is none."""
-    return Prompt(question, choices, default, answers={"enter": default} if default else {})
+    return Prompt(question, default=default, read=read, allowed=f"{low:g} to {high:g} {unit}")
 
 
 class Visit:
@@ -383,13 +352,9 @@ class Visit:
             self._answered.append(notebook)
         return answer
 
-    async def choose(self, question: str, choices: tuple[Choice, ...], default: str = "") -> str:
-        """The key of one of the choices; `default` is taken for an empty answer, which is none if it is empty."""
-        return str(await self.ask(choice_of(question, choices, default)))
-
     async def yes(self, question: str) -> bool:
         """Ask for yes or no; Enter is neither."""
-        return await self.choose(question, (YES, NO)) == YES.key
+        return await self.ask(choice_of(question, (YES, NO))) == YES.key
 
     async def brought(self, thing: str, how: str, *, may_skip: bool = False) -> bool:
         """Ask the person to bring a thing somewhere; False if it is skipped, where it `may_skip`."""
@@ -397,34 +362,30 @@ class Visit:
         answers = {choice.key: choice is THERE for choice in choices}
         return bool(await self.ask(Prompt(how, choices, thing=thing, answers=answers)))
 
-    async def values(self, *values: Asked) -> None:
-        """Ask for each of these values that is not known yet, and keep it."""
-        for asked in values:
-            if asked.field in self.notebook.values:
-                continue
-            prompt = asked.prompt(self.notebook)
+    async def value(self, field: str, prompt: Prompt, sigma: float | None = None) -> Any:
+        """The value of a field, which is asked for and kept if it is not known yet."""
+        if field not in self.notebook.values:
             value = await self.ask(prompt)
             agreed = isinstance(value, float) and prompt.default and value == float(prompt.default)
-            how = "suggested, and agreed" if agreed else f"typed: {asked.question}"
-            self.keep({asked.field: Taught(value, how, asked.unit, asked.sigma)})
+            how = "suggested, and agreed" if agreed else f"typed: {prompt.question}"
+            self.keep({field: Taught(value, how, sigma)})
+        return self.notebook.get(field)
 
     async def may_move(self, what: str) -> None:
         """Ask for the key that lets the arm move. Raises `NotAccepted` unless both it and `--arm` are given."""
         if not self.armed:
             raise NotAccepted(f"{what}: this moves the arm.", "Start the same command again with --arm.")
         question = f"{what}. The arm moves by itself, slower than 50 mm/s. Is nobody within its reach?"
-        if await self.choose(question, (ARM, STAY), STAY.key) != ARM.key:
+        if await self.ask(choice_of(question, (ARM, STAY), STAY.key)) != ARM.key:
             raise NotAccepted("the arm was left where it is.", "Try this step again once it may move.")
 
 
 class Step(ABC):
-    """One step of the first day."""
+    """One step of the first day, which may use whatever the steps before it taught."""
 
     name: ClassVar[StepName]
     title: ClassVar[str]
     minutes: ClassVar[int]
-    needs: ClassVar[tuple[StepName, ...]]
-    """Steps whose values this one depends on."""
     observes: ClassVar[tuple[str, ...]] = ()
     """Beginnings of fields and kinds of touches that are forgotten when it is taught again."""
 
@@ -433,5 +394,5 @@ class Step(ABC):
         """Ask, measure and keep. Raises `WentBack`, `LeftOff`, `NotAccepted` and what the devices raise."""
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
-        """Values that follow from the notebook alone; computed again whenever a value they depend on changes."""
+        """Values that follow from the notebook alone; computed again once a step before this one was taught again."""
         return {}

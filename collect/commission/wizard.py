@@ -13,17 +13,8 @@ from brushloop.collect.commission.places import LimitsStep, PlacesStep
 from brushloop.collect.commission.proof import ProofStep
 from brushloop.collect.commission.sheet import SheetStep
 from brushloop.collect.commission.tip import TipStep
-from brushloop.collect.commission.visit import (
-    LeftOff,
-    Step,
-    StepName,
-    Visit,
-    WentBack,
-    choice_of,
-    toml_value,
-    write_rig,
-)
-from brushloop.collect.errors import CollectAborted, ConfigError, NotAccepted, StepError
+from brushloop.collect.commission.visit import LeftOff, Step, Visit, WentBack, choice_of, toml_value, write_rig
+from brushloop.collect.errors import CollectAborted, ConfigError, NotAccepted, StepError, describe
 from brushloop.collect.operator import Choice
 from brushloop.drivers.errors import DeviceError
 
@@ -48,7 +39,7 @@ class Wizard:
 
     def __init__(self, visit: Visit, steps: Sequence[Step] = STEPS) -> None:
         self._visit = visit
-        self._steps = tuple(steps)
+        self._steps = {str(step.name): step for step in steps}
 
     async def run(self) -> Path:
         """Teach every step that is not done, then write `rig.toml`; returns its path.
@@ -56,7 +47,7 @@ class Wizard:
         Raises `CollectAborted` where the person stops: the same command resumes from there.
         """
         while names := self._open():
-            await self._attempt(self._named(names[0]))
+            await self._attempt(self._steps[names[0]])
         return self._written()
 
     async def again(self, name: str) -> Path | None:
@@ -64,32 +55,28 @@ class Wizard:
 
         Raises `ConfigError` for an unknown name, otherwise as `run` does.
         """
-        step = self._named(name)
-        if missing := [need for need in step.needs if need in self._open()]:
+        if name not in self._steps:
+            raise ConfigError("STEP", "", f"{name!r} is not one of {', '.join(self._steps)}")
+        names = list(self._steps)
+        if missing := [open_name for open_name in self._open() if names.index(open_name) < names.index(name)]:
             raise CollectAborted(
                 f"`{name}` depends on {', '.join(missing)}, which is not taught yet: `brushloop rig new` resumes there"
             )
-        self._visit.teach_afresh(step)
+        self._visit.teach_afresh(self._steps[name])
         while name in self._open():
-            await self._attempt(step)
+            await self._attempt(self._steps[name])
         return self._written() if self._open() in ([], ["proof"]) else None
 
-    def _open(self) -> list[StepName]:
+    def _open(self) -> list[str]:
         """Steps that are not done."""
-        return [step.name for step in self._steps if step.name not in self._visit.notebook.done]
-
-    def _named(self, name: str) -> Step:
-        for step in self._steps:
-            if step.name == name:
-                return step
-        raise ConfigError("STEP", "", f"{name!r} is not one of {', '.join(step.name for step in self._steps)}")
+        return [name for name in self._steps if name not in self._visit.notebook.done]
 
     async def _attempt(self, step: Step) -> None:
         """Teach a step once. Where the person goes back, or where it fails, the notebook says what comes next.
 
         Raises `CollectAborted` where the person stops.
         """
-        visit, number = self._visit, self._steps.index(step) + 1
+        visit, number = self._visit, list(self._steps).index(step.name) + 1
         visit.step = f"step {number} of {len(self._steps)}: {step.title}, about {step.minutes} min"
         if step.name == "proof":
             self._written()
@@ -98,7 +85,8 @@ class Wizard:
                 await step.carry_out(visit)
                 self._derive(step)
             except REFUSED as error:
-                visit.say(*_in_lines(error), tone="trouble")
+                unhelpful = isinstance(error, DeviceError) and not error.remedy
+                visit.say(describe(error), *(["Check power, cable and address."] if unhelpful else []), tone="trouble")
                 how = choice_of("How do you want to go on?", (AGAIN, AFRESH), AGAIN.key)
                 if await visit.ask(how, back=False) == AFRESH.key:
                     visit.teach_afresh(step)
@@ -108,20 +96,18 @@ class Wizard:
             visit.back()
 
     def _derive(self, step: Step) -> None:
-        """Finish a step: compute again what depends on it, list what changed, and void an earlier proof."""
+        """Finish a step: compute again what later ones made of it, list what changed, and void an earlier proof."""
         before = self._visit.notebook
-        notebook, resting, changed = before.with_values(step.derived(before)), {step.name}, list[str]()
-        for other in self._steps:
-            if resting & set(other.needs):
-                resting.add(other.name)
-                if other.name in notebook.done:
-                    values = other.derived(notebook)
-                    notebook = notebook.with_values(values)
-                    changed += [
-                        f"{field}: {toml_value(old)} -> {toml_value(new.value)}"
-                        for field, new in values.items()
-                        if (old := before.get(field)) is not None and toml_value(old) != toml_value(new.value)
-                    ]
+        notebook, changed, steps = before.with_values(step.derived(before)), list[str](), list(self._steps.values())
+        for later in steps[steps.index(step) + 1 :]:
+            if later.name in notebook.done:
+                values = later.derived(notebook)
+                notebook = notebook.with_values(values)
+                changed += [
+                    f"{field}: {toml_value(old)} -> {toml_value(new.value)}"
+                    for field, new in values.items()
+                    if (old := before.get(field)) is not None and toml_value(old) != toml_value(new.value)
+                ]
         self._visit.save(notebook.finished(step.name))
         if changed:
             self._visit.say("Changed with it, because it depends on this step:", *changed)
@@ -134,11 +120,3 @@ class Wizard:
         before = "" if kept is None else f"; as it was before: {kept}"
         self._visit.say(f"{path}: written, with how each value was obtained{before}")
         return path
-
-
-def _in_lines(error: Exception) -> list[str]:
-    # The notes of a device's error may say that the arm was not seen at rest.
-    lines = [str(error), *getattr(error, "__notes__", [])]
-    if isinstance(error, DeviceError) and not error.remedy:
-        lines.append("Check power, cable and address.")
-    return lines

@@ -9,10 +9,10 @@ from unittest.mock import AsyncMock
 
 import pytest
 
-from brushloop.collect.commission.arm import ADDRESS
-from brushloop.collect.commission.brush import BRUSH, BUS, PORT, BrushStep, ForceStep
-from brushloop.collect.commission.camera import PRINT, CameraStep
-from brushloop.collect.commission.visit import Asked, LeftOff, Visit, WentBack
+from brushloop.collect.commission.arm import ASK_ADDRESS
+from brushloop.collect.commission.brush import ASK_BUS, ASK_PORT, RADIUS, BrushStep, ForceStep, ask_depth, ask_length
+from brushloop.collect.commission.camera import ASK_SQUARES, CameraStep
+from brushloop.collect.commission.visit import LeftOff, Visit, WentBack
 from brushloop.collect.commission.wizard import Wizard
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.operator import Prompt
@@ -110,22 +110,22 @@ async def test_a_step_that_was_refused_goes_on_where_the_person_wants(
 @pytest.mark.parametrize(
     ("asked", "line", "said"),
     [
-        (BRUSH[1], "190", r"190 mm cannot be \(5 to 180 mm\)"),
-        (BRUSH[1], "nan", "is not a number"),
-        (BRUSH[0], "0,1", r"0\.1 is outside 0\.5 to 50 mm"),
-        (PORT, "", "no serial line was named"),
-        (BUS, "host:bus", "Port could not be cast to integer value as 'bus'"),
-        (PRINT[0], "26", "is not two numbers of squares like 26x20"),
-        (ADDRESS, "192.0.2.7:65536", "Port out of range"),
-        (ADDRESS, "192.0.2.7:x", "Port could not be cast to integer value as 'x'"),
-        (ADDRESS, "the cabinet", "is not an address like 192.0.2.7"),
+        (ask_length([0.0, 0.0, 180.0]), "190", r"190 mm cannot be \(5 to 180 mm\)"),
+        (ask_depth(48.0), "30", r"30 mm cannot be \(0\.5 to 28\.8 mm\)"),
+        (RADIUS, "nan", "is not a number"),
+        (RADIUS, "0,1", r"0\.1 is outside 0\.5 to 50 mm"),
+        (ASK_PORT, "", "no serial line was named"),
+        (ASK_BUS, "host:bus", "Port could not be cast to integer value as 'bus'"),
+        (ASK_SQUARES, "26", "is not two numbers of squares like 26x20"),
+        (ASK_ADDRESS, "192.0.2.7:65536", "Port out of range"),
+        (ASK_ADDRESS, "192.0.2.7:x", "Port could not be cast to integer value as 'x'"),
+        (ASK_ADDRESS, "the cabinet", "is not an address like 192.0.2.7"),
     ],
 )
-def test_a_line_that_cannot_be_the_value_is_refused_where_it_is_typed(
-    asked: Asked, line: str, said: str, tmp_path: Path
-) -> None:
+def test_a_line_that_cannot_be_the_value_is_refused_where_it_is_typed(asked: Prompt, line: str, said: str) -> None:
+    assert asked.read is not None
     with pytest.raises(ValueError, match=said):
-        asked.value(line, visit_of(Person(), tmp_path).notebook)
+        asked.read(line)
 
 
 async def test_a_step_that_is_taught_again_by_mistake_is_as_it_was_after_back(tmp_path: Path) -> None:
@@ -150,6 +150,6 @@ async def test_a_step_that_failed_says_in_what_state_the_arm_is(
     person = Person()
     with pytest.raises(CollectAborted):
         await Wizard(person.visit(tmp_path / "rig.toml"), (CameraStep(),)).run()
-    said = person.shown[0][1].splitlines()
-    assert said[0].startswith("robot: moveLine: no reply in 1 s. A stop was sent to the arm.")
-    assert said[1] == "The arm may still be moving."
+    said = person.shown[0][1]
+    assert said.startswith("robot: moveLine: no reply in 1 s. A stop was sent to the arm.")
+    assert "The arm may still be moving." in said

@@ -19,9 +19,9 @@ from rich.console import Console  # noqa: TID251
 from textual.app import App
 from textual.pilot import Pilot
 
-from brushloop.collect.commission.arm import ADDRESS
-from brushloop.collect.commission.brush import BRUSH, BUS
-from brushloop.collect.commission.visit import Visit
+from brushloop.collect.commission.arm import ASK_ADDRESS
+from brushloop.collect.commission.brush import ASK_BUS, RADIUS
+from brushloop.collect.commission.visit import Visit, choice_of
 from brushloop.collect.engine.capture import mark_of
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.engine import Engine
@@ -377,15 +377,15 @@ class Asking:
     async def _ask(self, visit: Visit, kind: str) -> Any:
         match kind:
             case "choose":
-                return await visit.choose("Take this tip?", (TAKE, TOUCH), "y")
+                return await visit.ask(choice_of("Take this tip?", (TAKE, TOUCH), "y"))
             case "no default":
                 return await visit.yes("Is there a pot of water?")
             case "number":
-                return await visit.ask(BRUSH[0].prompt(visit.notebook))
+                return await visit.ask(RADIUS)
             case "text":
-                return await visit.ask(replace(ADDRESS, default="192.0.2.7").prompt(visit.notebook))
+                return await visit.ask(replace(ASK_ADDRESS, default="192.0.2.7"))
             case "empty":
-                return await visit.ask(BUS.prompt(visit.notebook))
+                return await visit.ask(ASK_BUS)
             case "bring":
                 visit.say("the board as the camera sees it", picture=board())
                 how = "Guide the tip to the pin by hand, the brush leaning toward the window, then press Enter."
