@@ -80,12 +80,11 @@ class Make:
     def captured(self, stroke_id: str, still: int, **known: Any) -> CaptureResult:
         return CaptureResult(press=self.press(stroke_id), still=still, **known)
 
-    def perform(self, store: SessionStore, key: str, *patches: int) -> None:
+    def perform(self, store: SessionStore, key: str, patch: int | None = None) -> None:
         """One step from begin to done, with a still and a stroke in it."""
-        attempt = store.begin(key, StepKind.CAPTURE, patches=patches)
-        attempt.writer.write(self.still(attempt.serial))
-        attempt.writer.write(self.stroke(attempt.serial, stroke_id=key))
-        store.done(attempt, self.captured(key, attempt.serial))
+        number = store.state.begun
+        shown = [self.still(number), self.stroke(number, stroke_id=key)]
+        self.take(store, key, shown, self.captured(key, number), patch)
 
     def collect(self, store: SessionStore, strokes: int = 2) -> None:
         """A small grid as the engine collects it: a board, presses with poses, captures, and one press that was cut."""
@@ -127,9 +126,9 @@ class Make:
     def events(self, folder: Path, kind: str) -> list[dict[str, Any]]:
         return [line for line in read_lines(folder / JOURNAL_NAME) if line["event"] == kind]
 
-    def rewrite_journal(self, folder: Path, change: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
-        """Change what lines say, as a program would that knows the format."""
-        lines = [change(dict(line)) for line in read_lines(folder / JOURNAL_NAME)]
+    def rewrite_journal(self, folder: Path, event: str, **said: Any) -> None:
+        """Have every line of an event say this, as a program would that knows the format."""
+        lines = (line | (said if line["event"] == event else {}) for line in read_lines(folder / JOURNAL_NAME))
         data = [seal({"seq": n, "session": self.header.session_id, **line}) for n, line in enumerate(lines, 1)]
         (folder / JOURNAL_NAME).write_bytes(b"".join(data))
 

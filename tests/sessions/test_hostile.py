@@ -23,6 +23,7 @@ from tests.command import brushloop
 
 BRUSHLOOP = get_command(app)
 SECRET = b"the key to the safe"
+PRECIOUS = ("victim.mcap", "victim.toml", "victim.mcap.part", "journal.jsonl", "calibration/0123456789abcdef.json")
 CALLS = ("rename", "link", "symlink", "remove", "truncate", "mkdir", "rmdir", "listdir")
 WATCHED = ("open", *(f"os.{call}" for call in CALLS))
 COMMANDS = {
@@ -64,13 +65,7 @@ def place(make, tmp_path):
     """`outside` with precious files, and `root` with a closed session to damage, its files beside it."""
     outside = tmp_path / "outside"
     (outside / "calibration").mkdir(parents=True)
-    for name in (
-        "victim.mcap",
-        "victim.toml",
-        "victim.mcap.part",
-        "journal.jsonl",
-        "calibration/0123456789abcdef.json",
-    ):
+    for name in PRECIOUS:
         (outside / name).write_bytes(SECRET)
     make.session(tmp_path / "root" / make.header.session_id, closed=True)
     make.record(outside / "whole.mcap", *make.strokes(2))
@@ -79,20 +74,14 @@ def place(make, tmp_path):
 
 def named(name, event="done"):
     """Every line of this event names the file `name`."""
-    return lambda make, folder, _: make.rewrite_journal(
-        folder,
-        lambda line: (
-            {**line, "file": name.format(out=folder.parents[1] / "outside")} if line["event"] == event else line
-        ),
-    )
+    return lambda make, folder, outside: make.rewrite_journal(folder, event, file=name.format(out=outside))
 
 
 def snapshot(name):
-    def damage(make, folder, outside):
-        snapshots = {name.format(out=outside): "written by a stranger"}
-        make.rewrite_journal(folder, lambda line: {**line, "snapshots": snapshots} if line["event"] == "open" else line)
-
-    return damage
+    """A snapshot of the configuration has this name."""
+    return lambda make, folder, outside: make.rewrite_journal(
+        folder, "open", snapshots={name.format(out=outside): "written by a stranger"}
+    )
 
 
 def linked(pattern, to):
@@ -110,13 +99,8 @@ def linked(pattern, to):
 
 def session_id(make, folder, _):
     """The header names a folder elsewhere."""
-    session_id = "../../outside/calibration"
-    make.rewrite_journal(
-        folder,
-        lambda line: (
-            {**line, "header": {**line["header"], "session_id": session_id}} if line["event"] == "open" else line
-        ),
-    )
+    elsewhere = {"session_id": "../../outside/calibration"}
+    make.rewrite_journal(folder, "open", header=make.header.model_dump(mode="json") | elsewhere)
 
 
 WAYS = {

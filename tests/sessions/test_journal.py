@@ -73,20 +73,16 @@ def test_a_last_line_without_only_its_end_is_a_whole_line(path):
     assert [line["event"] for line in read_lines(path)] == ["begin", "done", "sheet"]
 
 
-LINES = [seal({"seq": n, "session": "s", "t_ns": 1, **{"event": "sheet", "sheet": n}}) for n in range(1, 13)]
-FOREIGN = seal({"seq": 7, "session": "other", "t_ns": 1, **{"event": "sheet", "sheet": 7}})
-BARE = seal({"seq": 5, "session": "s", "t_ns": 1, **{"event": "sheet"}})
+LINES = [seal({"seq": n, "session": "s", "t_ns": 1, "event": "sheet", "sheet": n}) for n in range(1, 13)]
+FOREIGN = seal({"seq": 7, "session": "other", "t_ns": 1, "event": "sheet", "sheet": 7})
+BARE = seal({"seq": 5, "session": "s", "t_ns": 1, "event": "sheet"})
 WRONG = "line 5 does not match its CRC"
-
 
 CHANGES = {
     "deleted": (lambda a: [*a[:4], *a[5:]], ["line 5 is numbered 6"]),
     "first": (lambda a: a[1:], ["line 1 is numbered 2"]),
     "doubled": (lambda a: [*a[:5], a[4], *a[5:]], ["line 6 is numbered 5"]),
-    "exchanged": (
-        lambda a: [*a[:3], a[9], *a[4:9], a[3], *a[10:]],
-        ["line 4 is numbered 10"],
-    ),
+    "exchanged": (lambda a: [*a[:3], a[9], *a[4:9], a[3], *a[10:]], ["line 4 is numbered 10"]),
     "foreign": (lambda a: [*a[:6], FOREIGN, *a[6:]], ["line 7 is of another session, 'other'", "line 8 is numbered 7"]),
     "binary": (lambda a: [*a[:4], b"\xff\xfe\n", *a[5:]], [WRONG]),
     "deep": (lambda a: [*a[:4], b"[" * 100_000 + b"\n", *a[5:]], [WRONG]),
@@ -147,9 +143,10 @@ def test_what_does_not_fit_on_the_disk_is_an_error_and_damages_nothing(path, mon
 
 def test_the_latest_remark_on_a_capture_holds_and_the_earlier_ones_stay(tmp_path: Path) -> None:
     assert remarks_of(tmp_path) == {}
-    add_remark(tmp_path, Remark(t_ns=1, still=4, stroke_id="H13-a0-r01", bad=True, note="墨 ran"))
-    add_remark(tmp_path, Remark(t_ns=2, still=7, stroke_id="H13-a0-r02", bad=False, note="pale"))
-    add_remark(tmp_path, Remark(t_ns=3, still=4, stroke_id="H13-a0-r01", bad=False, note="good after all"))
-    assert remarks_of(tmp_path)[4] == Remark(t_ns=3, still=4, stroke_id="H13-a0-r01", bad=False, note="good after all")
-    assert remarks_of(tmp_path)[7].note == "pale"
+    ran = Remark(t_ns=1, still=4, stroke_id="H13-a0-r01", bad=True, note="墨 ran")
+    pale = Remark(t_ns=2, still=7, stroke_id="H13-a0-r02", bad=False, note="pale")
+    good = Remark(t_ns=3, still=4, stroke_id="H13-a0-r01", bad=False, note="good after all")
+    for remark in (ran, pale, good):
+        add_remark(tmp_path, remark)
+    assert remarks_of(tmp_path) == {4: good, 7: pale}
     assert "ran" in (tmp_path / REMARKS_NAME).read_text(encoding="utf-8")

@@ -24,11 +24,10 @@ def store(make, tmp_path):
 
 def press(make, store, stroke_id, depth_mm, patch):
     made = make.press(stroke_id, depth_mm, sheet=store.state.sheet, patch=patch)
-    store.done(store.begin(f"press {stroke_id}", StepKind.PRESS, patches=(patch,), press=made), PressResult(press=made))
-    attempt = store.begin(f"capture {stroke_id}", StepKind.CAPTURE, press=made)
-    attempt.writer.write(make.still(attempt.serial))
-    attempt.writer.write(make.stroke(attempt.serial, stroke_id=stroke_id, depth_mm=depth_mm, tilt_deg=5.0))
-    store.done(attempt, CaptureResult(press=made, still=attempt.serial))
+    make.take(store, f"press {stroke_id}", [], PressResult(press=made), patch)
+    number = store.state.begun
+    shown = [make.still(number), make.stroke(number, stroke_id=stroke_id, depth_mm=depth_mm, tilt_deg=5.0)]
+    make.take(store, f"capture {stroke_id}", shown, CaptureResult(press=made, still=number))
 
 
 @pytest.fixture
@@ -79,14 +78,9 @@ def test_a_closed_session_and_its_file_agree(collected):
 def test_the_command_prints_it_and_json_holds_all_of_it(collected):
     ran = CliRunner(env={"COLUMNS": "160"}).invoke(app, ["show", str(collected.folder)])
     assert ran.exit_code == 0
-    for word in (
-        "2 of 4 planned",
-        "3 patches used",
-        "H 13 mm, alpha 5 deg: 1 of 2",
-        "press H13-a5-r02 (under way",
-        "goat",
-    ):
-        assert word in ran.output
+    condition, running = "H 13 mm, alpha 5 deg: 1 of 2", "press H13-a5-r02 (under way"
+    for words in ("2 of 4 planned", "3 patches used", condition, running, "goat"):
+        assert words in ran.output
     as_json = json.loads(CliRunner().invoke(app, ["show", str(collected.folder), "--json"]).output)
     assert as_json["sheets"] == {"1": [0, 1, 2], "2": [0]}
 
@@ -101,13 +95,8 @@ def root(make, tmp_path, out, photos, run):
         | {"start_x_px": "1", "start_y_px": "1"},
     )
     run()
-    for name, strokes in (("2026-01-02-grid-01", 3), ("2026-01-02-grid-02", 1)):
-        store = make.store(root / name)
-        for number in range(strokes):
-            make.perform(store, f"stroke {number}")
-        if strokes == 3:
-            store.close()
-        store.release()
+    make.session(root / "2026-01-02-grid-01", 3, closed=True)
+    make.session(root / "2026-01-02-grid-02", 1)
     (root / "notes").mkdir()
     (root / "readme.txt").write_text("no session")
     return root

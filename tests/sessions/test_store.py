@@ -5,6 +5,7 @@ import io
 import itertools
 import os
 from collections import namedtuple
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -81,11 +82,7 @@ def test_the_merged_file_holds_what_the_journal_counted_and_the_configuration(ma
 
 def test_counts_that_do_not_agree_leave_the_merged_file_unnamed(make, store, resume):
     make.perform(store, "a")
-
-    def more(line):
-        return {**line, "counts": {**line["counts"], "/stroke": 2}} if line["event"] == "done" else line
-
-    make.rewrite_journal(store.folder, more)
+    make.rewrite_journal(store.folder, "done", counts={"/step": 2, "/camera/still": 1, "/stroke": 2})
     with pytest.raises(SessionDamaged, match="the journal says"):
         resume(store).close()
     assert not (store.folder / f"{store.folder.name}.mcap").exists()
@@ -175,11 +172,10 @@ def test_a_clock_that_is_set_back_reorders_nothing(make, tmp_path):
     ticks = itertools.chain([make.t0_ns + 10**10] * 2, itertools.count(make.t0_ns, 1_000_000))
     store = SessionStore.create(tmp_path / "s", make.header, make.snapshots, lambda: next(ticks))
     for number in (3, 2, 1):  # each is stamped before the last one
-        messages = [make.still(number), make.stroke(number)]
-        messages[1] = make.stroke(number, stroke_id=f"stroke {number}")
-        early = messages[0].log_ns - 500
-        messages[1] = type(messages[1])(messages[1].topic, early, early, number, messages[1].message)
-        make.take(store, f"key {number}", messages, make.captured(f"stroke {number}", number))
+        still, stroke = make.still(number), make.stroke(number, stroke_id=f"stroke {number}")
+        early_ns = still.log_ns - 500
+        earlier = replace(stroke, log_ns=early_ns, publish_ns=early_ns)
+        make.take(store, f"key {number}", [still, earlier], make.captured(f"stroke {number}", number))
     final = store.close()
     store.release()
     captures = list(Recording(final).captures())

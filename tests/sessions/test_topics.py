@@ -47,19 +47,24 @@ def each(make):
     return [*outgoing, make.still(0), make.stroke(0)]
 
 
-def test_the_merged_file_carries_every_topic_under_a_name_that_viewers_know(make, store, each):
+@pytest.fixture
+def merged(make, store, each):
+    """Schema and channel of each topic of the merged file."""
     make.take(store, "all", each, PressResult(press=make.press()))
     with store.close().open("rb") as file:
-        found = {channel.topic: (schema, channel) for schema, channel, _ in make_reader(file).iter_messages()}
-    assert set(found) == {str(topic) for topic in Topic}
-    for schema, channel in found.values():
+        return {channel.topic: (schema, channel) for schema, channel, _ in make_reader(file).iter_messages()}
+
+
+def test_the_merged_file_carries_every_topic_under_a_name_that_viewers_know(merged):
+    assert set(merged) == {str(topic) for topic in Topic}
+    for schema, channel in merged.values():
         if schema.name.startswith("foxglove."):
             assert (schema.encoding, channel.message_encoding) == (SchemaEncoding.Protobuf, MessageEncoding.Protobuf)
         else:
             assert schema.name.startswith("brushloop.")
             assert (schema.encoding, channel.message_encoding) == (SchemaEncoding.JSONSchema, MessageEncoding.JSON)
             assert json.loads(schema.data)["type"] == "object"
-    names = {topic: schema.name for topic, (schema, _) in found.items()}
+    names = {topic: schema.name for topic, (schema, _) in merged.items()}
     assert names["/robot/joints"] == "foxglove.JointStates"
     assert names["/tf"] == "foxglove.FrameTransforms"
     assert names["/camera/calibration"] == "foxglove.CameraCalibration"
@@ -86,16 +91,10 @@ def test_any_viewer_decodes_them_from_the_schemas_in_the_file(make, tmp_path, ea
 LAYOUT = Path(__file__).parents[2] / "docs" / "foxglove-layout.json"
 
 
-def test_the_foxglove_layout_asks_for_topics_and_fields_that_there_are(make, store, each):
-    make.take(store, "all", each, PressResult(press=make.press()))
-    with store.close().open("rb") as file:
-        fields = {}
-        for schema, channel, _ in make_reader(file).iter_messages():
-            fields[channel.topic] = schema.data.decode(errors="replace")
-    layout = json.loads(LAYOUT.read_text())
-    panels = json.dumps(layout["configById"])
+def test_the_foxglove_layout_asks_for_topics_and_fields_that_there_are(merged):
+    panels = json.dumps(json.loads(LAYOUT.read_text())["configById"])
     asked = re.findall(r'"(/[a-z/]+)((?:\.\w+)*)"', panels)
-    assert {topic for topic, _ in asked} <= set(fields)
+    assert {topic for topic, _ in asked} <= set(merged)
     for topic, path in asked:
         for field in filter(None, path.split(".")[1:2] + path.split(".")[-1:]):
-            assert field in fields[topic], f"{topic}{path}"
+            assert field.encode() in merged[topic][0].data, f"{topic}{path}"

@@ -2,16 +2,13 @@
 
 import errno
 import hashlib
-import io
 import os
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.records import Channel, Schema
-from mcap.writer import CompressionType, Writer
+from mcap.records import Channel, Message, Schema
 
 from brushloop.sessions import mcap_writer
 from brushloop.sessions.errors import SessionDamaged, SessionError
@@ -76,67 +73,37 @@ def test_a_disk_that_does_not_keep_up_is_heard(make, path, monkeypatch):
 HEADER = Make.header
 THING, THINGS = Schema(1, b"{}", "jsonschema", "Thing"), Channel(1, "/things", "json", {}, 1)
 BARE = Channel(2, "/bare", "", {}, 0)
+SMALL = [Message(THINGS.id, number, b"{}", number + 1, number) for number in range(500)]
+LARGE = [Message(BARE.id, 100 - n, bytes(size), 0, 2**32 - 1) for n, size in enumerate((0, CHUNK_BYTES, 10))]
+"""In order of writing, on a clock that goes back."""
 
 
-def theirs(file):
-    writer = Writer(
-        file,
-        chunk_size=CHUNK_BYTES,
-        compression=CompressionType.ZSTD,
-        enable_data_crcs=True,
-        use_summary_offsets=False,
-    )
-    writer.start(profile="", library=HEADER.software)
-    writer.add_attachment(0, 0, HEADER_FILE, "application/json", HEADER.model_dump_json().encode())
-
-    def add_channel(schema, channel):
-        if schema is not None:
-            writer.register_schema(schema.name, schema.encoding, schema.data)
-        writer.register_channel(channel.topic, channel.message_encoding, channel.schema_id)
-
-    def add_message(channel_id, sequence, log_ns, publish_ns, data):
-        writer.add_message(channel_id, log_ns, data, publish_ns, sequence)
-
-    def attach(name, data):
-        writer.add_attachment(0, 0, name, "application/toml", data)
-
-    return writer, attach, add_channel, add_message
+@pytest.fixture
+def written(tmp_path):
+    """A file with two topics, large and small messages, and whatever else a file may hold."""
+    path = tmp_path / "written.mcap"
+    with path.open("xb") as file:
+        writer = McapWriter(file, HEADER)
+        writer.add_attachment("rig.toml", b"x = 1")
+        writer.add_channel(THING, THINGS)
+        writer.add_channel(None, BARE)
+        for m in SMALL:
+            writer.add_message(m.channel_id, m.sequence, m.log_time, m.publish_time, m.data)
+        writer.flush()
+        writer.flush()  # nothing waits: no chunk is written
+        for m in LARGE:
+            writer.add_message(m.channel_id, m.sequence, m.log_time, m.publish_time, m.data)
+        writer.finish()
+    return path
 
 
-def ours(file):
-    writer = McapWriter(file, HEADER)
-    return writer, writer.add_attachment, writer.add_channel, writer.add_message
-
-
-def written(begin):
-    """A file with two topics, large and small messages, a clock that goes back, and whatever else a file may hold."""
-    file = io.BytesIO()
-    writer, attach, add_channel, add_message = begin(file)
-    attach("rig.toml", b"x = 1")
-    add_channel(THING, THINGS)
-    add_channel(None, BARE)
-    for number in range(500):
-        add_message(THINGS.id, number, number, number + 1, b"{}")
-    writer.flush()
-    writer.flush()  # nothing waits: no chunk is written
-    for number, size in enumerate((0, CHUNK_BYTES, 10)):
-        add_message(BARE.id, 2**32 - 1, 100 - number, 0, bytes(size))
-    writer.finish()
-    file.seek(0)
-    return file
-
-
-@pytest.mark.parametrize("topic", ["/things", "/bare"])
-def test_the_mcap_library_finds_by_our_index_what_it_finds_by_its_own(topic):
-    def found(file):
+def test_the_mcap_library_finds_by_our_index_what_was_written(written):
+    with written.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
-        assert [(a.name, a.data[:6]) for a in reader.iter_attachments()] == [
-            (HEADER_FILE, b'{"sche'),
-            ("rig.toml", b"x = 1"),
-        ]
-        return [asdict(message) for _, _, message in reader.iter_messages([topic])]
-
-    assert found(written(ours)) == found(written(theirs))
+        attached = [(attachment.name, attachment.data[:6]) for attachment in reader.iter_attachments()]
+        things, bare = ([message for *_, message in reader.iter_messages([topic])] for topic in ("/things", "/bare"))
+    assert attached == [(HEADER_FILE, b'{"sche'), ("rig.toml", b"x = 1")]
+    assert (things, bare) == (SMALL, LARGE[::-1])
 
 
 def copied(path, *sources, channels=()):
@@ -147,26 +114,17 @@ def copied(path, *sources, channels=()):
         for source in sources:
             writer.copy_file(source)
         writer.finish()
+    return path
 
 
-def test_the_messages_of_other_files_are_copied_as_they_are(tmp_path):
-    source, copy = tmp_path / "source.mcap", tmp_path / "copy.mcap"
-    source.write_bytes(written(theirs).getvalue())
-    copied(copy, source, source)
-
-    def messages_of(path):
-        return [
-            (c.topic, m.sequence, m.log_time, m.publish_time, m.data) for _, c, m in McapFile(path).sound().messages()
-        ]
-
-    assert messages_of(copy) == 2 * messages_of(source)
+def test_the_messages_of_other_files_are_copied_as_they_are(written, tmp_path):
+    copy = copied(tmp_path / "copy.mcap", written, written)
+    assert [message for *_, message in McapFile(copy).sound().messages()] == 2 * [*SMALL, *LARGE]
     with copy.open("rb") as file:
-        by_index = [m.log_time for _, _, m in make_reader(file, validate_crcs=True).iter_messages(["/bare"])]
+        by_index = [m.log_time for *_, m in make_reader(file, validate_crcs=True).iter_messages(["/bare"])]
     assert by_index == [98, 98, 99, 99, 100, 100]
 
 
-def test_a_file_that_numbers_its_topics_otherwise_is_not_merged(tmp_path):
-    source = tmp_path / "source.mcap"
-    source.write_bytes(written(theirs).getvalue())
+def test_a_file_that_numbers_its_topics_otherwise_is_not_merged(written, tmp_path):
     with pytest.raises(SessionDamaged, match="has /things under the number of /other"):
-        copied(tmp_path / "copy.mcap", source, channels=[Channel(1, "/other", "json", {}, 0)])
+        copied(tmp_path / "copy.mcap", written, channels=[Channel(1, "/other", "json", {}, 0)])
