@@ -92,13 +92,6 @@ def in_thread(servers: AbstractAsyncContextManager[_R]) -> Iterator[tuple[_R, as
         assert not thread.is_alive(), f"waited {PATIENCE_S:g} s for the servers to end"
 
 
-@contextlib.contextmanager
-def serving(config: SimConfig) -> Iterator[LoopbackRig]:
-    """The rig serves from another thread's event loop until the block ends."""
-    with in_thread(LoopbackRig(config)) as (rig, _):
-        yield rig
-
-
 @dataclass
 class Lab:
     """A rig, its configuration on disk, and a folder for sessions."""
@@ -196,7 +189,7 @@ def sharp(lab: Lab, latency_ms: int = 100) -> Lab:
 @contextlib.contextmanager
 def wired_lab(folder: Path, config: SimConfig = COARSE) -> Iterator[Lab]:
     """A coarse lab on sockets, whose processes end with the block."""
-    with serving(config) as rig:
+    with in_thread(LoopbackRig(config)) as (rig, _):
         lab = coarse(Lab(rig, folder))
         for limit in ("max_delay_ms = 3000.0", "max_jitter_ms = 2000.0"):
             lab.edit_rig(limit, f"{limit.partition(' ')[0]} = 10000.0")  # of a busy machine

@@ -53,12 +53,7 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "photos" / "table.csv").write_text("file,px_per_mm,start_x_px,start_y_px\nprofile.png,1,0,12\n")
     store = make.store(folder / "profile", session_id="profile")
     still = make.still(0, with_profile(make.png()))
-    make.take(
-        store,
-        "a",
-        [still, make.stroke(0, kind="drag", px_per_mm=(1.0, 1.0))],
-        make.captured("a", 0),
-    )
+    make.take(store, "a", [still, make.stroke(0, kind="drag", px_per_mm=(1.0, 1.0))], make.captured("a", 0))
     store.close()
     store.release()
     table = f'"file{HOSTILE.replace(chr(13), "")}",px_per_mm\na.png,1\n'

@@ -5,12 +5,10 @@ from __future__ import annotations
 import asyncio
 import importlib.util
 import sys
-import threading
 import time
 import tomllib
-from collections.abc import Iterator
-from concurrent.futures import Future
-from contextlib import contextmanager
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -37,9 +35,8 @@ from brushloop.model import strokes
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.raster import coverage
 from brushloop.model.strokes import stroke_models
-from tests.rigs import SHARP_VIEW, SMALL_TABLE, serving
+from tests.rigs import SHARP_VIEW, SMALL_TABLE, in_thread
 from tests.runs import wait_for_end
-from tests.waiting import PATIENCE_S
 
 RECIPES = Path(__file__).resolve().parent.parent / "examples" / "recipes"
 
@@ -67,9 +64,8 @@ def test_a_stroke_model_is_a_file_in_the_folder(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(strokes, "__path__", [*strokes.__path__, str(tmp_path)])
     try:
         models = stroke_models(Brush())
-        drop, circle = (
-            float(coverage(models[name].profile(15.0, 5.0), (15.0, 15.0)).sum()) for name in ("drop", "circle")
-        )
+        marks = (models[name].profile(15.0, 5.0) for name in ("drop", "circle"))
+        drop, circle = (float(coverage(mark, (15.0, 15.0)).sum()) for mark in marks)
         assert drop == pytest.approx(0.5 * circle, rel=0.01)
     finally:
         sys.modules.pop("brushloop.model.strokes.drop", None)
@@ -78,13 +74,8 @@ def test_a_stroke_model_is_a_file_in_the_folder(tmp_path: Path, monkeypatch: pyt
 def test_a_protocol_kind_is_one_class() -> None:
     stairs = recipe("protocol_kind").StairsConfig(kind="stairs", from_mm=10.0, to_mm=14.0, count=3, repeats=2)
     assert [stroke.condition.depth_mm for stroke in stairs.planned()] == [10.0, 12.0, 14.0, 10.0, 12.0, 14.0]
-    steps = [
-        walked.step
-        for walked in walk(
-            RigConfig(**tomllib.loads(rig_toml(SimConfig(force_sensor=False, ink_device="none")))),
-            stairs,
-        )
-    ]
+    rig = RigConfig(**tomllib.loads(rig_toml(SimConfig(force_sensor=False, ink_device="none"))))
+    steps = [walked.step for walked in walk(rig, stairs)]
     presses = [step.press for step in steps if isinstance(step, PressStep)]
     assert [press.condition.depth_mm for press in presses] == [10.0, 12.0, 14.0, 10.0, 12.0, 14.0]
     assert len({step.key for step in steps}) == len(steps)
@@ -97,8 +88,8 @@ def test_a_quality_check_is_a_function_of_the_mark() -> None:
     assert "Wipe the brush" in flooded(replace(mark, tone=0.99), QualityConfig()).reason
 
 
-@contextmanager
-def syringe(well: Well) -> Iterator[int]:
+@asynccontextmanager
+async def syringe(well: Well) -> AsyncIterator[int]:
     """The port of a simulated syringe pump that fills this well."""
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -109,19 +100,8 @@ def syringe(well: Well) -> Iterator[int]:
         writer.close()
         await writer.wait_closed()
 
-    async def listen() -> None:
-        async with await asyncio.start_server(serve, "127.0.0.1", 0) as server:
-            over = asyncio.Event()
-            ready.set_result((server.sockets[0].getsockname()[1], asyncio.get_running_loop(), over))
-            await over.wait()
-
-    ready: Future[tuple[int, asyncio.AbstractEventLoop, asyncio.Event]] = Future()
-    thread = threading.Thread(target=asyncio.run, args=(listen(),))
-    thread.start()
-    port, loop, over = ready.result(PATIENCE_S)
-    yield port
-    loop.call_soon_threadsafe(over.set)
-    thread.join(PATIENCE_S)
+    async with await asyncio.start_server(serve, "127.0.0.1", 0) as server:
+        yield server.sockets[0].getsockname()[1]
 
 
 def test_an_ink_device_is_a_table_and_a_driver_and_the_engine_inks_a_brush_with_it(tmp_path: Path) -> None:
@@ -134,7 +114,7 @@ def test_an_ink_device_is_a_table_and_a_driver_and_the_engine_inks_a_brush_with_
         ink: InkWithSyringe  # type: ignore[assignment]
 
     config = SimConfig(rate=60.0, table=SMALL_TABLE, view=SHARP_VIEW, force_sensor=False, ink_device="none")
-    with serving(config) as lab, syringe(lab.world.well) as port:
+    with in_thread(LoopbackRig(config)) as (lab, _), in_thread(syringe(lab.world.well)) as (port, _):
         lab.world.well.ml = 0.0
         rig_path, protocol_path = tmp_path / "rig.toml", tmp_path / "protocol.toml"
         rig_path.write_text(lab.toml().replace("latency_ms = 250.0", "latency_ms = 100.0"), encoding="utf-8")

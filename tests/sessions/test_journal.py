@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from brushloop.sessions.errors import SessionDamaged, SessionError
-from brushloop.sessions.events import Condition, Remark, parse_event
+from brushloop.sessions.events import Remark, parse_event
 from brushloop.sessions.journal import Journal, read, replay, seal
 from brushloop.sessions.recording import REMARKS_NAME, add_remark, remarks_of
 from tests.journal_lines import read_lines
@@ -55,7 +55,7 @@ def test_every_line_is_on_disk_before_append_returns(path, monkeypatch):
     assert synced == [1, 2, 3]
 
 
-def test_a_last_line_torn_at_any_byte_is_removed_and_the_rest_reads(path):
+def test_a_last_line_torn_at_any_byte_is_removed_and_one_without_only_its_end_is_whole(path):
     whole = written(path, BEGIN, DONE).read_bytes()
     last_line_at = whole.index(b"\n") + 1
     for cut in range(last_line_at + 1, len(whole) - 1):
@@ -63,10 +63,6 @@ def test_a_last_line_torn_at_any_byte_is_removed_and_the_rest_reads(path):
         assert len(list(read_lines(path))) == 1
         written(path, DONE)
         assert path.read_bytes() == whole
-
-
-def test_a_last_line_without_only_its_end_is_a_whole_line(path):
-    whole = written(path, BEGIN, DONE).read_bytes()
     path.write_bytes(whole[:-1])
     assert [line["event"] for line in read_lines(path)] == ["begin", "done"]
     written(path, {"event": "sheet", "sheet": 1})
@@ -108,17 +104,6 @@ def test_what_happened_to_lines_is_named(path, change, expected):
 def test_a_step_that_is_done_twice_is_damage(path):
     with pytest.raises(SessionDamaged, match="its step was done already"):
         replay(written(path, BEGIN, DONE, DONE))
-
-
-def test_replay_folds_begin_done_void_and_sheet(path):
-    other = {**BEGIN, "key": "k2", "patches": [5], "file": "0001-k2.mcap"}
-    void = {"event": "void", "key": "k2", "attempt": 1, "why": "stopped"}
-    again = {**other, "attempt": 2, "sheet": 1, "patches": [0]}
-    state = replay(written(path, BEGIN, DONE, other, void, {"event": "sheet", "sheet": 1}, again))
-    assert state.done["k1"].result.press.condition == Condition(depth_mm=13.0, tilt_deg=5.0)
-    assert list(state.files) == ["0000-k1.mcap"]
-    assert state.attempts == {"k1": 1, "k2": 2}
-    assert (state.begun, len(state.cut), state.sheet) == (3, 1, 1)
 
 
 def test_what_does_not_fit_on_the_disk_is_an_error_and_damages_nothing(path, monkeypatch):

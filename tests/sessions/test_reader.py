@@ -50,7 +50,7 @@ def test_every_stroke_comes_with_the_still_that_shows_it(make, path):
     assert Recording(path).counts[Topic.STROKE] == 3
 
 
-def test_captures_are_lazy_so_that_a_session_need_not_fit_in_memory(make, path):
+def test_a_still_that_is_long_gone_is_missed_only_when_its_stroke_is_read(make, path):
     make.record(path, *make.strokes(20), make.stroke(1, stroke_id="names a still long gone", still=3))
     captures = Recording(path).captures()
     assert len(list(itertools.islice(captures, 2))) == 2

@@ -31,7 +31,7 @@ def test_an_existing_folder_is_refused_and_left_as_it_is(make, tmp_path):
     assert list((tmp_path / "s").iterdir()) == []
 
 
-def test_attempts_patches_and_results_are_kept_across_processes(make, store, resume):
+def test_attempts_sheets_patches_and_results_are_kept_across_processes(make, store, resume):
     make.perform(store, "H13-a05", 0)
     store.void(store.begin("H15-a05", StepKind.PRESS, patches=(1, 36)), "stopped by the operator")
     second = resume(store)
@@ -40,16 +40,13 @@ def test_attempts_patches_and_results_are_kept_across_processes(make, store, res
     attempt = second.begin("H15-a05", StepKind.PRESS, patches=(2,))
     assert (attempt.begin.attempt, attempt.serial) == (2, 2)
     second.done(attempt, PressResult(press=make.press()))
-    assert [line["why"] for line in make.events(store.folder, "void")] == ["stopped by the operator"]
-    assert resume(second).state.attempts == {"H13-a05": 1, "H15-a05": 2}
-
-
-def test_a_fresh_sheet_frees_its_patches_and_stays_fresh(make, store, resume):
-    make.perform(store, "H13-a05", 0)
-    store.fresh_sheet()
-    make.perform(store, "H15-a05", 0)
-    state = resume(store).state
-    assert (state.sheet, state.used_patches) == (1, {(0, 0), (1, 0)})
+    second.fresh_sheet()
+    make.perform(second, "H17-a05", 0)
+    state = resume(second).state
+    assert state.attempts == {"H13-a05": 1, "H15-a05": 2, "H17-a05": 1}
+    assert [(begin.key, why) for begin, why in state.cut] == [("H15-a05", "stopped by the operator")]
+    assert state.sheet == 1, "a fresh sheet frees its patches and stays fresh"
+    assert state.used_patches == {(0, 0), (0, 1), (0, 36), (0, 2), (1, 0)}
 
 
 def test_a_process_that_dies_between_rename_and_done_does_the_step_again(make, store, resume):
