@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncGenerator, Awaitable, Callable
-from contextlib import asynccontextmanager, suppress
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from enum import IntEnum, StrEnum
 from typing import Any
 
@@ -251,6 +251,8 @@ OF_THE_ROBOT = (
 )
 """Asked without parameters; then kinematics are asked where the arm is, and for the newest messages."""
 MESSAGES = 5
+NO_ANSWER: dict[type[DeviceError], str] = {DeviceTimeout: "silence", ConnectionLost: "lost"}
+"""What a transcript says instead of an answer; `refused` for any other error."""
 
 
 async def survey(host: str, port: int, framing: Framing) -> list[dict[str, Any]]:
@@ -262,26 +264,34 @@ async def survey(host: str, port: int, framing: Framing) -> list[dict[str, Any]]
     """
     connection = RpcConnection(host, port, framing=framing)
     exchanges: list[dict[str, Any]] = []
-    results: dict[str, Any] = {}
 
-    async def ask(method: str, params: dict[str, Any] | None = None) -> None:
-        if not connection.lost:
-            exchanges.append(await _exchange(method, params, connection.call(method, params)))
-            results[method.rpartition(".")[2]] = exchanges[-1]["answer"].get("result")
+    async def ask(method: str, params: dict[str, Any] | None = None, step: Awaitable[Any] | None = None) -> Any:
+        """The result of `method`, or of `step`; None without one."""
+        if connection.lost:
+            return None
+        began_s, answer = time.monotonic(), dict[str, Any]()
+        try:
+            answer["result"] = await (step or connection.call(method, params))
+        except RpcError as error:
+            answer["error"] = {"code": error.code, "message": error.message}
+        except DeviceError as error:
+            answer[NO_ANSWER.get(type(error), "refused")] = error.what
+        took_ms = round((time.monotonic() - began_s) * 1e3, 3)
+        exchanges.append({"method": method, "params": params, "answer": answer, "took_ms": took_ms})
+        return answer.get("result")
 
     try:
-        opened = await _exchange("connect", None, open_arcs(connection))
-        if "result" not in opened["answer"]:
-            exchanges.append(opened)
+        await ask("connect", step=open_arcs(connection))
+        if "result" in exchanges[0]["answer"]:
+            exchanges.clear()  # the login has no answer to keep
+        else:
             with suppress(DeviceError):  # a cabinet that does not answer the login may answer the rest
                 await connection.open(login=False)
         await ask("SystemInfo.getInterfaceVersionCode")
-        await ask("getRobotNames")
-        names = results.get("getRobotNames")
+        names = await ask("getRobotNames")
         robot = str(names[0]) if isinstance(names, list) and names else "rob1"  # pyright: ignore[reportUnknownArgumentType]
-        for method in (*OF_THE_CONTROLLER, *(f"{robot}.{name}" for name in OF_THE_ROBOT)):
-            await ask(method)
-        joints, pose = results.get("getJointPositions"), results.get("getTcpPose")
+        methods = (*OF_THE_CONTROLLER, *(f"{robot}.{name}" for name in OF_THE_ROBOT))
+        *_, pose, joints = [await ask(method) for method in methods]
         if joints and pose:
             await ask(f"{robot}.RobotAlgorithm.forwardKinematics", {"q": joints})
             await ask(f"{robot}.RobotAlgorithm.inverseKinematics", {"qnear": joints, "pose": pose})
@@ -289,36 +299,3 @@ async def survey(host: str, port: int, framing: Framing) -> list[dict[str, Any]]
     finally:
         await connection.close()
     return exchanges
-
-
-async def _exchange(method: str, params: dict[str, Any] | None, step: Awaitable[Any]) -> dict[str, Any]:
-    """One exchange of `survey`."""
-    began_s = time.monotonic()
-    try:
-        answer: dict[str, Any] = {"result": await step}
-    except RpcError as error:
-        answer = {"error": {"code": error.code, "message": error.message}}
-    except DeviceError as error:
-        reason = "refused"
-        if isinstance(error, DeviceTimeout):
-            reason = "silence"
-        elif isinstance(error, ConnectionLost):
-            reason = "lost"
-        answer = {reason: error.what}
-    took_ms = round((time.monotonic() - began_s) * 1e3, 3)
-    return {"method": method, "params": params, "answer": answer, "took_ms": took_ms}
-
-
-@asynccontextmanager
-async def only_asking(host: str, port: int, framing: Framing) -> AsyncGenerator[Controller]:
-    """Connect to a controller, yield it, and disconnect; for asking, as nothing is set, powered or moved.
-
-    Raises `WrongGeneration` and other `DeviceError`s.
-    """
-    controller = Controller(RpcConnection(host, port, framing=framing))
-    try:
-        await open_arcs(controller.connection)
-        [controller.robot, *_] = await controller.robot_names()
-        yield controller
-    finally:
-        await controller.connection.close()

@@ -21,7 +21,7 @@ import contextlib
 import json
 import math
 from collections import defaultdict, deque
-from collections.abc import AsyncGenerator, Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from typing import Any, NoReturn
 
 import cbor2
@@ -30,15 +30,14 @@ import numpy as np
 from brushloop.drivers.arcs.controller import Controller
 from brushloop.drivers.arcs.motion import arrived
 from brushloop.drivers.arcs.settings import ArcsTable
-from brushloop.drivers.arcs.wire import DEVICE, FrameDecoder, encode_short, numbers
+from brushloop.drivers.arcs.wire import DEVICE, FrameDecoder, encode_short, in_time, numbers
 from brushloop.drivers.devices import Pose, PoseSample, Stamp
-from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected, ProtocolViolation, Stale
+from brushloop.drivers.errors import DeviceError, DeviceTimeout, NotConnected, ProtocolViolation, Stale
 from brushloop.drivers.geometry import from_wire
 from brushloop.drivers.host import Clock
 
 STREAM = "robot telemetry"
 SET_RECIPE = 100
-PING = b"__ping__\0"
 GREETING_END = b"}\n\n"
 MAX_GREETING_BYTES = 256 * 1024
 MAX_MESSAGE_BYTES = 64 * 1024
@@ -112,14 +111,14 @@ class RtdeStream:
         self.port = port
         self.offered: dict[str, int] = {}
         """Names in the greeting that can be subscribed to, with their ids."""
-        self._decoder = FrameDecoder(skip=PING, max_bytes=MAX_MESSAGE_BYTES)
+        self._decoder = FrameDecoder(max_bytes=MAX_MESSAGE_BYTES)
         self._stream: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
         self._segments: Sequence[str] = ()
 
     async def open(self, segments: Sequence[str], frequency_hz: float) -> None:
         """Connect, read the greeting, subscribe. Raises `ConnectionLost`, `DeviceTimeout`, `ProtocolViolation`."""
         try:
-            async with _answered("connect", f"greeting from {self.host}:{self.port}"):
+            async with in_time(STREAM, "connect", SILENCE_S, f"greeting from {self.host}:{self.port}"):
                 self._stream = await asyncio.open_connection(self.host, self.port, limit=MAX_GREETING_BYTES)
                 greeting = await self._stream[0].readuntil(GREETING_END)
         except asyncio.LimitOverrunError:
@@ -139,7 +138,7 @@ class RtdeStream:
         if self._stream is None:
             raise NotConnected(STREAM, "read", "not connected")
         samples: list[list[Any]] = []
-        async with _answered("read", "sample"):
+        async with in_time(STREAM, "read", SILENCE_S, "sample"):
             while not samples:
                 data = await self._stream[0].read(MAX_MESSAGE_BYTES)
                 if not data:
@@ -159,18 +158,6 @@ class RtdeStream:
                 stream[1].write(encode_topic(CHANNEL, (), 0.0))
                 stream[1].close()
                 await stream[1].wait_closed()
-
-
-@contextlib.asynccontextmanager
-async def _answered(op: str, awaited: str) -> AsyncGenerator[None]:
-    """Raise `DeviceTimeout` if the block takes longer than `SILENCE_S`, `ConnectionLost` if the controller hangs up."""
-    try:
-        async with asyncio.timeout(SILENCE_S):
-            yield
-    except TimeoutError:
-        raise DeviceTimeout(STREAM, op, f"no {awaited} in {SILENCE_S:g} s") from None
-    except (OSError, EOFError) as error:
-        raise ConnectionLost(STREAM, op, str(error)) from None
 
 
 async def rtde_answers(host: str, port: int) -> dict[str, Any]:

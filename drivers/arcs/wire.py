@@ -22,13 +22,14 @@ import json
 import re
 import secrets
 import struct
-from collections.abc import Mapping
+from collections.abc import AsyncGenerator, Mapping
 from typing import Any, Literal
 
 from pydantic import FiniteFloat, TypeAdapter, ValidationError
 
 from brushloop.drivers.errors import (
     ConnectionLost,
+    DeviceError,
     DeviceTimeout,
     NotConnected,
     ProtocolViolation,
@@ -40,7 +41,9 @@ DEVICE = "robot"
 MAGIC = b"SOF"
 HEADERS = {0x01: struct.Struct(">4xI"), 0x00: struct.Struct(">4xH")}
 """The length behind magic and flag, by the flag."""
-MAX_PAYLOAD_BYTES = 16 * 1024 * 1024
+PING = b"__ping__\0"
+"""Keep-alive of the maker's RTDE client: it may come between two frames, and is passed over."""
+MAX_BYTES = 1024 * 1024
 """Far above any reply of a controller; a hostile length must not make the host allocate gigabytes."""
 
 
@@ -57,7 +60,7 @@ def encode(payload: bytes) -> bytes:
 class _Decoder(abc.ABC):
     """Turns a byte stream, split at any point, into what `_next` finds at its beginning."""
 
-    def __init__(self, max_bytes: int) -> None:
+    def __init__(self, *, max_bytes: int = MAX_BYTES) -> None:
         self._max_bytes = max_bytes
         self._buffer = bytearray()
         self._broken: str | None = None
@@ -89,16 +92,11 @@ class _Decoder(abc.ABC):
 class FrameDecoder(_Decoder):
     """Turns a byte stream, split at any point, into the payloads of SOF frames."""
 
-    def __init__(self, *, skip: bytes = b"", max_bytes: int = MAX_PAYLOAD_BYTES) -> None:
-        """`skip` holds bytes that may appear between frames and are ignored."""
-        super().__init__(max_bytes)
-        self._skip = skip
-
     def _next(self) -> bytes | None:
-        buffer, skip = self._buffer, self._skip
-        while skip and buffer.startswith(skip):
-            del buffer[: len(skip)]
-        if 0 < len(buffer) < len(skip) and skip.startswith(bytes(buffer)):
+        buffer = self._buffer
+        while buffer.startswith(PING):
+            del buffer[: len(PING)]
+        if PING.startswith(bytes(buffer[: len(PING)])):
             return None
         if not MAGIC.startswith(bytes(buffer[:3])):
             raise self._violation(f"expected SOF, got {bytes(buffer[:8])!r}")
@@ -120,24 +118,22 @@ class FrameDecoder(_Decoder):
         return payload
 
 
-MAX_DOCUMENT_BYTES = 1024 * 1024
-"""Far above any reply of a controller."""
 MAX_DEPTH = 64
 """No reply nests deeper than five; the parser must not run out of stack."""
 
-_STRUCTURE = re.compile(rb'["{}\[\]]')
-_STRING_END = re.compile(rb'["\\]')
+_TOKEN = re.compile(rb'[{}\[\]]|"(?:[^"\\]|\\.)*+("?)', re.DOTALL)
+"""A bracket or a string, whose end is the group: empty if it has not arrived."""
 _CLOSES = {ord("}"): ord("{"), ord("]"): ord("[")}
 
 
 class BareDecoder(_Decoder):
     """Turns a byte stream, split at any point, into JSON documents by their brackets, bounded in size and depth."""
 
-    def __init__(self, *, max_bytes: int = MAX_DOCUMENT_BYTES) -> None:
-        super().__init__(max_bytes)
+    def __init__(self, *, max_bytes: int = MAX_BYTES) -> None:
+        super().__init__(max_bytes=max_bytes)
         self._at = 0
         self._open: list[int] = []
-        self._in_string = False
+        """Brackets before `_at` that are not closed."""
 
     def _next(self) -> bytes | None:
         if not self._open:
@@ -157,28 +153,22 @@ class BareDecoder(_Decoder):
     def _scan(self) -> int | None:
         """Continue where the last piece ended; return the end of the document, or None if it has not arrived."""
         buffer = self._buffer
-        while True:
-            match = (_STRING_END if self._in_string else _STRUCTURE).search(buffer, self._at)
-            if match is None:
-                self._at = len(buffer)
+        while (token := _TOKEN.search(buffer, self._at)) is not None:
+            if token.group(1) == b"":
+                self._at = token.start()
                 return None
-            byte, self._at = buffer[match.start()], match.end()
-            if byte == ord("\\"):
-                if self._at == len(buffer):  # the escaped character has not arrived: scan again from here
-                    self._at -= 1
-                    return None
-                self._at += 1
-            elif byte == ord('"'):
-                self._in_string = not self._in_string
-            elif byte in _CLOSES:
+            byte, self._at = buffer[token.start()], token.end()
+            if byte in _CLOSES:
                 if self._open.pop() != _CLOSES[byte]:
                     raise self._violation("brackets do not match")
                 if not self._open:
                     return self._at
-            else:
+            elif byte != ord('"'):
                 self._open.append(byte)
                 if len(self._open) > MAX_DEPTH:
                     raise self._violation(f"nested deeper than {MAX_DEPTH}")
+        self._at = len(buffer)
+        return None
 
 
 NUMBERS = TypeAdapter(list[FiniteFloat])
@@ -252,6 +242,20 @@ def encode_bare_request(ident: int, method: str, params: Mapping[str, object] | 
     return json.dumps(body, separators=(",", ":")).encode()
 
 
+@contextlib.asynccontextmanager
+async def in_time(device: str, op: str, seconds: float, awaited: str) -> AsyncGenerator[None]:
+    """Raise `DeviceTimeout` if the block takes longer, and `ConnectionLost` if the peer refuses or hangs up."""
+    try:
+        async with asyncio.timeout(seconds):
+            yield
+    except DeviceError:
+        raise
+    except TimeoutError:
+        raise DeviceTimeout(device, op, f"no {awaited} in {seconds:g} s") from None
+    except (OSError, EOFError) as error:
+        raise ConnectionLost(device, op, f"no {awaited}: {getattr(error, 'strerror', None) or error}") from None
+
+
 Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 
@@ -286,7 +290,8 @@ class RpcConnection:
         """
         await self.close()
         try:
-            self._stream = await self._connected()
+            async with in_time(DEVICE, "connect", self._timeout_s, f"answer from {self.host}:{self.port}"):
+                self._stream = await asyncio.open_connection(self.host, self.port)
             self._decoder = BareDecoder() if self._framing == "bare" else FrameDecoder()
             if login and self._framing == "sof":
                 token = f"__login__\naubo\n{FACTORY_LOGIN_TOKEN}\n{SDK_INTERFACE_VERSION}\n"
@@ -295,16 +300,6 @@ class RpcConnection:
             await self.close()
             self._lost = f"{self.host}:{self.port} was not opened"
             raise
-
-    async def _connected(self) -> Stream:
-        where = f"{self.host}:{self.port}"
-        try:
-            async with asyncio.timeout(self._timeout_s):
-                return await asyncio.open_connection(self.host, self.port)
-        except TimeoutError:
-            raise DeviceTimeout(DEVICE, "connect", f"{where} did not answer") from None
-        except OSError as error:
-            raise ConnectionLost(DEVICE, "connect", f"{where}: {error.strerror or error}") from None
 
     async def call(self, method: str, params: Mapping[str, object] | None = None) -> Any:
         """The result of `method`. Raises `RpcError`, `DeviceTimeout`, `ConnectionLost`, `ProtocolViolation`."""
@@ -328,13 +323,10 @@ class RpcConnection:
                 raise ConnectionLost(DEVICE, op, str(self._lost))
             if self._stream is None:
                 raise NotConnected(DEVICE, op, "not connected")
-            try:
-                # No drain: requests are small, and a socket that cannot be written to fails the reader.
-                self._stream[1].write(request)
-                async with asyncio.timeout(self._timeout_s):
-                    return await self._reply(ident, op, self._stream)
-            except TimeoutError:
-                raise DeviceTimeout(DEVICE, op, f"no reply in {self._timeout_s:g} s") from None
+            # No drain: requests are small, and a socket that cannot be written to fails the reader.
+            self._stream[1].write(request)
+            async with in_time(DEVICE, op, self._timeout_s, "reply"):
+                return await self._reply(ident, op, self._stream)
 
     async def _reply(self, ident: str | int, op: str, stream: Stream) -> Any:
         """Read until the call is answered. Bytes out of step end the connection: nothing after them can be trusted."""
@@ -388,21 +380,13 @@ async def open_arcs(connection: RpcConnection) -> None:
     try:
         await connection.open()
     except (ConnectionLost, DeviceTimeout) as error:
-        if error.op == "connect" and await answers(connection.host, AUBOPE_PORT):
-            raise WrongGeneration(
-                DEVICE,
-                "connect",
-                f"port {connection.port} does not answer but {AUBOPE_PORT} does: this cabinet runs AUBOPE (V4)",
-            ) from None
-        raise
-
-
-async def answers(host: str, port: int) -> bool:
-    """Whether anything listens there."""
-    try:
-        async with asyncio.timeout(1.0):
-            _, writer = await asyncio.open_connection(host, port)
-    except OSError:
-        return False
-    writer.close()
-    return True
+        if error.op != "connect":
+            raise
+        older = RpcConnection(connection.host, AUBOPE_PORT)
+        try:
+            await older.open(login=False)
+        except DeviceError:
+            raise error from None
+        await older.close()
+        what = f"port {connection.port} does not answer but {AUBOPE_PORT} does: this cabinet runs AUBOPE (V4)"
+        raise WrongGeneration(DEVICE, "connect", what) from None

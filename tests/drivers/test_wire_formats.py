@@ -15,10 +15,11 @@ from typing import Any
 import cbor2
 import pytest
 
-from brushloop.drivers.arcs.telemetry import PING, RtdeStream, decode_message, encode_sample, outputs_of
+from brushloop.drivers.arcs.telemetry import RtdeStream, decode_message, encode_sample, outputs_of
 from brushloop.drivers.arcs.wire import (
     FACTORY_LOGIN_TOKEN,
     MAX_DEPTH,
+    PING,
     BareDecoder,
     FrameDecoder,
     answer_in,
@@ -252,7 +253,7 @@ SOF = [encode(reply) for reply in REPLIES] + [
     PING[:5],
 ]
 STREAMS: dict[str, tuple[Callable[[], Feed], list[bytes]]] = {
-    "SOF": (lambda: FrameDecoder(skip=PING, max_bytes=SMALL_BYTES).feed, SOF),
+    "SOF": (lambda: FrameDecoder(max_bytes=SMALL_BYTES).feed, SOF),
     "bare": (lambda: BareDecoder(max_bytes=SMALL_BYTES).feed, [*REPLIES, b" \r\n".join(REPLIES[:2]), b"[]"]),
 }
 
@@ -295,7 +296,7 @@ def test_bytes_that_belong_to_neither_framing_are_refused_at_once(decoder: type[
 
 ENDLESS: dict[str, tuple[Callable[[], Feed], bytes, bytes]] = {
     "a length of 4 GB": (lambda: FrameDecoder().feed, b"SOF\x01\xff\xff\xff\xff", b""),
-    "pings": (lambda: FrameDecoder(skip=PING).feed, PING * 100_000 + b"SOF\x02", b""),
+    "pings": (lambda: FrameDecoder().feed, PING * 100_000 + b"SOF\x02", b""),
     "arrays in arrays": (lambda: BareDecoder().feed, b"[", b"["),
     "a string": (lambda: BareDecoder(max_bytes=100_000).feed, b'{"a":"', b"\\" * 300),
 }

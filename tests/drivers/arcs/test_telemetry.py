@@ -13,13 +13,12 @@ import pytest
 
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.arcs.telemetry import (
-    PING,
     LagMeter,
     RtdeStream,
     encode_sample,
     encode_topic,
 )
-from brushloop.drivers.arcs.wire import FrameDecoder, encode
+from brushloop.drivers.arcs.wire import PING, FrameDecoder, encode
 from brushloop.drivers.devices import Pose, PoseSample, QueuedLine, Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, ProtocolViolation, Stale
 from brushloop.drivers.geometry import brush_pose, distance
