@@ -68,14 +68,11 @@ WAITING = 64
 """Length of the backlog: refused processes connect to learn who holds the name, and are never served."""
 
 
-class Claimed(Exception):
-    """Another process holds the name: its `pid` and `uid`, where they are known."""
+UNNAMED = "a process that cannot be named"
 
-    def __init__(self, pid: int | None = None, uid: int | None = None) -> None:
-        self.pid = pid
-        self.uid = uid
-        who = "a process that cannot be named" if pid is None else f"process {pid} of {_user(uid)}"
-        super().__init__(who)
+
+class Claimed(Exception):
+    """Another process holds the name; the message says which one, if that is known."""
 
 
 @contextlib.contextmanager
@@ -94,21 +91,27 @@ def _named_socket(name: str) -> Generator[None]:
         except OSError as error:
             if error.errno != errno.EADDRINUSE:
                 raise
-            raise Claimed(*_holder(address)) from None
+            raise Claimed(_holder(address)) from None
         claim.listen(WAITING)
         yield
 
 
-def _holder(address: str) -> tuple[int | None, int | None]:
-    """(pid, uid) of the listener at `address`, as the kernel reports them; (None, None) if unknown."""
+def _holder(address: str) -> str:
+    """The process that listens at `address`, and its user, as the kernel reports them."""
+    import pwd  # not on every system
+
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
         asking.setblocking(False)
         try:
             asking.connect(address)
             pid, uid, _ = struct.unpack("3i", asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
         except OSError:
-            return None, None
-    return (pid, uid) if pid else (None, None)
+            return UNNAMED
+    try:
+        user = pwd.getpwuid(uid).pw_name
+    except KeyError:
+        user = f"user {uid}"
+    return f"process {pid} of {user}" if pid else UNNAMED
 
 
 @contextlib.contextmanager
@@ -118,13 +121,4 @@ def _file(name: str) -> Generator[None]:
         with FileLock(folder / f"{name}.lock", timeout=0, mode=0o666):
             yield
     except Timeout:
-        raise Claimed from None
-
-
-def _user(uid: int | None) -> str:
-    try:
-        import pwd
-
-        return pwd.getpwuid(uid).pw_name if uid is not None else "an unknown user"
-    except (ImportError, KeyError):
-        return f"user {uid}"
+        raise Claimed(UNNAMED) from None

@@ -129,6 +129,13 @@ def ask(path: Path, request: Mapping[str, object]) -> dict[str, Any]:
             raise FaultRefused(f"{path}: not the control socket of a rig")
 
 
+ENDS_OF_A_CLIENT = (
+    *(ConnectionError, TimeoutError, asyncio.IncompleteReadError),  # it disconnected
+    *(ProtocolViolation, asyncio.LimitOverrunError),  # it does not speak the protocol
+    asyncio.CancelledError,  # `stop`: the streams module would report a cancelled handler as an error
+)
+
+
 class LoopbackServer:
     """A TCP server whose clients are tasks; `converse` speaks to one of them."""
 
@@ -181,13 +188,8 @@ class LoopbackServer:
         assert task is not None
         self._clients.add(task)
         try:
-            await self.converse(reader, writer)
-        except (ConnectionError, TimeoutError, asyncio.IncompleteReadError):
-            pass  # the client disconnected
-        except (ProtocolViolation, asyncio.LimitOverrunError):
-            pass  # the client does not speak the protocol
-        except asyncio.CancelledError:
-            pass  # `stop`: the streams module would report a cancelled handler as an error
+            with contextlib.suppress(*ENDS_OF_A_CLIENT):
+                await self.converse(reader, writer)
         finally:
             self._clients.discard(task)
             writer.close()

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable
-from contextlib import suppress
+from collections.abc import AsyncGenerator, Awaitable, Callable
+from contextlib import asynccontextmanager, suppress
 from enum import IntEnum, StrEnum
 from typing import Any
 
@@ -299,3 +299,18 @@ async def survey(host: str, port: int, framing: Framing) -> list[dict[str, Any]]
     finally:
         await connection.close()
     return exchanges
+
+
+@asynccontextmanager
+async def only_asking(host: str, port: int, framing: Framing) -> AsyncGenerator[Controller]:
+    """Connect to a controller, yield it, and disconnect; for asking, as nothing is set, powered or moved.
+
+    Raises `WrongGeneration` and other `DeviceError`s.
+    """
+    controller = Controller(RpcConnection(host, port, framing=framing))
+    try:
+        await open_arcs(controller.connection)
+        [controller.robot, *_] = await controller.robot_names()
+        yield controller
+    finally:
+        await controller.connection.close()

@@ -309,27 +309,25 @@ class Telemetry:
         self._take(await self._state.pose())
 
     async def _run(self) -> None:
-        silences = 0
-        while self._stream is not None:
-            try:
-                await self._take_pushed(self._stream)
-                silences = 0
-            except DeviceError as error:
-                silences += 1
-                if not isinstance(error, DeviceTimeout) or silences > MOST_SILENCES:
-                    await self._fall_back(error)
-                await self._poll()  # a short silence is bridged: the poses that piled up will still arrive
-        loop = asyncio.get_running_loop()
+        loop, silences = asyncio.get_running_loop(), 0
         due = loop.time()
         while True:
-            await self._poll()
-            due = max(due + 1.0 / RATE_HZ, loop.time())
-            await asyncio.sleep(due - loop.time())
-
-    async def _poll(self) -> None:
-        # A gap shows as an old sample (`Stale`); the motion path reports the cause.
-        with contextlib.suppress(DeviceError):
-            await self.read()
+            if self._stream is None:
+                due = max(due + 1.0 / RATE_HZ, loop.time())
+                await asyncio.sleep(due - loop.time())
+            else:
+                try:
+                    await self._take_pushed(self._stream)
+                    silences = 0
+                    continue
+                except DeviceError as error:
+                    silences += 1
+                    if not isinstance(error, DeviceTimeout) or silences > MOST_SILENCES:
+                        await self._fall_back(error)
+            # A short silence is bridged: the poses that piled up will still arrive. A pose that cannot be read shows as
+            # an old sample (`Stale`); the motion path reports the cause.
+            with contextlib.suppress(DeviceError):
+                await self.read()
 
     async def _take_pushed(self, stream: RtdeStream) -> None:
         *older, (pose, joints) = await stream.samples()

@@ -380,13 +380,18 @@ async def open_arcs(connection: RpcConnection) -> None:
     try:
         await connection.open()
     except (ConnectionLost, DeviceTimeout) as error:
-        if error.op != "connect":
-            raise
-        older = RpcConnection(connection.host, AUBOPE_PORT)
-        try:
-            await older.open(login=False)
-        except DeviceError:
-            raise error from None
-        await older.close()
-        what = f"port {connection.port} does not answer but {AUBOPE_PORT} does: this cabinet runs AUBOPE (V4)"
-        raise WrongGeneration(DEVICE, "connect", what) from None
+        if error.op == "connect" and await answers(connection.host, AUBOPE_PORT):
+            what = f"port {connection.port} does not answer but {AUBOPE_PORT} does: this cabinet runs AUBOPE (V4)"
+            raise WrongGeneration(DEVICE, "connect", what) from None
+        raise
+
+
+async def answers(host: str, port: int) -> bool:
+    """Whether anything listens there."""
+    try:
+        async with asyncio.timeout(1.0):
+            _, writer = await asyncio.open_connection(host, port)
+    except OSError:
+        return False
+    writer.close()
+    return True
