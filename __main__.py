@@ -174,15 +174,18 @@ def sim(
     Ctrl-C ends it; SIGUSR1 puts a fresh sheet in. An unknown lab has a loopback address of its own and no rig.toml,
     which `brushloop rig new` has to find out.
     """
+    import asyncio
+
     from brushloop.drivers.sim.brush.spec import load_brush
     from brushloop.drivers.sim.config import SimConfig, View
-    from brushloop.drivers.sim.lab import LabRefused, serve_unknown
-    from brushloop.drivers.sim.rig import serve
+    from brushloop.drivers.sim.lab import LabRefused, UnknownLab, trap_of
+    from brushloop.drivers.sim.rig import LoopbackRig, serve
 
     if unknown is not None:
         if write_rig is not None or brush != Path("loopback") or arcs_port or camera_port:
             raise LabRefused("--unknown: can only be combined with --trap, --control, --rate and --idle-exit")
-        serve_unknown(unknown, trap, rate, idle_exit, say, control)
+        lab = UnknownLab(unknown, None if trap is None else trap_of(trap), rate=rate)
+        asyncio.run(serve(lab, say, idle_exit_s=idle_exit, control=control))
         return
     if trap is not None:
         raise LabRefused("--trap: needs --unknown SEED")
@@ -197,7 +200,7 @@ def sim(
         head=pressed.quality,
         view=View(fps=fps) if pressed.camera is None else View(fps=fps, noise=pressed.camera.noise),
     )
-    serve(config, write_rig, idle_exit, say, control)
+    asyncio.run(serve(LoopbackRig(config), say, write_rig=write_rig, idle_exit_s=idle_exit, control=control))
 
 
 @groups["sim"].command()

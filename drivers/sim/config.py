@@ -8,6 +8,11 @@ from typing import Literal
 
 from brushloop.drivers.sim.brush.spec import BrushSpec, SoundHead
 
+Place = tuple[float, float, float]
+"""x, y, z in the base frame, in mm."""
+CORNERS = ("lower left", "lower right", "upper right", "upper left")
+"""Of the board and of the sheet, with the print upright before the reader."""
+
 
 @dataclass(frozen=True, slots=True)
 class Table:
@@ -38,6 +43,12 @@ class Table:
     """Ink surface above the paper plane when the rig starts."""
 
     @property
+    def board_size_mm(self) -> tuple[float, float]:
+        """True width and height of the printed board."""
+        columns, rows = self.board_squares
+        return columns * self.board_square_mm, rows * self.board_square_mm
+
+    @property
     def normal(self) -> tuple[float, float, float]:
         """Unit vector out of the sheet, in the paper frame (whose z is the base frame's)."""
         about_x, about_y = (math.tan(math.radians(v)) for v in self.slope_deg)
@@ -50,7 +61,7 @@ class Table:
         yaw = math.radians(self.yaw_deg)
         return math.cos(yaw) * dx + math.sin(yaw) * dy, -math.sin(yaw) * dx + math.cos(yaw) * dy
 
-    def to_base(self, x_mm: float, y_mm: float, above_mm: float = 0.0) -> tuple[float, float, float]:
+    def to_base(self, x_mm: float, y_mm: float, above_mm: float = 0.0) -> Place:
         """A point of the paper frame, `above_mm` above the sheet, in the base frame."""
         yaw = math.radians(self.yaw_deg)
         return (
@@ -58,6 +69,19 @@ class Table:
             self.origin_mm[1] + math.sin(yaw) * x_mm + math.cos(yaw) * y_mm,
             self.surface_z_mm(x_mm, y_mm) + above_mm,
         )
+
+    def over_sheet(self, above_mm: float = 0.0) -> Place:
+        """The middle of the sheet, or a place above it."""
+        width, height = self.sheet_mm
+        return self.to_base(width / 2, height / 2, above_mm)
+
+    def corner(self, of: str, name: str) -> Place:
+        """A corner of the `board` or of the `sheet`. Raises ValueError for an unknown name."""
+        if name not in CORNERS:
+            raise ValueError(f"corner = {name!r} is not one of {', '.join(CORNERS)}")
+        left, bottom = self.board_origin_mm if of == "board" else (0.0, 0.0)
+        width, height = self.board_size_mm if of == "board" else self.sheet_mm
+        return self.to_base(left + width * ("right" in name), bottom + height * ("upper" in name))
 
     def surface_z_mm(self, x_mm: float, y_mm: float) -> float:
         """Height of the sheet at a point of the paper frame, in the base frame."""
@@ -122,7 +146,7 @@ class SimConfig:
     rtde_port: int = 0
     camera_port: int = 0
     force_port: int = 0
-    home_mm: tuple[float, float, float] = (250.0, -230.0, 260.0)
+    home_mm: Place = (250.0, -230.0, 260.0)
     """Where the tip rests when the rig starts, in the base frame."""
     ink_device: Literal["station", "pump", "none"] = "station"
     """The device at the well: an ink station, a Modbus pump, or none (a person with a bottle)."""

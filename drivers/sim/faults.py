@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import math
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Callable, Set
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Any
@@ -184,10 +184,8 @@ class Hung:
 class FaultBoard:
     """Faults in the order in which they were added; of several that match one request the first strikes it."""
 
-    def __init__(self, world: World, missing: Sequence[Device] = ()) -> None:
-        """`missing`: devices that the rig does not have."""
+    def __init__(self, world: World) -> None:
         self._world = world
-        self._missing = missing
         self._idents = itertools.count(1)
         self._hanging: dict[int, Hung] = {}
         self.strikes = 0
@@ -199,7 +197,9 @@ class FaultBoard:
 
     def hang(self, fault: Fault) -> int:
         """Add a fault; return the number by which it can be removed. Raises ValueError where it can never strike."""
-        if fault.device in self._missing:
+        config = self._world.config
+        missing = {Device.INK: config.ink_device == "none", Device.FORCE: not config.force_sensor}
+        if missing.get(fault.device):
             raise ValueError(f"device = {fault.device.value!r}: this rig has none")
         hung = Hung(next(self._idents), fault)
         self._hanging[hung.ident] = hung

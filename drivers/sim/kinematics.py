@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,8 +32,6 @@ CLOSE_M, CLOSE_RAD = 1e-7, 1e-7
 MAX_STEP_RAD = 0.3
 ITERATIONS = 80
 DAMPING = 1e-3
-
-
 _OFFSETS_RAD = tuple(math.radians(theta) for theta in THETA_DEG)
 _TWISTS = tuple((math.cos(math.radians(alpha)), math.sin(math.radians(alpha))) for alpha in ALPHA_DEG)
 
@@ -99,7 +97,8 @@ def _within(q: Matrix, near: Sequence[float]) -> Joints | None:
         if not allowed:
             return None
         joints.append(min(allowed, key=lambda v: abs(v - close)))
-    return (joints[0], joints[1], joints[2], joints[3], joints[4], joints[5])
+    q1, q2, q3, q4, q5, q6 = joints
+    return q1, q2, q3, q4, q5, q6
 
 
 def matrix_of(pose: Pose) -> Matrix:
@@ -129,84 +128,55 @@ STRETCHES = 16
 """Number of straight pieces in which a curved path is reported to the world."""
 
 
-@dataclass(frozen=True)
-class Line:
+@dataclass(frozen=True, slots=True)
+class Path:
+    """A way of the tip, by its length in mm, or in rad where it is angular."""
+
+    length: float
+    pose: Callable[[float], Pose]
+    """Where the tip is after some of the length; the ends are exact."""
+    angular: bool
+    stretches: int = STRETCHES
+    joints: Callable[[float], Joints] | None = None
+    """The joints after some of the length; None where the path is not given in joints."""
+
+
+def line(start: Pose, end: Pose, travel_mm: float, turn_rad: float) -> Path:
     """Straight for the tip. `travel_mm` and `turn_rad` are those of the tool centre point that was configured."""
+    angular = travel_mm < ROTATION_AS_LINEAR_MM and turn_rad > TURN_RAD
+    length = turn_rad if angular else travel_mm
 
-    start: Pose
-    end: Pose
-    travel_mm: float
-    turn_rad: float
-    stretches = 1
+    def pose(done: float) -> Pose:
+        if done >= length:
+            return end
+        return start if done <= 0.0 else interpolate(start, end, done / length)
 
-    @property
-    def angular(self) -> bool:
-        """True for a turn on the spot."""
-        return self.travel_mm < ROTATION_AS_LINEAR_MM and self.turn_rad > TURN_RAD
-
-    @property
-    def length(self) -> float:
-        """Length of the line, or of the turn."""
-        return self.turn_rad if self.angular else self.travel_mm
-
-    def pose(self, done: float) -> Pose:
-        """Where the tip is; the ends are exact."""
-        if done >= self.length:
-            return self.end
-        return self.start if done <= 0.0 else interpolate(self.start, self.end, done / self.length)
+    return Path(length, pose, angular, stretches=1)
 
 
-@dataclass(frozen=True)
-class Corner:
-    """The parabola that leaves `a` at `cut` before its end and meets `b` at `cut` after its start, turns included."""
+def corner(a: Path, b: Path, cut: float) -> Path:
+    """The parabola that leaves the line `a` at `cut` before its end and meets `b` at `cut` after its start.
 
-    a: Line
-    b: Line
-    cut: float
-    angular = False
-    stretches = STRETCHES
+    Its length is the one that it replaces; the curve itself is shorter.
+    """
+    start, middle, end = a.pose(a.length - cut), a.pose(a.length), b.pose(cut)
 
-    @property
-    def length(self) -> float:
-        """Length that the corner replaces; the curve itself is shorter."""
-        return 2.0 * self.cut
+    def pose(done: float) -> Pose:  # by de Casteljau's algorithm, turns included
+        u = done / (2.0 * cut)
+        return interpolate(interpolate(start, middle, u), interpolate(middle, end, u), u)
 
-    @property
-    def bend(self) -> float:
-        """Length of the difference of the two unit directions: 0 for straight on, 2 for a reversal."""
-        directions = [np.subtract(w.end.position_mm, w.start.position_mm) / w.length for w in (self.a, self.b)]
-        return float(np.linalg.norm(directions[1] - directions[0]))
-
-    def pose(self, done: float) -> Pose:
-        """Where the tip is after `done`, by de Casteljau's algorithm."""
-        u = done / self.length
-        start, end = self.a.pose(self.a.length - self.cut), self.b.pose(self.cut)
-        return interpolate(interpolate(start, self.a.end, u), interpolate(self.b.start, end, u), u)
+    return Path(2.0 * cut, pose, angular=False)
 
 
-@dataclass(frozen=True)
-class JointLine:
+def joint_line(start: Joints, end: Joints, tool: Matrix) -> Path:
     """Straight in joints; its length is the angle of the joint that turns farthest."""
+    length = max(abs(a - b) for a, b in zip(start, end, strict=True))
 
-    start: Joints
-    end: Joints
-    tool: Matrix
-    angular = True
-    stretches = STRETCHES
+    def joints(done: float) -> Joints:
+        if done >= length:
+            return end
+        share = max(done, 0.0) / length
+        q1, q2, q3, q4, q5, q6 = (a + share * (b - a) for a, b in zip(start, end, strict=True))
+        return q1, q2, q3, q4, q5, q6
 
-    @property
-    def length(self) -> float:
-        """The largest angle."""
-        return max(abs(a - b) for a, b in zip(self.start, self.end, strict=True))
-
-    def joints(self, done: float) -> Joints:
-        """The joints after `done`."""
-        if done >= self.length:
-            return self.end
-        share = max(done, 0.0) / self.length
-        q = [a + share * (b - a) for a, b in zip(self.start, self.end, strict=True)]
-        return (q[0], q[1], q[2], q[3], q[4], q[5])
-
-    def pose(self, done: float) -> Pose:
-        """Where the tip is."""
-        return pose_of(forward(self.joints(done)) @ self.tool)
+    return Path(length, lambda done: pose_of(forward(joints(done)) @ tool), angular=True, joints=joints)

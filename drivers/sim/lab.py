@@ -11,7 +11,6 @@ import os
 import secrets
 import zlib
 from collections import Counter
-from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -28,35 +27,18 @@ from brushloop.drivers.loopback import LoopbackServer
 from brushloop.drivers.sim.config import View
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 from brushloop.drivers.sim.kinematics import Joints, inverse, inverted, matrix_of
-from brushloop.drivers.sim.lab_facts import (
-    LIFT_MM,
-    PICTURE_PX,
-    PIN_TILT_DEG,
-    Place,
-    Trap,
-    azimuth_deg,
-    board_size_mm,
-    corner,
-    draw,
-    held,
-    over_sheet,
-    trapped,
-)
-from brushloop.drivers.sim.rig import LoopbackRig, serve_until_over
+from brushloop.drivers.sim.lab_facts import CAMERA_PORTS, LIFT_MM, PICTURE_PX, PIN_TILT_DEG, Trap, draw, held, trapped
+from brushloop.drivers.sim.rig import LoopbackRig
 from brushloop.drivers.sim.scene import Held, MjpegServer
 
 HAND_MM, BY_EYE_MM = 0.3, 1.0
 """Standard deviation of a tip that touches a thing, and of one that is brought near it by eye, along each axis."""
 SEEN_SIGMAS = 2.5
 """Errors beyond this many standard deviations are seen and corrected by the person."""
-DIP_ABOVE_BOTTOM_MM = 2.5
-UPRIGHT_ABOVE_MM = 70.0
 LOOK_S = 0.005
 PUSH_N, PUSH_S = 2.0, 1.0
 PUSHES = ((0.0, 0.0, -PUSH_N), (PUSH_N, 0.0, 0.0), (0.0, PUSH_N, 0.0))
 """Forces in the brush's frame, N: along the brush toward the flange, then along its x and y."""
-
-
 GRIPS = (
     (3.0, 0.0, 0.0, (0.0, 0.0)),
     *((28.0, toward_deg, 0.0, (0.0, 0.0)) for toward_deg in (270.0, 90.0, 0.0, 180.0)),
@@ -72,7 +54,6 @@ Each is its slant, the side toward which it slants and its turn in the picture, 
 and down, in shares of the picture's width and height.
 """
 ARCS_PORT, RTDE_PORT, CAN_PORT = 30004, 30010, 29536
-CAMERA_PORTS = (8080, 8081)
 MOST_ROUNDS = 3.0
 """The sensor's rounds come faster with simulated time, up to this many times: what one process can send and read."""
 THINGS = (
@@ -95,31 +76,28 @@ class UnknownLab(LoopbackRig):
         clean = draw(seed, rate, picture_px)
         self.facts, self._mended = (clean, clean) if trap is None else trapped(clean, trap)
         """The lab as it is now, and once the mistake is corrected."""
-        self.host = f"127.{16 + seed % 200}.{os.getpid() % 250 + 1}.{secrets.randbelow(250) + 1}"
-        """The address that the pendant shows: another one each time, so that no client of an earlier lab finds it."""
+        config = self.facts.config
+        force_hz = config.force_hz * min(max(rate, 1.0), MOST_ROUNDS)
+        super().__init__(
+            replace(config, arcs_port=ARCS_PORT, rtde_port=RTDE_PORT, force_port=CAN_PORT, force_hz=force_hz),
+            # another address each time, so that no client of an earlier lab finds it
+            f"127.{16 + seed % 200}.{os.getpid() % 250 + 1}.{secrets.randbelow(250) + 1}",
+        )
         self.streams = tuple(f"http://{self.host}:{port}/stream.mjpg" for port in CAMERA_PORTS)
         """The addresses on the stickers of the cameras."""
         self.can_bus = f"{self.host}:{CAN_PORT}/{LOOPBACK_CHANNEL}"
         """The gateway and bus of the force sensor."""
-        served = replace(
-            self.facts.config,
-            arcs_port=ARCS_PORT,
-            rtde_port=RTDE_PORT,
-            camera_port=CAMERA_PORTS[self.facts.sheet_camera],
-            force_port=CAN_PORT,
-            force_hz=self.facts.config.force_hz * min(max(rate, 1.0), MOST_ROUNDS),
-        )
-        super().__init__(served, self.host)
         self.arcs.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
         self.arcs.cabinet.payload = [self.facts.payload_kg, [0.0] * 3, [0.0] * 3, [0.0] * 6]
         self._noise = np.random.default_rng([seed, 17])
-        room = MjpegServer(self.world, self._wall, View(fps=5.0))
-        self.servers[room] = CAMERA_PORTS[1 - self.facts.sheet_camera]
+        [other_port] = {*CAMERA_PORTS} - {config.camera_port}
+        self.servers[MjpegServer(self.world, self._wall, View(fps=5.0))] = other_port
         self._older = LoopbackServer()
         """The software before ARCS: its port takes connections, and answers nothing that ARCS would."""
-        if trap is Trap.OLD_SOFTWARE:
+        if not self.facts.speaks_arcs:
             del self.servers[self.arcs], self.servers[self.rtde]
             self.servers[self._older] = AUBOPE_PORT
+        self._trap = trap
         self._asked: Counter[str] = Counter()
         self._touches = 0
         self._pulled: list[int] = []
@@ -130,7 +108,7 @@ class UnknownLab(LoopbackRig):
         """What the second camera sees: a wall, and no sheet."""
         return self._noise.normal(185.0, 2.0, (480, 640)).astype(np.uint8)
 
-    def labels(self) -> list[str]:
+    def labels(self, control: Path | None = None) -> list[str]:
         """What a person can read in the lab now: on labels, plugs, the print and the pendant."""
         facts, table, brush = self.facts, self.facts.config.table, self.facts.config.brush
         columns, rows = table.board_squares
@@ -145,12 +123,12 @@ class UnknownLab(LoopbackRig):
             f"markers of {facts.printed_marker_mm:g} mm, {table.board_dictionary}",
             f"brush     radius R = {brush.radius_mm:g} mm, length L = {brush.length_mm:g} mm, "
             f"press at most {facts.max_depth_mm:g} mm",
+            *(() if control is None else (f"hand      brushloop sim hand {control} bring pin",)),
+            "Ctrl-C ends",
         ]
 
-    async def hand(self, request: Mapping[str, object]) -> dict[str, Any]:
+    async def hand(self, act: str = "", to: str = "", index: int = 0, corner: str = "") -> dict[str, Any]:
         """What the person did: `says`, and for `bring` whether it was `reached`. Raises ValueError, with one line."""
-        act, to = request.get("act"), str(request.get("to", ""))
-        index, corner = request.get("index", 0), str(request.get("corner", ""))
         if type(index) is not int or not 0 <= index < 1000:
             raise ValueError(f"index = {index!r}: must be a whole number from 0 to 999")
         async with self._busy:
@@ -189,41 +167,39 @@ class UnknownLab(LoopbackRig):
 
     async def mend(self) -> str:
         """Correct the mistake that the trap is; return what was done."""
+        if self._trap is None:
+            return "Nothing is wrong that I know of."
         was, self.facts = self.facts, self._mended
-        match was.trap:
-            case None:
-                return "Nothing is wrong that I know of."
-            case Trap.CABLE_PULLED:
-                pulled, self._pulled = self._pulled, []
-                for ident in pulled:
-                    self.faults.take(ident)
-            case Trap.OLD_SOFTWARE:
-                await self._older.stop()
-                for server, port in ((self.arcs, ARCS_PORT), (self.rtde, RTDE_PORT)):
-                    self.servers[server] = port
-                    await server.start(self.host, port)
-            case _:
-                self.arcs.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
-                if self.facts.config != was.config:
-                    self.reconfigure(self.facts.config)
-        return f"I have seen to it: {was.trap.value}."
+        for ident in self._pulled:
+            self.faults.take(ident)
+        if not was.speaks_arcs:
+            await self._older.stop()
+            for server, port in ((self.arcs, ARCS_PORT), (self.rtde, RTDE_PORT)):
+                self.servers[server] = port
+                await server.start(self.host, port)
+        if self.facts.cabinet_tcp != was.cabinet_tcp:
+            self.arcs.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
+        if self.facts.config != was.config:
+            self.reconfigure(self.facts.config)
+        done, self._trap = f"I have seen to it: {self._trap.value}.", None
+        return done
 
     def aim(self, to: str, index: int, name: str) -> Pose:
         """Pose of the tip for a thing. Raises ValueError for one that the lab does not have."""
-        rng, place = self._luck(to, index, name), self._place(to, name)
-        wrist_deg = azimuth_deg(place) + float(rng.normal(0.0, 5.0))
+        rng, place = self._luck(to, index, name), self.facts.place(to, name)
+        turn_deg = float(rng.normal(0.0, 5.0))
         tilt_deg, toward_deg = 0.0, 0.0
         if to == "pin":
             # The brush leans to each of four sides in turn; in every second round the sides lie between those of the
             # first, and from round to round the wrist turns.
             tilt_deg = PIN_TILT_DEG + float(rng.uniform(-4, 0))
             toward_deg = 90.0 * index + 45.0 * (index // 4 % 2) + float(rng.uniform(-8, 8))
-            wrist_deg += (0.0, 70.0, -70.0)[index // 4 % 3]
+            turn_deg += (0.0, 70.0, -70.0)[index // 4 % 3]
         elif to == "upright":
-            wrist_deg += (0.0, 100.0, -100.0, 50.0, -50.0)[index % 5]
+            turn_deg += (0.0, 100.0, -100.0, 50.0, -50.0)[index % 5]
         error_mm = _error_mm(rng, HAND_MM if to in TOUCHED else BY_EYE_MM)
         x, y, z = (a + b for a, b in zip(place, error_mm, strict=True))
-        aimed = held((x, y, z), wrist_deg=wrist_deg, tilt_deg=tilt_deg, toward_deg=toward_deg)
+        aimed = held((x, y, z), turn_deg=turn_deg, tilt_deg=tilt_deg, toward_deg=toward_deg)
         upright_deg = 0.15 if to == "upright" else 1.0  # against a set square, or by eye
         about_x, about_y = np.radians(rng.normal(0.0, upright_deg, 2)).tolist()
         return Pose(x, y, z, *product(of_vector((about_x, about_y, 0.0)), aimed.quaternion))
@@ -233,7 +209,7 @@ class UnknownLab(LoopbackRig):
         rng = self._luck("hold-board", index, "")
         view, table = self.facts.config.view, self.facts.config.table
         slant_deg, toward_deg, turn_deg, (x, y) = GRIPS[index % len(GRIPS)]
-        size_x_mm, size_y_mm = board_size_mm(table)
+        size_x_mm, size_y_mm = table.board_size_mm
         high = view.height_px / view.width_px
         longest = max(size_x_mm, size_y_mm / high) if abs(turn_deg) < 45.0 else max(size_y_mm, size_x_mm / high)
         across_mm = longest / float(rng.uniform(0.85, 0.95))
@@ -246,35 +222,15 @@ class UnknownLab(LoopbackRig):
 
     def _measured(self, what: str) -> str:
         """A length as the person writes it down. Raises ValueError for one that nobody can measure."""
-        config = self.facts.config
-        lengths_mm = {
-            "square": round(config.table.board_square_mm, 2),
-            "marker": round(config.table.board_marker_mm, 2),
-            "tool": round(config.tool_mm),
+        table = self.facts.config.table
+        lengths = {
+            "square": round(table.board_square_mm, 2),
+            "marker": round(table.board_marker_mm, 2),
+            "tool": self.facts.noted_tool,
         }
-        if what not in lengths_mm:
-            raise ValueError(f"to = {what!r} is not one of {', '.join(lengths_mm)}")
-        in_metres = self.facts.trap is Trap.TCP_IN_METRES and what == "tool"
-        return f"{lengths_mm[what] / 1e3 if in_metres else lengths_mm[what]:g}"
-
-    def _place(self, to: str, name: str) -> Place:
-        facts, table = self.facts, self.facts.config.table
-        if to in ("board-corner", "sheet-corner"):  # the person may take one corner for another
-            if facts.swapped is not None and name in facts.swapped:
-                name = facts.swapped[1 - facts.swapped.index(name)]
-            return corner(table, to.removesuffix("-corner"), name)
-        (x, y), (wash_x, wash_y) = table.well_mm, facts.wash_mm
-        in_picture = facts.trap is Trap.PARK_IN_PICTURE
-        return {
-            "pin": facts.pin_mm,
-            "upright": over_sheet(table, UPRIGHT_ABOVE_MM),
-            "well": table.to_base(x, y, DIP_ABOVE_BOTTOM_MM),
-            "well-rim": table.to_base(x, y + table.well_radius_mm, table.well_depth_mm),
-            "wash-pot": table.to_base(wash_x, wash_y, DIP_ABOVE_BOTTOM_MM),
-            "wash-rim": table.to_base(wash_x, wash_y + table.well_radius_mm, table.well_depth_mm),
-            "park": over_sheet(table, facts.park_mm[2] - table.paper_z_mm) if in_picture else facts.park_mm,
-            "clear-view": facts.clear_mm,
-        }[to]
+        if what not in lengths:
+            raise ValueError(f"to = {what!r} is not one of {', '.join(lengths)}")
+        return f"{lengths[what]:g}"
 
     def _luck(self, to: str, index: int, name: str) -> np.random.Generator:
         key = f"{to} {index} {name}"
@@ -346,19 +302,8 @@ class LabRefused(Exception):
     exit_code: ClassVar[int] = 2
 
 
-def serve_unknown(
-    seed: int, trap: str | None, rate: float, idle_exit_s: float, tell: Callable[..., None], control: Path | None
-) -> None:
-    """Serve the unknown lab of this seed and print what a person reads there.
-
-    Raises `LabRefused` for an unknown trap, and `SimFileError` for the control socket.
-    """
-    if trap is not None and trap not in [*Trap]:
-        raise LabRefused(f"--trap is {trap!r}, allowed: {', '.join(Trap)}")
-    lab = UnknownLab(seed, None if trap is None else Trap(trap), rate=rate)
-
-    def announce() -> None:
-        hand = [] if control is None else [f"hand      brushloop sim hand {control} bring pin"]
-        tell(*lab.labels(), *hand, "Ctrl-C ends")
-
-    asyncio.run(serve_until_over(lab, control, idle_exit_s, announce))
+def trap_of(name: str) -> Trap:
+    """The trap with this name. Raises `LabRefused` for an unknown one."""
+    if name not in [*Trap]:
+        raise LabRefused(f"--trap is {name!r}, allowed: {', '.join(Trap)}")
+    return Trap(name)

@@ -14,54 +14,13 @@ import numpy as np
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import DOWN, brush_pose, of_vector, product
 from brushloop.drivers.sim.brush.brush import BrushSpec
-from brushloop.drivers.sim.config import SimConfig, Table, View
+from brushloop.drivers.sim.config import CORNERS, Place, SimConfig, Table, View
 from brushloop.drivers.sim.kinematics import HOME, inverse, inverted, matrix_of
 from brushloop.drivers.sim.scene import homography, mapped
 from brushloop.drivers.sim.world import tool_of
 
-Place = tuple[float, float, float]
-"""x, y, z in the base frame, in mm."""
-CORNERS = ("lower left", "lower right", "upper right", "upper left")
-"""Of the board and of the sheet, with the print upright before the reader."""
-
-
-def over_sheet(table: Table, above_mm: float = 0.0) -> Place:
-    """The middle of the sheet, or a place above it."""
-    width, height = table.sheet_mm
-    return table.to_base(width / 2, height / 2, above_mm)
-
-
-def board_size_mm(table: Table) -> tuple[float, float]:
-    """True width and height of the printed board."""
-    columns, rows = table.board_squares
-    return columns * table.board_square_mm, rows * table.board_square_mm
-
-
-def corner(table: Table, of: str, name: str) -> Place:
-    """A corner of the `board` or of the `sheet`. Raises ValueError for an unknown name."""
-    if name not in CORNERS:
-        raise ValueError(f"corner = {name!r} is not one of {', '.join(CORNERS)}")
-    left, bottom = table.board_origin_mm if of == "board" else (0.0, 0.0)
-    width, height = board_size_mm(table) if of == "board" else table.sheet_mm
-    return table.to_base(left + width * ("right" in name), bottom + height * ("upper" in name))
-
-
-def held(place: Place, *, wrist_deg: float, tilt_deg: float = 0.0, toward_deg: float = 0.0) -> Pose:
-    """The brush with its tip at a place, its wrist turned, and then its ferrule leaned toward a direction.
-
-    Unlike `brush_pose`, where the wrist turns with the direction of the lean.
-    """
-    toward, tilt = math.radians(toward_deg), math.radians(tilt_deg)
-    lean = of_vector((-math.sin(toward) * tilt, math.cos(toward) * tilt, 0.0))
-    upright = product(of_vector((0.0, 0.0, math.radians(wrist_deg))), DOWN)
-    return Pose(*place, *product(lean, upright))
-
-
-def azimuth_deg(place: Place) -> float:
-    """Direction from the foot of the arm, in which a person would turn the wrist."""
-    return math.degrees(math.atan2(place[1], place[0]))
-
-
+CAMERA_PORTS = (8080, 8081)
+"""One of the two cameras shows the sheet."""
 PICTURE_PX = (1280, 960)
 PRINTS = ((26, 20, 12.0, 9.0), (24, 19, 12.0, 9.0), (22, 17, 14.0, 10.5), (27, 20, 12.0, 9.0))
 """Boards that fit on A3: columns, rows, square and marker in mm."""
@@ -69,6 +28,8 @@ BRUSHES = ((5.5, 46.0), (6.0, 48.0), (6.5, 50.0))
 LIFT_MM = 60.0
 """How far a person lifts the brush before going elsewhere."""
 PIN_TILT_DEG = 38.0
+UPRIGHT_ABOVE_MM = 70.0
+DIP_ABOVE_BOTTOM_MM = 2.5
 CLEAR_OF_PICTURE_MM = 75.0
 """More than the arm hides around the tip."""
 BOARD_MARGIN_PX = 12.0
@@ -119,25 +80,60 @@ class Facts:
     """A place for the tip outside the picture."""
     clear_mm: Place
     """Another one."""
-    cabinet_tcp: tuple[float, ...] = (0.0,) * 6
+    cabinet_tcp: tuple[float, ...]
     """Tool offset that somebody once typed at the pendant: x, y, z in m and three angles in rad."""
-    payload_kg: float = 0.0
-    sheet_camera: int = 0
-    """Which of the two streams shows the sheet."""
-    printed_square_mm: float = 12.0
-    printed_marker_mm: float = 9.0
+    payload_kg: float
+    printed_square_mm: float
+    printed_marker_mm: float
     """Sizes that the line below the print states, mm."""
-    swapped: tuple[str, str] | None = None
+    noted_tool: float
+    """The tool's length as the person writes it down."""
+    swapped: tuple[str, ...] = ()
     """Corners that the person takes for each other."""
     cable_after: int | None = None
     """Number of touched things after which somebody trips over the controller's cable."""
-    trap: Trap | None = None
-    """What is wrong in the lab until it is mended."""
+    speaks_arcs: bool = True
+    """Whether the cabinet has the software that does."""
 
     @property
     def max_depth_mm(self) -> int:
         """Deepest press that the maker of the brush allows."""
         return round(PRESS_SHARE * self.config.brush.length_mm)
+
+    def place(self, to: str, name: str = "") -> Place:
+        """Where a person goes for a thing, such as the `name` of a corner. Raises ValueError for an unknown corner."""
+        table = self.config.table
+        if to in ("board-corner", "sheet-corner"):
+            if name in self.swapped:
+                name = self.swapped[1 - self.swapped.index(name)]
+            return table.corner(to.removesuffix("-corner"), name)
+        (x, y), (wash_x, wash_y) = table.well_mm, self.wash_mm
+        return {
+            "pin": self.pin_mm,
+            "upright": table.over_sheet(UPRIGHT_ABOVE_MM),
+            "well": table.to_base(x, y, DIP_ABOVE_BOTTOM_MM),
+            "well-rim": table.to_base(x, y + table.well_radius_mm, table.well_depth_mm),
+            "wash-pot": table.to_base(wash_x, wash_y, DIP_ABOVE_BOTTOM_MM),
+            "wash-rim": table.to_base(wash_x, wash_y + table.well_radius_mm, table.well_depth_mm),
+            "park": self.park_mm,
+            "clear-view": self.clear_mm,
+        }[to]
+
+    def patched(self, **config: Any) -> Facts:
+        """The lab with these fields of its configuration changed."""
+        return replace(self, config=replace(self.config, **config))
+
+
+def held(place: Place, *, turn_deg: float = 0.0, tilt_deg: float = 0.0, toward_deg: float = 0.0) -> Pose:
+    """The brush with its tip at a place, and then its ferrule leaned toward a direction.
+
+    The wrist is turned from where a person would turn it, which is away from the foot of the arm. Unlike `brush_pose`,
+    where it turns with the direction of the lean.
+    """
+    wrist = math.atan2(place[1], place[0]) + math.radians(turn_deg)
+    toward, tilt = math.radians(toward_deg), math.radians(tilt_deg)
+    lean = of_vector((-math.sin(toward) * tilt, math.cos(toward) * tilt, 0.0))
+    return Pose(*place, *product(lean, product(of_vector((0.0, 0.0, wrist)), DOWN)))
 
 
 def draw(seed: int, rate: float = 1.0, picture_px: tuple[int, int] = PICTURE_PX) -> Facts:
@@ -146,7 +142,7 @@ def draw(seed: int, rate: float = 1.0, picture_px: tuple[int, int] = PICTURE_PX)
         facts = _guess(np.random.default_rng([seed, 16, attempt]), seed, rate, picture_px)
         if facts is None:
             continue
-        board = [corner(facts.config.table, "board", name) for name in CORNERS]
+        board = [facts.config.table.corner("board", name) for name in CORNERS]
         if in_picture(facts.config, board, BOARD_MARGIN_PX) and reaches(facts.config, poses(facts)):
             return facts
     raise AssertionError("unreachable")
@@ -175,7 +171,7 @@ def _guess(rng: np.random.Generator, seed: int, rate: float, picture_px: tuple[i
     # The tool offset at the pendant is none, that of another tool, or this one measured with a ruler.
     ruler_m, other_m = (config.tool_mm + float(rng.normal(0.0, 2.0))) / 1e3, float(rng.uniform(0.05, 0.2))
     typed = ((0.0,) * 6, (0.0, 0.03, other_m, 0.0, 0.0, 0.5), (0.0, 0.0, ruler_m, 0.0, 0.0, 0.0))[rng.integers(3)]
-    payload_kg, sheet_camera = float(rng.choice([0.0, 0.5])), int(rng.integers(2))
+    payload_kg, camera_port = float(rng.choice([0.0, 0.5])), CAMERA_PORTS[rng.integers(2)]
     park = next(_places_aside(rng, config, 40), None)
     if park is None or min(math.dist(pin, wash), math.dist(pin, table.well_mm), math.dist(wash, table.well_mm)) < 60.0:
         return None
@@ -184,16 +180,16 @@ def _guess(rng: np.random.Generator, seed: int, rate: float, picture_px: tuple[i
     if clear is None:
         return None
     return Facts(
-        config=replace(config, home_mm=park),
+        config=replace(config, home_mm=park, camera_port=camera_port),
         pin_mm=table.to_base(*pin, float(rng.uniform(20, 60))),
         wash_mm=wash,
         park_mm=park,
         clear_mm=clear,
         cabinet_tcp=typed,
         payload_kg=payload_kg,
-        sheet_camera=sheet_camera,
         printed_square_mm=table.board_square_mm,
         printed_marker_mm=table.board_marker_mm,
+        noted_tool=round(config.tool_mm),
     )
 
 
@@ -222,7 +218,7 @@ def _table(rng: np.random.Generator) -> Table:
 
 
 def _view(rng: np.random.Generator, table: Table, picture_px: tuple[int, int]) -> View:
-    (width, height), (width_px, height_px) = board_size_mm(table), picture_px
+    (width, height), (width_px, height_px) = table.board_size_mm, picture_px
     focal = float(rng.uniform(0.95, 1.25))
     across_mm = max(width + rng.uniform(30, 60), (height + rng.uniform(30, 60)) * width_px / height_px)
     left, bottom = table.board_origin_mm
@@ -251,7 +247,7 @@ def _view(rng: np.random.Generator, table: Table, picture_px: tuple[int, int]) -
 
 def _beside(rng: np.random.Generator, table: Table, clear_mm: float) -> tuple[float, float]:
     """A point beside the board, in the paper frame."""
-    (width, height), (left, bottom) = board_size_mm(table), table.board_origin_mm
+    (width, height), (left, bottom) = table.board_size_mm, table.board_origin_mm
     along, beyond = float(rng.uniform(0.15, 0.85)), clear_mm + float(rng.uniform(0, 15))
     return (
         (left + along * width, bottom - beyond),
@@ -264,10 +260,10 @@ def _beside(rng: np.random.Generator, table: Table, clear_mm: float) -> tuple[fl
 def _places_aside(rng: np.random.Generator, config: SimConfig, tries: int) -> Iterator[Place]:
     """Places that the arm reaches and the camera does not see, and a straight way from the sheet past the base."""
     table = config.table
-    middle = over_sheet(table)
+    middle = table.over_sheet()
     for _ in range(tries):
         reach_mm = rng.uniform(300, 600)
-        bearing = math.radians(azimuth_deg(middle) + rng.uniform(-80, 80))
+        bearing = math.radians(math.degrees(math.atan2(middle[1], middle[0])) + rng.uniform(-80, 80))
         z_mm = table.paper_z_mm + float(rng.uniform(110, 180))
         place = (float(reach_mm * math.cos(bearing)), float(reach_mm * math.sin(bearing)), z_mm)
         if in_picture(config, [place]) or _nearest_mm(middle, place) < BASE_CLEAR_MM:
@@ -297,17 +293,15 @@ def in_picture(config: SimConfig, places: Sequence[Place], margin_px: float | No
 def poses(facts: Facts) -> Iterator[Pose]:
     """Poses of the tip that the lab must allow: by hand, and those of a later session, with room above."""
     table = facts.config.table
-    touched = [corner(table, of, name) for of in ("board", "sheet") for name in CORNERS]
-    touched += [table.to_base(*facts.wash_mm), table.to_base(*table.well_mm)]
-    for place in touched:
-        upright = held(place, wrist_deg=azimuth_deg(place))
+    board, sheet = ([table.corner(of, name) for name in CORNERS] for of in ("board", "sheet"))
+    for place in (*board, *sheet, table.to_base(*facts.wash_mm), table.to_base(*table.well_mm)):
+        upright = held(place)
         yield from (upright, replace(upright, z_mm=upright.z_mm + LIFT_MM + 20.0))
-    for place in touched[4:8]:
+    for x, y, z in sheet:
         for turn_deg in (0.0, 90.0, 180.0, 270.0):
-            x, y, z = place
             yield brush_pose(x, y, z - 15.0, heading_deg=table.yaw_deg + turn_deg, tilt_deg=15.0)
     for toward_deg in range(0, 360, 45):
-        yield held(facts.pin_mm, wrist_deg=azimuth_deg(facts.pin_mm), tilt_deg=PIN_TILT_DEG, toward_deg=toward_deg)
+        yield held(facts.pin_mm, tilt_deg=PIN_TILT_DEG, toward_deg=toward_deg)
 
 
 def reaches(config: SimConfig, wanted: Iterable[Pose]) -> bool:
@@ -330,36 +324,33 @@ TOO_FAR_MM = 330.0
 
 def trapped(facts: Facts, trap: Trap) -> tuple[Facts, Facts]:
     """The lab with the trap in it, and as it is once the person has corrected the mistake."""
-    wrong, mended = facts, facts
-    table, view, rng = facts.config.table, facts.config.view, np.random.default_rng([facts.config.seed, 18])
+    config, rng = facts.config, np.random.default_rng([facts.config.seed, 18])
+    table, view = config.table, config.view
     match trap:
         case Trap.SWAPPED_CORNER:
             first = int(rng.integers(4))
-            wrong = replace(facts, swapped=(CORNERS[first], CORNERS[(first + 1) % 4]))
+            return replace(facts, swapped=(CORNERS[first], CORNERS[(first + 1) % 4])), facts
         case Trap.MIRRORED_CAMERA:
-            wrong = _with(facts, view=replace(view, mirrored=True))
+            return facts.patched(view=replace(view, mirrored=True)), facts
         case Trap.WRONG_BOARD_SIZE:  # a board that was printed too small is measured
             square_mm, marker_mm = SHRUNK * table.board_square_mm, SHRUNK * table.board_marker_mm
-            wrong = _with(facts, table=replace(table, board_square_mm=square_mm, board_marker_mm=marker_mm))
-            mended = replace(wrong, printed_square_mm=square_mm, printed_marker_mm=marker_mm)
+            wrong = facts.patched(table=replace(table, board_square_mm=square_mm, board_marker_mm=marker_mm))
+            return wrong, replace(wrong, printed_square_mm=square_mm, printed_marker_mm=marker_mm)
         case Trap.TCP_IN_METRES:
-            wrong = replace(facts, cabinet_tcp=(0.0, 0.0, facts.config.tool_mm / 1e6, 0.0, 0.0, 0.0))
+            cabinet_tcp = (0.0, 0.0, config.tool_mm / 1e6, 0.0, 0.0, 0.0)
+            return replace(facts, cabinet_tcp=cabinet_tcp, noted_tool=facts.noted_tool / 1e3), facts
+        case Trap.PARK_IN_PICTURE:
+            return replace(facts, park_mm=table.over_sheet(facts.park_mm[2] - table.paper_z_mm)), facts
         case Trap.SLOW_CAMERA:
-            wrong = _with(facts, view=replace(view, delay_s=SLOW_S))
+            return facts.patched(view=replace(view, delay_s=SLOW_S)), facts
         case Trap.FORCE_SIGN:
-            wrong, mended = _with(facts, sensor_sign=-1), _with(facts, sensor_sign=1)
+            return facts.patched(sensor_sign=-1), facts.patched(sensor_sign=1)
         case Trap.SHEET_OUT_OF_REACH:  # with board, pots and camera; the pin stays within reach
-            x, y, _ = over_sheet(table)
+            x, y, _ = table.over_sheet()
             stretch = TOO_FAR_MM / math.hypot(x, y)
             origin_mm = (table.origin_mm[0] + stretch * x, table.origin_mm[1] + stretch * y)
-            wrong = _with(facts, table=replace(table, origin_mm=origin_mm))
+            return facts.patched(table=replace(table, origin_mm=origin_mm)), facts
+        case Trap.OLD_SOFTWARE:
+            return replace(facts, speaks_arcs=False), facts
         case Trap.CABLE_PULLED:
-            wrong = replace(facts, cable_after=int(rng.integers(2, 7)))
-        case Trap.PARK_IN_PICTURE | Trap.OLD_SOFTWARE:
-            pass  # in the hands of the person, and at the ports
-    return replace(wrong, trap=trap), mended
-
-
-def _with(facts: Facts, **changes: Any) -> Facts:
-    """The lab with another configuration."""
-    return replace(facts, config=replace(facts.config, **changes))
+            return replace(facts, cable_after=int(rng.integers(2, 7))), facts

@@ -19,13 +19,14 @@ from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import distance
 from brushloop.drivers.sim.kinematics import (
     HOME,
-    Corner,
-    JointLine,
     Joints,
-    Line,
     Matrix,
+    Path,
+    corner,
     inverse,
     inverted,
+    joint_line,
+    line,
     matrix_of,
     pose_of,
 )
@@ -49,7 +50,7 @@ class Piece:
 
     ident: int
     """Of its move."""
-    path: Line | JointLine | Corner
+    path: Path
     start: float
     """Where it begins, along the whole path."""
     begin: float
@@ -61,16 +62,13 @@ class Piece:
     acc: float
     blend_mm: float = 0.0
     """Distance from its end at which it may be left; 0 where it ends at rest."""
+    through: bool = False
+    """Whether the arm does not rest at its end, which leads into a corner or out of one."""
 
     @property
     def stop(self) -> float:
         """Where it ends, along the whole path."""
         return self.start + self.end - self.begin
-
-    @property
-    def corner(self) -> bool:
-        """Whether it joins two lines."""
-        return isinstance(self.path, Corner)
 
     def place(self, along: float) -> float:
         """The distance along its own path."""
@@ -82,7 +80,7 @@ class Piece:
 
     def joints(self, along: float) -> Joints | None:
         """The joints; None where the path is not given in joints."""
-        return self.path.joints(self.place(along)) if isinstance(self.path, JointLine) else None
+        return None if self.path.joints is None else self.path.joints(self.place(along))
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +117,7 @@ def timetable(pieces: Sequence[Piece], start: Knot) -> list[Knot] | None:
     leaving = [0.0] * len(pieces)
     for i in range(len(pieces) - 1, 0, -1):
         before, piece = pieces[i - 1 : i + 1]
-        if before.corner or piece.corner:
+        if before.through:
             leaving[i - 1] = min(before.cap, piece.cap, reach(piece, leaving[i]))
     if start.speed > reach(pieces[0], leaving[0]) * (1.0 + SLACK) + SLACK:
         return None
@@ -186,19 +184,19 @@ class MotionQueue:
         if travel_mm <= SAME_POSE_MM and turn_deg <= SAME_POSE_DEG:
             return False
         end = target if fix is None else pose_of(matrix_of(target) @ fix)
-        line = Line(start, end, travel_mm, math.radians(turn_deg))
-        unit, blend_mm = (1e-3, 0.0) if line.angular else (1.0, blend_mm)
-        self._append(line, speed_mm_s * unit, acc_mm_s2 * unit, now_s, duration_s, blend_mm)
+        path = line(start, end, travel_mm, math.radians(turn_deg))
+        unit, blend_mm = (1e-3, 0.0) if path.angular else (1.0, blend_mm)
+        self._append(path, speed_mm_s * unit, acc_mm_s2 * unit, now_s, duration_s, blend_mm)
         return True
 
     def add_joints(self, joints: Joints, speed_rad_s: float, acc_rad_s2: float, now_s: float) -> bool:
         """Append a straight move in joint space, from rest to rest; False if the queue already ends there."""
         self.advance(now_s)
         exact = self._pieces[-1].joints(self._pieces[-1].stop) if self._pieces else None
-        line = JointLine(exact or self.near_joints(self._last()), joints, self.tool)
-        if line.length <= SAME_JOINT_RAD:
+        path = joint_line(exact or self.near_joints(self._last()), joints, self.tool)
+        if path.length <= SAME_JOINT_RAD:
             return False
-        self._append(line, speed_rad_s, acc_rad_s2, now_s)
+        self._append(path, speed_rad_s, acc_rad_s2, now_s)
         return True
 
     def advance(self, now_s: float) -> None:
@@ -217,7 +215,9 @@ class MotionQueue:
         self._brake(acc_mm_s2, acc_rad_s2, now_s)
         self.held, rest = False, self._knots[-1].along
         self._pieces = [
-            replace(piece, end=piece.place(rest), blend_mm=0.0) for piece in self._pieces if piece.start < rest
+            replace(piece, end=piece.place(rest), blend_mm=0.0, through=piece.through and piece.stop < rest)
+            for piece in self._pieces
+            if piece.start < rest
         ]
         self.advance(now_s)
 
@@ -298,7 +298,7 @@ class MotionQueue:
 
     def _append(
         self,
-        path: Line | JointLine,
+        path: Path,
         speed: float,
         acc: float,
         now_s: float,
@@ -334,20 +334,20 @@ class MotionQueue:
 
         The corner has to begin beyond `along`.
         """
-        match self._pieces and self._pieces[-1].path, piece.path:
-            case Line() as a, Line() as b if not a.angular and not b.angular:
-                last = self._pieces[-1]
-                cut = min(last.blend_mm, 0.5 * a.length, 0.5 * b.length)
-            case _:
-                return None
+        if not self._pieces or self._pieces[-1].blend_mm == 0.0 or piece.path.angular:
+            return None
+        last, a, b = self._pieces[-1], self._pieces[-1].path, piece.path
+        cut = min(last.blend_mm, 0.5 * a.length, 0.5 * b.length)
         if cut <= SHORTEST_CUT or last.stop - cut < along:
             return None
-        corner, acc = Corner(a, b, cut), min(last.acc, piece.acc)
+        directions = [np.subtract(w.pose(w.length).position_mm, w.pose(0.0).position_mm) / w.length for w in (a, b)]
+        bend = float(np.linalg.norm(directions[1] - directions[0]))  # 0 for straight on, 2 for a reversal
         # the speed bends by `bend` v within 2 cut / v: an acceleration of v^2 bend / (2 cut)
-        limit = math.sqrt(2.0 * cut * CORNER_SHARE * acc / max(corner.bend, 1e-12))
-        before = replace(last, end=a.length - cut)
-        cap = min(limit, last.cap, piece.cap)
-        bent = Piece(piece.ident, corner, before.stop, 0.0, corner.length, cap, (1.0 - CORNER_SHARE) * acc)
+        acc = min(last.acc, piece.acc)
+        cap = min(math.sqrt(2.0 * cut * CORNER_SHARE * acc / max(bend, 1e-12)), last.cap, piece.cap)
+        before = replace(last, end=a.length - cut, through=True)
+        path = corner(a, b, cut)
+        bent = Piece(piece.ident, path, before.stop, 0.0, path.length, cap, (1.0 - CORNER_SHARE) * acc, through=True)
         return [*self._pieces[:-1], before, bent, replace(piece, start=bent.stop, begin=cut)]
 
     def _brake(self, acc_mm_s2: float, acc_rad_s2: float, now_s: float) -> None:

@@ -6,17 +6,15 @@ import asyncio
 import contextlib
 import functools
 import json
-import math
 import os
 import signal
-from collections.abc import AsyncGenerator, Callable, Mapping
+from collections.abc import AsyncGenerator, Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any, Self
 
 from brushloop.drivers.force.simulator import ForceBoard, SocketcandServer
-from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL, Wrench
-from brushloop.drivers.geometry import inverse, of_angles, product, turned
+from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL
 from brushloop.drivers.ink.simulator import PtyLine, PumpFirmware, StationFirmware
 from brushloop.drivers.loopback import LoopbackServer
 from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
@@ -61,20 +59,19 @@ class LoopbackRig:
     def __init__(self, config: SimConfig, host: str = HOST) -> None:
         """`host` is another loopback address, where one lab is to have the ports of a real one for itself."""
         self.config = config
-        self._host = host
+        self.host = host
         self.world = World(config)
         self.force = None
         if config.force_sensor:
             noise_n, noise_nm = config.force_noise_n, config.force_noise_nm
-            board = ForceBoard(self._wrench, noise_n=noise_n, noise_nm=noise_nm, seed=config.seed)
+            board = ForceBoard(lambda _: self.world.wrench(), noise_n=noise_n, noise_nm=noise_nm, seed=config.seed)
             self.force = SocketcandServer(board, self.world.clock.now_s, rate_hz=config.force_hz)
         self.ink: PtyLine | None = None
         if config.ink_device == "station":
             self.ink = PtyLine(StationFirmware(self.world.well))
         elif config.ink_device == "pump":
             self.ink = PtyLine(PumpFirmware(self.world.well, ml_per_revolution=PUMP_ML))
-        missing = {Device.INK: self.ink, Device.FORCE: self.force}
-        self.faults = FaultBoard(self.world, [device for device, server in missing.items() if server is None])
+        self.faults = FaultBoard(self.world)
         """One board for all servers."""
         self.arcs = ArcsServer(self.world, self.faults)
         self.rtde = RtdeServer(self.arcs.cabinet, self.faults)
@@ -98,7 +95,7 @@ class LoopbackRig:
         async with contextlib.AsyncExitStack() as opening:
             opening.push_async_callback(self._stop)
             for server, port in self.servers.items():
-                await server.start(self._host, port)
+                await server.start(self.host, port)
             if self.force is not None:
                 await asyncio.to_thread(self.world.reaction.push_n, 1.0, 0.0)  # the first is slow
             if self.ink is not None:
@@ -111,16 +108,6 @@ class LoopbackRig:
     async def __aexit__(self, *_: object) -> None:
         await self._open.aclose()
 
-    def _wrench(self, _t_s: float) -> Wrench:
-        """The wrench as the sensor reports it, whose axes and sign depend on how it is mounted."""
-        config, wrench = self.world.config, self.world.wrench()
-        about_x, about_y = (math.radians(v) for v in config.tool_lean_deg)
-        sensor = of_angles(0.0, 0.0, math.radians(config.sensor_turn_deg))
-        brush_in_sensor = product(inverse(sensor), of_angles(about_x, about_y, 0.0))
-        force_n, torque_nm = (turned(brush_in_sensor, part) for part in (wrench[:3], wrench[3:]))
-        fx, fy, fz, mx, my, mz = (config.sensor_sign * value for value in (*force_n, *torque_nm))
-        return fx, fy, fz, mx, my, mz
-
     async def _stop(self) -> None:
         for server in self.servers:
             await server.stop()
@@ -131,7 +118,11 @@ class LoopbackRig:
         served = replace(self.config, arcs_port=arcs, rtde_port=rtde, camera_port=camera)
         if self.force is not None:
             served = replace(served, force_port=self.force.port)
-        return rig_toml(served, self._host, "" if self.ink is None else self.ink.path)
+        return rig_toml(served, self.host, "" if self.ink is None else self.ink.path)
+
+    def labels(self, control: Path | None = None) -> list[str]:
+        """What a person can read at the rig, whose control socket may be at `control`."""
+        return [*self.toml().splitlines(), "# Ctrl-C ends"]
 
     def state(self) -> dict[str, Any]:
         """Current state of the world, as JSON."""
@@ -154,7 +145,7 @@ class LoopbackRig:
         self.scene = Scene(self.world)
         self.camera.show(self.scene.render, config.view)
 
-    async def hand(self, request: Mapping[str, object]) -> dict[str, Any]:
+    async def hand(self, act: str = "", to: str = "", index: int = 0, corner: str = "") -> dict[str, Any]:
         """Ask the person in the lab for something. Raises ValueError, with one line, for what nobody can do."""
         raise ValueError("there is no person here: only the lab of `brushloop sim --unknown` has one")
 
@@ -210,27 +201,26 @@ class ControlServer(LoopbackServer):
             writer.write(json.dumps(answer, separators=(",", ":")).encode() + b"\n")
             await writer.drain()
 
-    async def _obey(self, said: object) -> dict[str, Any]:
-        request = cast("dict[str, Any]", said) if isinstance(said, dict) else {}
-        board, alone = self._rig.faults, len(request) == 1
+    async def _obey(self, request: Any) -> dict[str, Any]:
+        rig, faults = self._rig, self._rig.faults
         match request:
-            case {"do": "add", "fault": dict()} if len(request) == 2:
-                return {"id": board.hang(fault_of(request["fault"]))}
-            case {"do": "list"} if alone:
-                return {"hanging": [hung.as_json() for hung in board.hanging]}
-            case {"do": "clear"} if alone:
-                return {"taken": board.clear()}
-            case {"do": "clear", "id": int(ident)} if len(request) == 2 and not isinstance(ident, bool):
-                return {"taken": int(board.take(ident))}
-            case {"do": "state"} if alone:
-                return self._rig.state()
-            case {"do": "release"} if alone:
-                return {"was": self._rig.arcs.cabinet.release()}
-            case {"do": "fresh-sheet"} if alone:
-                self._rig.world.fresh_sheet()
+            case {"do": "add", "fault": fault, **others} if not others:
+                return {"id": faults.hang(fault_of(fault))}
+            case {"do": "list", **others} if not others:
+                return {"hanging": [hung.as_json() for hung in faults.hanging]}
+            case {"do": "clear", "id": int() as ident, **others} if not others:
+                return {"taken": int(faults.take(ident))}
+            case {"do": "clear", **others} if not others:
+                return {"taken": faults.clear()}
+            case {"do": "state", **others} if not others:
+                return rig.state()
+            case {"do": "release", **others} if not others:
+                return {"was": rig.arcs.cabinet.release()}
+            case {"do": "fresh-sheet", **others} if not others:
+                rig.world.fresh_sheet()
                 return {}
-            case {"do": "hand"} if set(request) <= {"do", "act", "to", "index", "corner"}:
-                return await self._rig.hand(request)
+            case {"do": "hand", **wanted} if wanted.keys() <= {"act", "to", "index", "corner"}:
+                return await rig.hand(**wanted)
             case _:
                 raise ValueError(USAGE)
 
@@ -247,46 +237,44 @@ async def live_control(rig: LoopbackRig, path: Path) -> AsyncGenerator[None]:
         path.unlink(missing_ok=True)
 
 
-def serve(
-    config: SimConfig, write_rig: Path | None, idle_exit_s: float, tell: Callable[..., None], control: Path | None
+async def serve(
+    rig: LoopbackRig,
+    tell: Callable[..., None],
+    *,
+    write_rig: Path | None = None,
+    idle_exit_s: float = 0.0,
+    control: Path | None = None,
 ) -> None:
-    """Serve until a signal, or until idle for `idle_exit_s` (0 means never); print the `rig.toml` or write it.
+    """Serve until Ctrl-C, SIGTERM, or no client for `idle_exit_s`, where 0 means never; SIGUSR1 changes the sheet.
 
-    Raises `SimFileError` for a control socket or a `rig.toml` that cannot be written, and rather than overwrite a file
-    that no loopback rig wrote.
+    Print what a person reads at the rig, or write its `rig.toml`. Raises `SimFileError` for a control socket or a
+    `rig.toml` that cannot be written, and rather than overwrite a file that no loopback rig wrote.
     """
     if write_rig and not write_rig.parent.is_dir():
         raise SimFileError(write_rig, "", f"there is no folder {write_rig.parent}")
     if write_rig and write_rig.exists() and not write_rig.read_bytes().startswith(LOOPBACK_HEAD.encode()):
         raise SimFileError(write_rig, "", "exists and was not written by a loopback rig; it is not overwritten")
-    rig = LoopbackRig(config)
-
-    def announce() -> None:
-        if write_rig is None:
-            tell(*rig.toml().splitlines(), "# Ctrl-C ends")
-            return
-        part = write_rig.with_name(write_rig.name + ".part")
-        try:
-            part.write_text(rig.toml(), encoding="utf-8")
-            part.replace(write_rig)  # a reader sees all of it or none
-        except OSError as error:
-            raise SimFileError(write_rig, "", f"cannot be written: {error.strerror}") from None
-        tell(f"{write_rig} is written: brushloop doctor --config {write_rig}; Ctrl-C ends")
-
-    asyncio.run(serve_until_over(rig, control, idle_exit_s, announce))
-
-
-async def serve_until_over(
-    rig: LoopbackRig, control: Path | None, idle_exit_s: float, announce: Callable[[], None]
-) -> None:
-    """Serve until Ctrl-C, SIGTERM, or no client for `idle_exit_s`; SIGUSR1 changes the sheet."""
     over, loop = asyncio.Event(), asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, over.set)
     loop.add_signal_handler(signal.SIGUSR1, rig.world.fresh_sheet)
     async with rig, contextlib.nullcontext() if control is None else live_control(rig, control):
-        announce()
+        if write_rig is None:
+            tell(*rig.labels(control))
+        else:
+            _write_whole(write_rig, rig.toml())
+            tell(f"{write_rig} is written: brushloop doctor --config {write_rig}; Ctrl-C ends")
         if idle_exit_s > 0:
             idle = asyncio.create_task(rig.idle(idle_exit_s))
             idle.add_done_callback(lambda _: over.set())
         await over.wait()
+
+
+def _write_whole(path: Path, text: str) -> None:
+    """Write a file of which a reader sees all or nothing. Raises `SimFileError`."""
+    part = path.with_name(path.name + ".part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        raise SimFileError(path, "", f"cannot be written: {error.strerror}") from None

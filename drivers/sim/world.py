@@ -14,7 +14,19 @@ from numpy.typing import NDArray
 
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.force.sri_m8123 import Wrench
-from brushloop.drivers.geometry import brush_pose, columns, from_wire, interpolate, lean, of_vector, product, unit
+from brushloop.drivers.geometry import (
+    brush_pose,
+    columns,
+    from_wire,
+    interpolate,
+    inverse,
+    lean,
+    of_angles,
+    of_vector,
+    product,
+    turned,
+    unit,
+)
 from brushloop.drivers.ink.simulator import Well
 from brushloop.drivers.sim.brush.brush import MAX_TILT_DEG, Brush, BrushSpec
 from brushloop.drivers.sim.brush.drag import Waypoint, ink_left
@@ -174,16 +186,22 @@ class World:
         return self.motion.target(self.clock.now_s())
 
     def wrench(self) -> Wrench:
-        """Force in N and torque in Nm on the sensor now, in the tool's frame: z along the tool, towards the tip."""
-        tip, normal, arm_m = self.tool(), self._normal, self.config.tool_mm / 1e3
+        """Force in N and torque in Nm now, as the sensor reports them: its axes and sign are those of its mounting."""
+        config, tip, normal = self.config, self.tool(), self._normal
         x_mm, y_mm, depth_mm = self.on_sheet(tip)
         paper_n = 0.0
         if not self.is_over_well(x_mm, y_mm):
             paper_n = self.reaction.push_n(depth_mm, lean(leaning_with(tip, normal))[0])
-        push_n, weight_n = (paper_n * part for part in normal), (0.0, 0.0, self.config.hanging_kg * GRAVITY_M_S2)
+        push_n, weight_n = (paper_n * part for part in normal), (0.0, 0.0, config.hanging_kg * GRAVITY_M_S2)
         force_n = [a - b + c for a, b, c in zip(push_n, weight_n, self.push_n, strict=True)]
-        fx, fy, fz = (x * force_n[0] + y * force_n[1] + z * force_n[2] for x, y, z in columns(unit(tip.quaternion)))
-        return fx, fy, fz, -arm_m * fy, arm_m * fx, 0.0
+        fx, fy, fz = turned(inverse(unit(tip.quaternion)), force_n)  # in the brush's frame: z towards the tip
+        arm_m, sign = config.tool_mm / 1e3, config.sensor_sign
+        about_x, about_y = (math.radians(v) for v in config.tool_lean_deg)
+        sensor = of_angles(0.0, 0.0, math.radians(config.sensor_turn_deg))
+        brush_in_sensor = product(inverse(sensor), of_angles(about_x, about_y, 0.0))
+        forces_n = turned(brush_in_sensor, (sign * fx, sign * fy, sign * fz))
+        torques_nm = turned(brush_in_sensor, (sign * -arm_m * fy, sign * arm_m * fx, 0.0))
+        return (*forces_n, *torques_nm)
 
     def _travelled(self, start: Pose, end: Pose) -> None:
         """Follow one finished straight stretch of the path: dips into the well, and a contact until the brush lifts."""

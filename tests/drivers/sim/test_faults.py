@@ -25,7 +25,8 @@ class Scripted(FaultBoard):
         self.presses: list[None] = []
         self.clock = self
         self.stops: list[SafetyMode] = []
-        super().__init__(self, [Device.FORCE])  # type: ignore[arg-type]
+        self.config = SimConfig(force_sensor=False)
+        super().__init__(self)  # type: ignore[arg-type]
 
     def real_s(self) -> float:
         return self.at_s
@@ -151,7 +152,7 @@ def doing(*poses: Pose, table: Table = TABLE) -> Phase:
 def test_each_piece_of_a_press_and_of_a_dip_has_its_phase(
     here: tuple[float, float, float] | None, to: tuple[float, float, float] | None, phase: Phase
 ) -> None:
-    spots = [SimConfig().home_mm if spot is HOME else TABLE.to_base(*spot) for spot in (here, to)]
+    spots = [SimConfig().home_mm if spot is None else TABLE.to_base(*spot) for spot in (here, to)]
     assert doing(*(brush_pose(*spot) for spot in spots)) is phase
 
 

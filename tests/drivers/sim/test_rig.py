@@ -52,20 +52,20 @@ async def test_a_taken_port_leaves_no_half_a_rig(config: SimConfig):
             await asyncio.open_connection(HOST, rig.arcs.port)
 
 
-def test_serving_ends_by_itself_and_leaves_a_rig_toml_unless_another_file_stands_there(
+async def test_serving_ends_by_itself_and_leaves_a_rig_toml_unless_another_file_stands_there(
     config: SimConfig, tmp_path: Path
 ):
     target, lines = tmp_path / "rig.toml", list[str]()
-    serve(config, target, 0.2, lines.append, None)
+    await serve(LoopbackRig(config), lines.append, write_rig=target, idle_exit_s=0.2)
     assert tomllib.loads(target.read_text())["robot"]["host"] == HOST == "127.0.0.1"
     assert [p.name for p in tmp_path.iterdir()] == ["rig.toml"]
     assert str(target) in lines[0]
     target.write_text("name = 'our rig'")
     with pytest.raises(SimFileError, match="was not written by a loopback rig"):
-        serve(config, target, 0.2, lines.append, None)
+        await serve(LoopbackRig(config), lines.append, write_rig=target)
     (tmp_path / "other.toml.part").mkdir()
     with pytest.raises(SimFileError, match=r"other\.toml: cannot be written: Is a directory"):
-        serve(config, tmp_path / "other.toml", 0.2, lines.append, None)
+        await serve(LoopbackRig(config), lines.append, write_rig=tmp_path / "other.toml")
 
 
 async def test_a_rig_with_a_client_is_not_idle(rig: LoopbackRig):
@@ -119,7 +119,7 @@ async def test_a_server_refuses_any_address_that_is_not_loopback(host: str):
 async def test_the_frames_of_a_round_are_one_burst_on_a_busy_computer(monkeypatch: pytest.MonkeyPatch) -> None:
     late_s = itertools.count(1000.0, 0.05)
     monkeypatch.setattr(time, "time", lambda: next(late_s))
-    server = SocketcandServer(ForceBoard(lambda _: (0.0,) * 6), lambda: 0.0, rate_hz=100.0)
+    server = SocketcandServer(ForceBoard(lambda _: (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)), lambda: 0.0, rate_hz=100.0)
     await server.start("127.0.0.1", 0)
     reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
     command = f"< send {COMMAND_ID:03X} {len(START):x} {' '.join(f'{byte:02X}' for byte in START)} >"
@@ -250,7 +250,7 @@ def gray_at(image: np.ndarray, x_mm: float, y_mm: float) -> float:
 def test_corners_of_the_board_lie_where_the_optics_say(view: View):
     table, scene = CONFIG.table, Scene(World(SimConfig(view=view)))
     corners, ids, _, _ = cv2.aruco.CharucoDetector(board(table)).detectBoard(scene.render())
-    on_board = np.asarray(board(table).getChessboardCorners())[ids.ravel(), :2]
+    on_board = np.array(board(table).getChessboardCorners(), np.float64)[ids.ravel(), :2]
     left, bottom = table.board_origin_mm
     height_mm = table.board_squares[1] * table.board_square_mm
     paper_mm = np.column_stack([left + on_board[:, 0], bottom + height_mm - on_board[:, 1]]).astype(np.float64)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,9 +16,10 @@ from brushloop.drivers.arcs.controller import Controller
 from brushloop.drivers.arcs.wire import RpcConnection, open_arcs
 from brushloop.drivers.geometry import from_wire
 from brushloop.drivers.loopback import FaultRefused
+from brushloop.drivers.sim.config import CORNERS
 from brushloop.drivers.sim.kinematics import forward, inverted, matrix_of, pose_of
 from brushloop.drivers.sim.lab import ARCS_PORT, LabRefused, UnknownLab
-from brushloop.drivers.sim.lab_facts import CORNERS, corner, draw, in_picture
+from brushloop.drivers.sim.lab_facts import draw, in_picture
 from brushloop.drivers.sim.rig import live_control
 from brushloop.drivers.sim.world import tool_of
 
@@ -50,7 +52,7 @@ async def test_the_hand_brings_the_true_tip_to_the_thing():
         off_mm += np.subtract(lab.world.tool().position_mm, lab.facts.pin_mm).tolist()
     for name in CORNERS:
         await lab.bring("board-corner", 0, name)
-        off_mm += np.subtract(lab.world.tool().position_mm, corner(lab.facts.config.table, "board", name)).tolist()
+        off_mm += np.subtract(lab.world.tool().position_mm, lab.facts.config.table.corner("board", name)).tolist()
     assert 0.2 < float(np.std(off_mm)) < 0.4
     assert max(map(abs, off_mm)) < 0.8
     assert lab.world.presses == []
@@ -90,9 +92,9 @@ async def test_what_a_client_reads_agrees_with_the_truth_and_the_labels_tell_not
         ({"act": "measure", "to": "weight"}, "to = 'weight' is not one of square"),
     ],
 )
-async def test_what_a_person_cannot_do_is_named(request_: dict[str, object], words: str):
+async def test_what_a_person_cannot_do_is_named(request_: dict[str, Any], words: str):
     with pytest.raises(ValueError, match=words):
-        await lab_of(4).hand(request_)
+        await lab_of(4).hand(**request_)
 
 
 def run(*arguments: str) -> str:
