@@ -191,7 +191,10 @@ class Bench:
                 x, y, width, height = self._span_mm(own)
                 place = (x + width * rng.random(), y + height * rng.random())
                 peak, sigma_mm = rng.uniform(90.0, 260.0), rng.uniform(2.5, 10.0)
-                image = self._render(dataclasses.replace(view, glare=peak, glare_mm=place, glare_sigma_mm=sigma_mm))
+                u, v = self._scene.optics.image_of(np.array([place]))[0]
+                x, y = np.arange(view.width_px) - u, np.arange(view.height_px)[:, None] - v
+                glare = peak * np.exp(-0.5 * (x**2 + y**2) / (sigma_mm * view.px_per_mm) ** 2)
+                image = np.clip(self._render() + glare, 0.0, 255.0).astype(np.uint8)
                 return dataclasses.replace(sample, image=image)
             case Failure.EXPOSURE:
                 sheet = self._scene.optics.homography @ np.array([*np.array(self.table.sheet_mm) / 2, 1.0])

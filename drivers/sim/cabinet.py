@@ -16,7 +16,7 @@ from brushloop.drivers.arcs.controller import LOOPBACK_CONTROL_BOX, MOVING_ALLOW
 from brushloop.drivers.arcs.wire import numbers
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import from_wire, to_wire
-from brushloop.drivers.sim.kinematics import LIMITS_DEG, Joints, forward, inverse, inverted, matrix_of, pose_of
+from brushloop.drivers.sim.kinematics import LIMITS_DEG, Joints, Matrix, forward, inverse, inverted, matrix_of, pose_of
 from brushloop.drivers.sim.world import World
 
 BOOT_S = 0.7
@@ -42,11 +42,6 @@ class Power:
         while len(self._steps) > 1 and self._steps[1][0] <= self._now_s():
             self._steps.pop(0)
         return self._steps[0][1]
-
-    @property
-    def on(self) -> bool:
-        """True from PowerOn to Running."""
-        return self.joint_state != "Poweroff"
 
     @property
     def joint_state(self) -> str:
@@ -97,6 +92,7 @@ class Cabinet:
         self.motion = world.motion
         self.power = Power(self.now_s)
         self.tcp_offset = [0.0] * 6
+        """Flange to tool centre point as configured: x, y, z in m and three angles in rad. The true tip stays."""
         self.payload: list[Any] = [0.0, [0.0] * 3, [0.0] * 3, [0.0] * 6]
         self.collision_level = 6
         self.speed_fraction = 1.0
@@ -137,21 +133,20 @@ class Cabinet:
         return ReturnCode.OK
 
     @property
-    def tcp_offset(self) -> list[float]:
-        """Flange to tool centre point as configured: [x, y, z m, rx, ry, rz rad]. The true tip stays where it is."""
-        return self._tcp_offset
+    def _tool(self) -> Matrix:
+        """From the flange to the configured tool centre point."""
+        return matrix_of(from_wire(self.tcp_offset))
 
-    @tcp_offset.setter
-    def tcp_offset(self, offset: list[float]) -> None:
-        self._tcp_offset = list(offset)
-        self._tool = matrix_of(from_wire(offset))
-        fix = inverted(self._tool) @ self.motion.tool
-        self._fix = None if np.allclose(fix, np.eye(4), rtol=0.0, atol=1e-9) else fix
+    @property
+    def _fix(self) -> Matrix | None:
         """From the configured tool centre point to the true tip; None if they are the same."""
+        fix = inverted(self._tool) @ self.motion.tool
+        return None if np.allclose(fix, np.eye(4), rtol=0.0, atol=1e-9) else fix
 
     def configured(self, tip: Pose) -> Pose:
         """Where the controller takes the tip to be, at the configured tool centre point, when the true one is there."""
-        return tip if self._fix is None else pose_of(matrix_of(tip) @ inverted(self._fix))
+        fix = self._fix
+        return tip if fix is None else pose_of(matrix_of(tip) @ inverted(fix))
 
     def tcp(self) -> Pose:
         """Pose of the configured tool centre point now."""
@@ -308,7 +303,7 @@ def methods(cabinet: Cabinet) -> dict[str, Callable[[Params], Any]]:
         "RobotManage.isSimulationEnabled": lambda _: True,  # no arm is behind this controller
         "RobotState.getRobotModeType": lambda _: power.mode.value,
         "RobotState.getSafetyModeType": lambda _: power.safety.value,
-        "RobotState.isPowerOn": lambda _: power.on,
+        "RobotState.isPowerOn": lambda _: power.joint_state != "Poweroff",
         "RobotState.isSteady": lambda _: motion.steady(now_s()),
         "RobotState.getTcpPose": lambda _: to_wire(cabinet.tcp()),
         "RobotState.getJointPositions": lambda _: cabinet.joints(),

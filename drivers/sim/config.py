@@ -88,10 +88,6 @@ class Table:
         nx, ny, nz = self.normal
         return self.paper_z_mm - (nx * x_mm + ny * y_mm) / nz
 
-    def above_mm(self, x_mm: float, y_mm: float, z_mm: float) -> float:
-        """Distance from the sheet along its normal; negative below."""
-        return (z_mm - self.surface_z_mm(x_mm, y_mm)) * self.normal[2]
-
 
 @dataclass(frozen=True, slots=True)
 class View:
@@ -118,12 +114,6 @@ class View:
     """Fall-off of the light toward one corner."""
     shadow: float = 0.0
     """Light that a soft-edged shadow across the sheet takes away, 0 to 1."""
-    glare: float = 0.0
-    """Gray levels that the reflection of a lamp adds where it is brightest; wet ink reflects it as paper does."""
-    glare_mm: tuple[float, float] = (122.0, 86.0)
-    """Centre of the reflection, in the paper frame."""
-    glare_sigma_mm: float = 6.0
-    """Standard deviation of the reflection's Gaussian profile."""
     k1: float = 0.0
     """First radial distortion coefficient of OpenCV's lens model."""
     blur_px: float = 0.7

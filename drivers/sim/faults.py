@@ -168,12 +168,11 @@ class Hung:
 
     ident: int
     fault: Fault
-    begun: bool = False
     seen: int = 0
     """Requests that matched before it began."""
     struck: int = 0
-    until_s: float = math.inf
-    """Real time at which `for_s` is over, once it has begun."""
+    until_s: float | None = None
+    """Real time at which `for_s` is over; None until it has begun."""
 
     def as_json(self) -> dict[str, Any]:
         """Its number, its fault without defaults, and how often it has struck."""
@@ -218,7 +217,9 @@ class FaultBoard:
     def hanging(self) -> tuple[Hung, ...]:
         """Faults that are waiting or active."""
         now_s = self._world.clock.real_s()
-        self._hanging = {ident: hung for ident, hung in self._hanging.items() if now_s < hung.until_s}
+        for hung in [*self._hanging.values()]:
+            if hung.until_s is not None and now_s >= hung.until_s:
+                self.take(hung.ident)
         return tuple(self._hanging.values())
 
     def meet(self, device: Device, op: str = "", kinds: Set[str] | None = None) -> Fault | None:
@@ -230,11 +231,11 @@ class FaultBoard:
             fault = hung.fault
             if fault.device is not device or not fault.matches(op) or fault.kind not in (kinds or KINDS[device]):
                 continue
-            if not hung.begun and not fault.by_itself and self._holds(fault):
+            if hung.until_s is None and not fault.by_itself and self._holds(fault):
                 hung.seen += 1
                 if hung.seen >= fault.nth:
                     self._begin(hung)
-            if hung.begun:
+            if hung.until_s is not None:
                 self._strike(hung)
                 return fault
         return None
@@ -253,7 +254,7 @@ class FaultBoard:
     def begin_due(self, stop: Callable[[SafetyMode], None]) -> None:
         """Begin the faults that are due now without a request; `stop` gets the mode of a safety stop, over at once."""
         for hung in self.hanging:
-            if hung.fault.by_itself and not hung.begun and self._holds(hung.fault):
+            if hung.fault.by_itself and hung.until_s is None and self._holds(hung.fault):
                 self._begin(hung)
                 if hung.fault.kind in STOPS:
                     self._strike(hung)
@@ -261,9 +262,7 @@ class FaultBoard:
                     stop(STOPS[hung.fault.kind])
 
     def _begin(self, hung: Hung) -> None:
-        hung.begun = True
-        if hung.fault.for_s is not None:
-            hung.until_s = self._world.clock.real_s() + hung.fault.for_s
+        hung.until_s = self._world.clock.real_s() + (hung.fault.for_s or math.inf)
 
     def _strike(self, hung: Hung) -> None:
         self.strikes += 1

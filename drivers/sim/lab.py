@@ -34,7 +34,7 @@ from brushloop.drivers.sim.scene import Held, MjpegServer
 HAND_MM, BY_EYE_MM = 0.3, 1.0
 """Standard deviation of a tip that touches a thing, and of one that is brought near it by eye, along each axis."""
 SEEN_SIGMAS = 2.5
-"""Errors beyond this many standard deviations are seen and corrected by the person."""
+"""A person sees errors beyond this many standard deviations, and corrects the part that is beyond."""
 LOOK_S = 0.005
 PUSH_N, PUSH_S = 2.0, 1.0
 PUSHES = ((0.0, 0.0, -PUSH_N), (PUSH_N, 0.0, 0.0), (0.0, PUSH_N, 0.0))
@@ -197,8 +197,9 @@ class UnknownLab(LoopbackRig):
             turn_deg += (0.0, 70.0, -70.0)[index // 4 % 3]
         elif to == "upright":
             turn_deg += (0.0, 100.0, -100.0, 50.0, -50.0)[index % 5]
-        error_mm = _error_mm(rng, HAND_MM if to in TOUCHED else BY_EYE_MM)
-        x, y, z = (a + b for a, b in zip(place, error_mm, strict=True))
+        spread_mm = HAND_MM if to in TOUCHED else BY_EYE_MM
+        error_mm = np.clip(rng.normal(0.0, spread_mm, 3), -SEEN_SIGMAS * spread_mm, SEEN_SIGMAS * spread_mm)
+        x, y, z = (np.array(place) + error_mm).tolist()
         aimed = held((x, y, z), turn_deg=turn_deg, tilt_deg=tilt_deg, toward_deg=toward_deg)
         upright_deg = 0.15 if to == "upright" else 1.0  # against a set square, or by eye
         about_x, about_y = np.radians(rng.normal(0.0, upright_deg, 2)).tolist()
@@ -223,14 +224,10 @@ class UnknownLab(LoopbackRig):
     def _measured(self, what: str) -> str:
         """A length as the person writes it down. Raises ValueError for one that nobody can measure."""
         table = self.facts.config.table
-        lengths = {
-            "square": round(table.board_square_mm, 2),
-            "marker": round(table.board_marker_mm, 2),
-            "tool": self.facts.noted_tool,
-        }
-        if what not in lengths:
-            raise ValueError(f"to = {what!r} is not one of {', '.join(lengths)}")
-        return f"{lengths[what]:g}"
+        lengths_mm = {"square": table.board_square_mm, "marker": table.board_marker_mm}
+        if what not in lengths_mm:
+            raise ValueError(f"to = {what!r} is not one of {', '.join(lengths_mm)}")
+        return f"{round(lengths_mm[what], 2):g}"
 
     def _luck(self, to: str, index: int, name: str) -> np.random.Generator:
         key = f"{to} {index} {name}"
@@ -279,14 +276,6 @@ class UnknownLab(LoopbackRig):
         finally:
             self.world.hand_guided = False
         return math.dist(reached.position_mm, aim.position_mm)
-
-
-def _error_mm(rng: np.random.Generator, spread_mm: float) -> list[float]:
-    """Normal error along each axis; drawn again while it is larger than what a person would see and correct."""
-    while True:
-        error_mm = rng.normal(0.0, spread_mm, 3)
-        if np.abs(error_mm).max() <= SEEN_SIGMAS * spread_mm:
-            return error_mm.tolist()
 
 
 def _withdrawn(tip: Pose) -> Pose:

@@ -52,7 +52,7 @@ class Trap(StrEnum):
     WRONG_BOARD_SIZE = "wrong-board-size"
     """The board was printed to fit the page: its squares are smaller than the line below it says."""
     TCP_IN_METRES = "tcp-in-metres"
-    """Somebody typed the tool at the pendant in metres, where it takes millimetres; the person writes metres too."""
+    """Somebody typed the tool at the pendant in metres, where it takes millimetres."""
     PARK_IN_PICTURE = "park-in-picture"
     """The person parks the arm where the camera sees it."""
     SLOW_CAMERA = "slow-camera"
@@ -86,8 +86,6 @@ class Facts:
     printed_square_mm: float
     printed_marker_mm: float
     """Sizes that the line below the print states, mm."""
-    noted_tool: float
-    """The tool's length as the person writes it down."""
     swapped: tuple[str, ...] = ()
     """Corners that the person takes for each other."""
     cable_after: int | None = None
@@ -189,7 +187,6 @@ def _guess(rng: np.random.Generator, seed: int, rate: float, picture_px: tuple[i
         payload_kg=payload_kg,
         printed_square_mm=table.board_square_mm,
         printed_marker_mm=table.board_marker_mm,
-        noted_tool=round(config.tool_mm),
     )
 
 
@@ -324,8 +321,7 @@ TOO_FAR_MM = 330.0
 
 def trapped(facts: Facts, trap: Trap) -> tuple[Facts, Facts]:
     """The lab with the trap in it, and as it is once the person has corrected the mistake."""
-    config, rng = facts.config, np.random.default_rng([facts.config.seed, 18])
-    table, view = config.table, config.view
+    table, view, rng = facts.config.table, facts.config.view, np.random.default_rng([facts.config.seed, 18])
     match trap:
         case Trap.SWAPPED_CORNER:
             first = int(rng.integers(4))
@@ -337,8 +333,7 @@ def trapped(facts: Facts, trap: Trap) -> tuple[Facts, Facts]:
             wrong = facts.patched(table=replace(table, board_square_mm=square_mm, board_marker_mm=marker_mm))
             return wrong, replace(wrong, printed_square_mm=square_mm, printed_marker_mm=marker_mm)
         case Trap.TCP_IN_METRES:
-            cabinet_tcp = (0.0, 0.0, config.tool_mm / 1e6, 0.0, 0.0, 0.0)
-            return replace(facts, cabinet_tcp=cabinet_tcp, noted_tool=facts.noted_tool / 1e3), facts
+            return replace(facts, cabinet_tcp=(0.0, 0.0, facts.config.tool_mm / 1e6, 0.0, 0.0, 0.0)), facts
         case Trap.PARK_IN_PICTURE:
             return replace(facts, park_mm=table.over_sheet(facts.park_mm[2] - table.paper_z_mm)), facts
         case Trap.SLOW_CAMERA:

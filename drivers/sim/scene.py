@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import itertools
 import math
 import random
 import time
@@ -38,7 +39,6 @@ class Optics:
     def __init__(self, view: View, seed: int) -> None:
         self.homography = homography(view)
         self.light = _light(view, np.random.default_rng([seed, 11]))
-        self.glare = _glare(view, self.homography) if view.glare else None
         self.camera_matrix = camera_matrix(view)
         self.distortion: Floats = np.array([view.k1, 0.0, 0.0, 0.0])
         self._map = self._undistorted_places(view) if view.k1 else None
@@ -111,14 +111,6 @@ def _light(view: View, rng: np.random.Generator) -> NDArray[np.float32]:
     return (slope * (1.0 - view.shadow * in_shadow)).astype(np.float32)
 
 
-def _glare(view: View, paper_to_image: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Gray levels (h, w) that a lamp's reflection adds; the lens's distortion of it is left out."""
-    u, v, scale = paper_to_image @ np.array([*view.glare_mm, 1.0])
-    x, y = np.arange(view.width_px) - u / scale, np.arange(view.height_px)[:, None] - v / scale
-    sigma_px = view.glare_sigma_mm * view.px_per_mm
-    return (view.glare * np.exp(-0.5 * (x**2 + y**2) / sigma_px**2)).astype(np.float32)
-
-
 PRINT_PX_PER_MM = 6.0
 EDGE_MM, TRIMMED_EDGE_MM = 5.0, 3.0
 """White edge of the print around the board: in hand, and under the sheet."""
@@ -164,12 +156,12 @@ class Scene:
         table, view = world.config.table, world.config.view
         self._blank, self._noise = _draw(table, world.config.seed, view.noise, (view.height_px, view.width_px))
         self.optics = Optics(view, world.config.seed)
+        self._shown: tuple[int, Held | None] = (-1, None)
         self._lit: NDArray[np.float32] = np.zeros(0, np.float32)
         """The picture without noise and tool, of the sheet and the held board in `_shown`."""
-        self._shown: tuple[int, Held | None] = (-1, None)
         self._frames: dict[int, NDArray[np.uint8]] = {}
         """`_lit` with each field of noise: a moving tool only hides a part of it."""
-        self._count = 0
+        self._fields = itertools.cycle(range(NOISE_FIELDS))
         self._disc_radius_px = round(TOOL_CLEAR_MM * view.px_per_mm)
         self.held: Held | None = None
         """The board that a person holds before the camera; it hides everything else."""
@@ -180,24 +172,27 @@ class Scene:
         Without `tool` it advances the world, as only the thread that owns the world may do; with it, it may run in
         another thread. Do not write to the array: it is returned again while the picture does not change.
         """
-        tool = tool or self._world.tool()
-        held, mirrored = self.held, self._world.config.view.mirrored
+        tool, held = tool or self._world.tool(), self.held
         if self._shown != (self._world.version, held):
             self._shown = self._world.version, held
             self._lit = self._light_sheet() if held is None else self._light_board(held)
             self._frames.clear()
-        field = self._count % NOISE_FIELDS
-        self._count += 1
-        frame = self._frames.get(field)
-        if frame is None:
-            frame = np.clip(self._lit + self._noise[field], 0.0, 255.0).astype(np.uint8)
-            frame = np.ascontiguousarray(frame[:, ::-1]) if mirrored else frame
-            frame.flags.writeable = False
-            self._frames[field] = frame
+        field = next(self._fields)
+        if field not in self._frames:
+            self._frames[field] = self._exposed(self._lit + self._noise[field])
+        frame = self._frames[field]
         disc_px = None if held else self._tool_disc(tool)
         if disc_px is not None:
             frame = frame.copy()
             cv2.circle(frame, disc_px, self._disc_radius_px, (TOOL_GRAY,), -1)
+        return frame
+
+    def _exposed(self, gray: NDArray[np.float32]) -> NDArray[np.uint8]:
+        """A picture that nobody can write to, as the camera's driver delivers it."""
+        frame = np.clip(gray, 0.0, 255.0).astype(np.uint8)
+        if self._world.config.view.mirrored:
+            frame = np.ascontiguousarray(frame[:, ::-1])
+        frame.flags.writeable = False
         return frame
 
     def _light_sheet(self) -> NDArray[np.float32]:
@@ -210,8 +205,7 @@ class Scene:
         (left_mm, bottom_mm), (_, along_mm) = _extent(table)
         s, top_mm = 1.0 / PX_PER_MM, bottom_mm + along_mm
         to_mm = np.array([[s, 0, left_mm + 0.5 * s], [0, -s, top_mm - 0.5 * s], [0, 0, 1]])
-        lit = self._photograph(raster, self.optics.homography @ to_mm, TABLE_GRAY)
-        return lit if self.optics.glare is None else lit + self.optics.glare
+        return self._photograph(raster, self.optics.homography @ to_mm, TABLE_GRAY)
 
     def _light_board(self, held: Held) -> NDArray[np.float32]:
         """The print in hand, under the light of the table."""

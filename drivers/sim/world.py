@@ -194,14 +194,11 @@ class World:
             paper_n = self.reaction.push_n(depth_mm, lean(leaning_with(tip, normal))[0])
         push_n, weight_n = (paper_n * part for part in normal), (0.0, 0.0, config.hanging_kg * GRAVITY_M_S2)
         force_n = [a - b + c for a, b, c in zip(push_n, weight_n, self.push_n, strict=True)]
-        fx, fy, fz = turned(inverse(unit(tip.quaternion)), force_n)  # in the brush's frame: z towards the tip
-        arm_m, sign = config.tool_mm / 1e3, config.sensor_sign
         about_x, about_y = (math.radians(v) for v in config.tool_lean_deg)
-        sensor = of_angles(0.0, 0.0, math.radians(config.sensor_turn_deg))
-        brush_in_sensor = product(inverse(sensor), of_angles(about_x, about_y, 0.0))
-        forces_n = turned(brush_in_sensor, (sign * fx, sign * fy, sign * fz))
-        torques_nm = turned(brush_in_sensor, (sign * -arm_m * fy, sign * arm_m * fx, 0.0))
-        return (*forces_n, *torques_nm)
+        brush = of_angles(about_x, about_y, -math.radians(config.sensor_turn_deg))  # in the sensor's axes
+        lever_m = turned(brush, (0.0, 0.0, config.tool_mm / 1e3))
+        felt_n = turned(product(brush, inverse(unit(tip.quaternion))), [config.sensor_sign * f for f in force_n])
+        return (*felt_n, *np.cross(lever_m, felt_n).tolist())
 
     def _travelled(self, start: Pose, end: Pose) -> None:
         """Follow one finished straight stretch of the path: dips into the well, and a contact until the brush lifts."""
@@ -273,13 +270,14 @@ class World:
 
     def on_sheet(self, pose: Pose) -> tuple[float, float, float]:
         """x and y in the paper frame of the point of the sheet nearest to the tip, and the tip's depth below it."""
-        x_mm, y_mm = self.config.table.to_paper(pose.x_mm, pose.y_mm)
-        depth_mm = -self._above_mm(pose)
-        nx, ny, _ = self.config.table.normal
+        table = self.config.table
+        x_mm, y_mm = table.to_paper(pose.x_mm, pose.y_mm)
+        nx, ny, nz = table.normal
+        depth_mm = (table.surface_z_mm(x_mm, y_mm) - pose.z_mm) * nz
         return x_mm + depth_mm * nx, y_mm + depth_mm * ny, depth_mm
 
     def _above_mm(self, pose: Pose) -> float:
-        return self.config.table.above_mm(*self.config.table.to_paper(pose.x_mm, pose.y_mm), pose.z_mm)
+        return -self.on_sheet(pose)[2]
 
     @property
     def _normal(self) -> tuple[float, float, float]:

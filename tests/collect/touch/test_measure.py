@@ -159,8 +159,7 @@ class Operator(Asker):
         self.questions.append(prompt.question)
         if self._keys:
             return self._keys.pop(0)
-        table, tip = self._bench.sim.table, self._bench.target
-        gap_mm = table.above_mm(*self._bench.world.config.table.to_paper(tip.x_mm, tip.y_mm), tip.z_mm)
+        gap_mm = -self._bench.world.on_sheet(self._bench.target)[2]
         return next((key for key, step in (("1", 1.0), ("2", 0.1), ("3", 0.02)) if gap_mm > step), "t")
 
 

@@ -250,7 +250,7 @@ def gray_at(image: np.ndarray, x_mm: float, y_mm: float) -> float:
 def test_corners_of_the_board_lie_where_the_optics_say(view: View):
     table, scene = CONFIG.table, Scene(World(SimConfig(view=view)))
     corners, ids, _, _ = cv2.aruco.CharucoDetector(board(table)).detectBoard(scene.render())
-    on_board = np.array(board(table).getChessboardCorners(), np.float64)[ids.ravel(), :2]
+    on_board = np.array(board(table).getChessboardCorners(), np.float64)[ids.ravel().astype(np.intp), :2]
     left, bottom = table.board_origin_mm
     height_mm = table.board_squares[1] * table.board_square_mm
     paper_mm = np.column_stack([left + on_board[:, 0], bottom + height_mm - on_board[:, 1]]).astype(np.float64)
