@@ -157,9 +157,9 @@ def show_progress(engine: Engine) -> None:
         while True:
             over = engine.finished
             now = engine.snapshot()
-            for line in now.messages[max(shown - now.messages_before, 0) :]:
+            for line in now.messages[shown:]:
                 progress.console.print(line, highlight=False)
-            shown = now.messages_before + len(now.messages)
+            shown = len(now.messages)
             if (now.no_pose_s is not None) is not silent:
                 silent = now.no_pose_s is not None
                 line = f"warning: {no_pose_text(now)}" if silent else "the arm sends its pose again"

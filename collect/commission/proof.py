@@ -94,9 +94,9 @@ class ProofStep(Step):
         shown, doing = 0, ""
         while True:
             over, now = engine.finished, engine.snapshot()
-            if lines := now.messages[max(shown - now.messages_before, 0) :]:
+            if lines := now.messages[shown:]:
                 visit.say(*lines)
-            shown = now.messages_before + len(now.messages)
+            shown = len(now.messages)
             if over:
                 return
             if now.step != doing:

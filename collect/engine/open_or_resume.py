@@ -19,7 +19,7 @@ from brushloop.collect.engine import CollectRequest
 from brushloop.collect.engine.live import LiveView
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
-from brushloop.collect.rig.config import TRAVEL_CLEARANCE_MM, InkConfig, RigConfig, load_rig, overrides
+from brushloop.collect.rig.config import TRAVEL_CLEARANCE_MM, RigConfig, load_rig, overrides
 from brushloop.collect.rig.devices import Rig
 from brushloop.drivers.devices import Identity
 from brushloop.drivers.host import Clock
@@ -88,21 +88,18 @@ def _lifted(rig: RigConfig, protocol: ProtocolConfig, by_mm: float) -> RigConfig
             "",
             f"{by_mm:g} mm is outside [{low_mm:g}, {high_mm:g}] mm: above the deepest press, below travel",
         )
+    ink, dip_z_mm = rig.ink, rig.ink.dip_z_mm + by_mm
+    wipe = None if ink.wipe is None else ink.wipe.model_copy(update={"z_mm": ink.wipe.z_mm + by_mm})
+    wash = None if ink.wash is None else ink.wash.model_copy(update={"dip_z_mm": ink.wash.dip_z_mm + by_mm})
     return rig.model_copy(
         update={
             "self_check": rig.self_check.model_copy(update={"enabled": False}),
             "paper": rig.paper.model_copy(update={"touch_z_mm": rig.paper.touch_z_mm + by_mm}),
-            "ink": _lifted_ink(rig.ink, by_mm),
+            "ink": ink.model_copy(update={"dip_z_mm": dip_z_mm, "wipe": wipe, "wash": wash, "device": None}),
             "touch": rig.touch.model_copy(update={"method": "taught", "points_mm": []}),
             "quality": rig.quality.model_copy(update={"enabled": False}),
         }
     )
-
-
-def _lifted_ink(ink: InkConfig, by_mm: float) -> InkConfig:
-    wipe = None if ink.wipe is None else ink.wipe.model_copy(update={"z_mm": ink.wipe.z_mm + by_mm})
-    wash = None if ink.wash is None else ink.wash.model_copy(update={"dip_z_mm": ink.wash.dip_z_mm + by_mm})
-    return ink.model_copy(update={"dip_z_mm": ink.dip_z_mm + by_mm, "wipe": wipe, "wash": wash, "device": None})
 
 
 def find_resumable(opening: Opening) -> Path | None:
@@ -117,19 +114,17 @@ def find_resumable(opening: Opening) -> Path | None:
         folders = [request.out / request.resume]
     else:
         folders = [] if request.new else open_sessions(request.out)
-    refusals: list[ConfigError] = []
     for folder in reversed(folders):
-        changes = differences(folder, opening.snapshots)
-        if not changes:
+        if not differences(folder, opening.snapshots):
             return folder
+    if folders:
+        newest = folders[-1]
         way_out = (
-            f"Go on as it was begun: --config {folder / 'rig.toml'} --protocol {folder / 'protocol.toml'}, beside the "
+            f"Go on as it was begun: --config {newest / 'rig.toml'} --protocol {newest / 'protocol.toml'}, beside the "
             "files that they name, in the same environment; or start a new session with --new."
         )
-        what = "\n".join(["was begun with another configuration:", *changes, way_out])
-        refusals.append(ConfigError(folder, "", what))
-    if refusals:
-        raise refusals[0]
+        what = ["was begun with another configuration:", *differences(newest, opening.snapshots), way_out]
+        raise ConfigError(newest, "", "\n".join(what))
     check_fresh_sheet(request.out, request.sheet)
     return None
 
@@ -239,11 +234,10 @@ def open_sessions(root: Path) -> list[Path]:
 
 def open_store(opening: Opening, resume: Path | None, rig: Rig, clock: Clock) -> SessionStore:
     """Make or resume the session. Raises `ConfigError` if it was begun on another robot."""
-    header = _header(opening, rig)
+    root = opening.request.out
+    session_id = _next_session_id(root, opening.protocol.kind) if resume is None else resume.name
+    header = _header(opening, rig, session_id)
     if resume is None:
-        root = opening.request.out
-        session_id = _next_session_id(root, opening.protocol.kind)
-        header = header.model_copy(update={"session_id": session_id})
         return SessionStore.create(root / session_id, header, opening.snapshots, clock.now_ns)
     store = SessionStore(resume, clock.now_ns)
     try:
@@ -263,10 +257,10 @@ def open_store(opening: Opening, resume: Path | None, rig: Rig, clock: Clock) ->
     return store
 
 
-def _header(opening: Opening, rig: Rig) -> Header:
-    config, protocol = opening.rig, opening.protocol
+def _header(opening: Opening, rig: Rig, session_id: str) -> Header:
+    config = opening.rig
     return Header(
-        session_id="",
+        session_id=session_id,
         source=Source.LOOPBACK if rig.simulated else Source.REAL,
         software=f"brushloop {version('brushloop')}",
         robot=rig.robot_identity.model,
@@ -280,7 +274,7 @@ def _header(opening: Opening, rig: Rig) -> Header:
         ink_device=_who(rig.ink_identity),
         force_sensor=_who(rig.force_identity),
         paper=config.paper.name,
-        protocol=protocol.model_dump_json(),
+        protocol=opening.protocol.model_dump_json(),
         origin=f"{config.name}, {opening.request.config.name}",
     )
 

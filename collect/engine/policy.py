@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import StrEnum
+from typing import NamedTuple
 
 from brushloop.calibrate.board.pix2len import WORST_RMS_PX
 from brushloop.collect.errors import (
@@ -53,6 +54,7 @@ class Action(StrEnum):
 
 def decide(step: Step, error: StepError | DeviceError, failures: int) -> Action:
     """Return the action for the `failures`-th failure of `step`. Motion is never blindly repeated."""
+    again = Action.RETRY if failures < MAX_FAILURES else Action.ASK
     match step.kind, error:
         # Only a person can change paper or ink, mend a sensor, release the arm, or see what lies under the brush.
         case _, SheetFull() | NeedsOperator() | ForceTooHigh() | InkRefused() | DoseLost() | RobotNotSafe() | Stuck():
@@ -60,20 +62,17 @@ def decide(step: Step, error: StepError | DeviceError, failures: int) -> Action:
         # Somebody else had the arm.
         case _, ArmMoved() | SettingsChanged() | NotPowered() | PathDisturbed():
             return Action.ASK
-        case StepKind.PRESS | StepKind.DRAW, StepVoid():
-            action = Action.RETRY
-        case StepKind.PRESS | StepKind.DRAW, DeviceTimeout(device="force"):
-            # The arm was stopped because the sensor fell silent; if it still is, the next press fails at once.
-            action = Action.RETRY
+        # If the arm was stopped because the sensor fell silent, and it still is, the next press fails at once.
+        case StepKind.PRESS | StepKind.DRAW, StepVoid() | DeviceTimeout(device="force"):
+            return again
         case StepKind.PRESS | StepKind.DRAW | StepKind.SELF_CHECK, BadPicture():
             return Action.ASK  # another try would use up another patch
         case _, BadPicture():
-            action = Action.RETRY
+            return again
         case StepKind.CAPTURE | StepKind.BOARD, DeviceTimeout(device="camera"):
-            action = Action.RETRY
+            return again
         case _:
             return Action.ABORT
-    return action if failures < MAX_FAILURES else Action.ASK
 
 
 def resume_question(session_id: str, ended: str, hardware: str) -> Prompt:
@@ -131,20 +130,17 @@ def in_set_up(step: Step) -> bool:
     return step.kind in TITLES and step.index == 0
 
 
-@dataclass(frozen=True, slots=True)
-class Fact:
-    """One measured value of a set-up step."""
+class Fact(NamedTuple):
+    """One measured value of a set-up step, and whether it is within its limit; None without one."""
 
     name: str
     value: str
-    limit: str = ""
     good: bool | None = None
-    """Whether the value is within its limit; None without one."""
 
     def __str__(self) -> str:
         """A line such as `✓ residual of corners  0.11 px  (at most 1)`."""
         sign = {True: "✓", False: "!", None: " "}[self.good]
-        return f"{sign} {self.name:<{NAME}} {self.value}" + (f"  ({self.limit})" if self.limit else "")
+        return f"{sign} {self.name:<{NAME}} {self.value}"
 
 
 def accept_question(result: StepResult, config: RigConfig) -> Prompt:
@@ -181,7 +177,7 @@ def board_first(protocol: Protocol) -> Protocol:
 
 def _within(name: str, value: float, limit: float, shown: str) -> Fact:
     """A value that may be at most `limit` to either side of zero."""
-    return Fact(name, shown, f"at most {limit:g}", abs(value) <= limit)
+    return Fact(name, f"{shown}  (at most {limit:g})", abs(value) <= limit)
 
 
 def _board(result: BoardResult, config: RigConfig) -> list[Fact]:
@@ -197,9 +193,9 @@ def _board(result: BoardResult, config: RigConfig) -> list[Fact]:
     for check in result.checks:
         score = check.score or 0.0
         if check.name == "blurred":
-            facts.append(Fact("focus: blur", f"{score:.2f} mm", f"at most {check.threshold:g}", check.passed))
+            facts.append(Fact("focus: blur", f"{score:.2f} mm  (at most {check.threshold:g})", check.passed))
         elif check.name == "exposure":
-            facts.append(Fact("light: paper", f"level {score:.0f}", "", check.passed))
+            facts.append(Fact("light: paper", f"level {score:.0f}", check.passed))
     return facts
 
 

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
 from brushloop.collect.engine.control import State
-from brushloop.collect.protocols.steps import CaptureStep, DipStep, DrawStep, Planned, PressStep, Step, with_review
+from brushloop.collect.protocols.steps import Planned, with_review
 from brushloop.sessions.events import CaptureResult, DipResult, Press, PressResult, ReviewResult, SelfCheckResult
 from brushloop.sessions.records import Condition
 
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from brushloop.drivers.host import Clock
     from brushloop.sessions.store import SessionStore
 
-LOG_LINES = 200
 REFRESH_S = 0.1
 """Time between two snapshots that a screen or a progress bar shows."""
 
@@ -49,7 +48,7 @@ class CellCount:
     left_out: int = 0
     """Strokes that were given up."""
     now: bool = False
-    """The stroke in progress has this condition."""
+    """The stroke that is being made or photographed has this condition."""
     next: bool = False
     """The next planned stroke has this condition."""
 
@@ -139,7 +138,7 @@ class Snapshot:
     eta_s: float | None = None
     """Remaining time in seconds; None until two strokes of this process give a time per stroke."""
     messages: tuple[str, ...] = ()
-    """The newest lines of the log, oldest first."""
+    """The lines of the log."""
     error: str = ""
     """Why the run failed or stopped; empty otherwise."""
     tip_mm: tuple[float, float, float] | None = None
@@ -154,8 +153,6 @@ class Snapshot:
     """Level of the well before the last dip, 0 to 1; None if nothing measures it."""
     prompt: Prompt | None = None
     """Question that waits for an answer."""
-    messages_before: int = 0
-    """Number of older log lines that `messages` no longer holds."""
     target_mm: tuple[float, float, float] | None = None
     """Where the arm was last sent."""
     parked: bool = False
@@ -211,14 +208,12 @@ class Progress:
         self._store: SessionStore | None = None
         self._started_ns = clock.now_ns()
         self._over_ns: int | None = None
-        self._index: int | None = None
-        self._logged = 0
-        self._messages: deque[str] = deque(maxlen=LOG_LINES)
+        self._messages: list[str] = []
         self._now = Snapshot(
             session_id="" if resumes is None else resumes.name,
             folder="" if resumes is None else str(resumes),
             strokes_planned=len(self._plan),
-            grid=self._grid([], [], []),
+            grid=self._grid([], [], [], at_work=False),
         )
 
     def opened(self, store: SessionStore) -> int:
@@ -240,16 +235,10 @@ class Progress:
         yield
         self.doing(before)
 
-    def begun(self, step: Step) -> None:
-        """Note that a step begins."""
-        if isinstance(step, DipStep | PressStep | DrawStep | CaptureStep):
-            self._index = step.index
-        self.count()
-
     @property
     def first_free_index(self) -> int:
-        """The lowest index above all steps of the protocol; the steps of repeated strokes begin there."""
-        return 1 + max((stroke.index for stroke in self._planned), default=0)
+        """The lowest index above those of all strokes so far, where the steps of repeated strokes begin."""
+        return 1 + max((stroke.index for stroke in self._plan), default=0)
 
     def more_than(self, stroke_id: str) -> bool:
         """Whether a stroke other than this one is still to be made."""
@@ -271,12 +260,11 @@ class Progress:
     def log(self, text: str, *, warning: bool = False) -> None:
         """Add a line to the operator's log."""
         with self._lock:
-            self._logged += 1
             self._messages.append(f"warning: {text}" if warning else text)
 
     def over(self, error: str = "") -> None:
         """Note that the run is over, and why if it ended early."""
-        self._over_ns, self._index = self._clock.now_ns(), None
+        self._over_ns = self._clock.now_ns()
         self._change(error=error)
         if self._store is not None:
             self.count()
@@ -288,7 +276,6 @@ class Progress:
                 self._now,
                 elapsed_s=((self._over_ns or self._clock.now_ns()) - self._started_ns) / 1e9,
                 messages=tuple(self._messages),
-                messages_before=self._logged - len(self._messages),
                 **values,
             )
 
@@ -301,8 +288,10 @@ class Progress:
         assert self._store is not None
         state, plan = self._store.state, self._planned
         marks: dict[tuple[int | None, int | None], Mark] = dict.fromkeys(state.used_patches, Mark.VOID)
+        at_work = False
         for begin in state.running.values():
             marks |= {(begin.sheet, patch): Mark.NOW for patch in begin.patches[:1]}
+            at_work = begin.press is not None
         kept: dict[str, Press] = {}
         bad: list[Press] = []
         left_out: list[Press] = []
@@ -340,7 +329,7 @@ class Progress:
         self._change(
             strokes_done=len(kept),
             strokes_planned=len(plan),
-            grid=self._grid(kept.values(), bad, left_out),
+            grid=self._grid(kept.values(), bad, left_out, at_work=at_work),
             voids=len(state.cut),
             given_up=len(left_out),
             eta_s=self._eta_s(times_ns),
@@ -348,11 +337,14 @@ class Progress:
             sheet=None if layout is None else SheetMap(sheet + 1, layout.columns, layout.rows, on_sheet),
         )
 
-    def _grid(self, kept: Iterable[Press], bad: Iterable[Press], left_out: Iterable[Press]) -> tuple[CellCount, ...]:
-        """The strokes of each condition."""
+    def _grid(
+        self, kept: Iterable[Press], bad: Iterable[Press], left_out: Iterable[Press], *, at_work: bool
+    ) -> tuple[CellCount, ...]:
+        """The strokes of each condition. `at_work`: the first of those left is being made or photographed."""
         counts = [Counter(press.condition for press in presses) for presses in (kept, bad, left_out)]
-        current = next((stroke for stroke in self._left if stroke.index == self._index), None)
-        following = next((stroke for stroke in self._left if stroke is not current), None)
+        strokes = iter(self._left)
+        current = next(strokes, None) if at_work else None
+        following = next(strokes, None)
         return tuple(
             CellCount(
                 asked,

@@ -75,6 +75,8 @@ TRACE_PEAKS = 50
 """Peaks of the force that are drawn, of a tenth of a second each."""
 LEAST_SCALE_N = 0.1
 """Smallest full scale of that drawing, so that noise is not stretched: a soft brush pushes with a few tens of mN."""
+LOG_LINES = 200
+"""Newest lines of the log that are shown."""
 BOUNCE_S = 0.7
 """Time after an answer in which the keys of requests do nothing: pressing an answer's key twice sends no request."""
 
@@ -296,7 +298,7 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
         if now.sheet is not None:
             entitle(self._sheet, f"Sheet {now.sheet.number}: {now.sheet.marks.count(None)} free")
         if before is None or now.messages != before.messages:
-            self._log.show(Content("\n").join(_message_content(line) for line in now.messages))
+            self._log.show(Content("\n").join(_message_content(line) for line in now.messages[-LOG_LINES:]))
         if before is None or now.last is not before.last:
             self._show_capture(now.last)
         self._note.show(_note_content(now))
