@@ -11,22 +11,15 @@ from brushloop.collect.motion import TOUCH_TOLERANCE_MM
 from brushloop.collect.operator import Choice, Prompt
 from brushloop.collect.protocols.steps import DrawStep, PressStep, TouchStep, ZeroTouchStep
 from brushloop.collect.rig.config import TouchConfig
-from brushloop.collect.rig.paper import PaperPlane, Patch
+from brushloop.collect.rig.paper import PaperPlane
 from brushloop.collect.touch.force import ForceTap
 from brushloop.collect.touch.heights import plane_of
 from brushloop.collect.touch.measure import measure_plane
 from brushloop.collect.touch.selfcheck import self_check, triangle_on
 from brushloop.collect.walk import all_poses, step_poses, touch_of
 from brushloop.drivers.devices import PoseSample, Well
-from brushloop.sessions.events import (
-    DipResult,
-    Press,
-    PressResult,
-    SelfCheckResult,
-    StepKind,
-    TouchResult,
-    ZeroTouchResult,
-)
+from brushloop.sessions.events import DipResult, PressResult, SelfCheckResult, StepKind, TouchResult, ZeroTouchResult
+from brushloop.sessions.records import InkState, Topic
 
 STALE_INK_S = 5.0
 """After a longer wait (a pause, a question, a photograph) the brush dips again before it presses."""
@@ -48,92 +41,63 @@ async def fill_brush(context: StepContext) -> Well | None:
         if run.rig.ink is not None:
             well = await run.rig.ink.replenish(run.dips)
             run.dips += 1
-            context.recorder.ink(well.level, well.dosed_ml, run.light)
+            state = InkState(level=well.level, dosed_ml=well.dosed_ml, light=run.light)
+            context.recorder.event(Topic.INK, state)
         await context.guard.guarded(run.procedures.dip())
         run.left_ink_ns = run.rig.clock.now_ns()
     return well
 
 
-class DipToTouch:
-    """Times from dip to touch within one step: one for a press, one or more for a figure that dips between strokes."""
-
-    def __init__(self, context: StepContext) -> None:
-        self._context = context
-        self._left_ns: int | None = None
-        self._waits_s: list[float] = []
-        context.recorder.listeners.append(self._pose)
-
-    @property
-    def longest_s(self) -> float | None:
-        """The longest time; None if no pose showed the brush on the paper."""
-        return max(self._waits_s, default=None)
-
-    def begin(self) -> None:
-        """Time the next stroke, from the moment at which the brush left the ink."""
-        run = self._context.run
-        self._left_ns, run.left_ink_ns = run.left_ink_ns, None
-
-    def _pose(self, sample: PoseSample) -> None:
-        """Take a pose: the first one on the paper counts, and the step's moves come down nowhere else before it."""
-        if self._left_ns is None:
-            return
-        procedures, paper = self._context.run.procedures, self._context.run.rig.config.paper
-        if procedures.plane.above_mm(paper, sample.pose) <= TOUCH_TOLERANCE_MM:
-            self._waits_s.append((sample.stamp.host_ns - self._left_ns) / 1e9)
-            self._left_ns = None
-
-
-async def press(context: StepContext, step: PressStep) -> PressResult:
-    """The PRESS step."""
-    patch, procedures = await _ready(context), context.run.procedures
-    timing = DipToTouch(context)
-    timing.begin()
-    reached_mm = await context.guard.guarded(procedures.press(patch, step.press.condition, step.dwell_s))
-    pressed = _as_made(context, step.press, reached_mm, timing)
-    return PressResult(press=pressed, peak_force_n=_peak_n(context, context.guard.peak_n))
-
-
-async def draw(context: StepContext, step: DrawStep) -> PressResult:
-    """The DRAW step: every stroke of a figure, with a dip before each."""
-    run, drawn = context.run, step.drawn
-    patch = await _ready(context)
+async def mark(context: StepContext, step: PressStep | DrawStep) -> PressResult:
+    """The PRESS step, or the DRAW step: every stroke of a figure, with a dip before each."""
+    run, [patch] = context.run, context.patches
+    procedures, paper = run.procedures, run.rig.config.paper
+    left_ns: int | None = None
+    waits_s: list[float] = []
     depths_mm: list[float] = []
     peaks_n: list[float] = []
-    timing = DipToTouch(context)
-    for number in range(len(drawn.strokes)):
+
+    def touched(sample: PoseSample) -> None:
+        """Note the time from the ink to the first pose on the paper: no move of the step comes down before it."""
+        nonlocal left_ns
+        if left_ns is not None and procedures.plane.above_mm(paper, sample.pose) <= TOUCH_TOLERANCE_MM:
+            waits_s.append((sample.stamp.host_ns - left_ns) / 1e9)
+            left_ns = None
+
+    await _make_ready(context)
+    context.recorder.listeners.append(touched)
+    for number in range(len(step.drawn.strokes) if isinstance(step, DrawStep) else 1):
         if number > 0:
             await fill_brush(context)
-        timing.begin()
-        depths_mm.append(await context.guard.guarded(run.procedures.stroke(patch, drawn, number)))
+        left_ns, run.left_ink_ns = run.left_ink_ns, None
+        if isinstance(step, DrawStep):
+            stroke = procedures.stroke(patch, step.drawn, number)
+        else:
+            stroke = procedures.press(patch, step.press.condition, step.dwell_s)
+        depths_mm.append(await context.guard.guarded(stroke))
         peaks_n.append(context.guard.peak_n)
-    pressed = _as_made(context, step.press, max(depths_mm), timing)
+    made = {
+        "sheet": run.store.state.sheet,
+        "patch": patch.index,
+        "reached_mm": max(depths_mm),
+        "dip_to_touch_s": round(max(waits_s), 3) if waits_s else None,
+    }
     return PressResult(
-        kind=StepKind.DRAW, press=pressed, peak_force_n=_peak_n(context, max(peaks_n)), depths_mm=tuple(depths_mm)
+        kind=StepKind.DRAW if isinstance(step, DrawStep) else StepKind.PRESS,
+        press=step.press.model_copy(update=made),
+        peak_force_n=None if run.rig.force is None else max(peaks_n),
+        depths_mm=tuple(depths_mm) if isinstance(step, DrawStep) else (),
     )
 
 
-async def _ready(context: StepContext) -> Patch:
-    """Check the sheet, fill the brush if its ink is old, and return the patch to press, which was seen to be blank."""
-    [patch] = context.patches
+async def _make_ready(context: StepContext) -> None:
+    """Check that the sheet is blank, and fill the brush if its ink is old."""
     await look_at_sheet(context)
     run, left_ns = context.run, context.run.left_ink_ns
     if left_ns is None or run.rig.clock.now_ns() - left_ns > STALE_INK_S * 1e9:
         # Resumed, paused, or the last press failed: the brush may have dried or lost its ink since its dip.
         context.recorder.log("dip again before the press")
         await fill_brush(context)
-    return patch
-
-
-def _as_made(context: StepContext, press: Press, reached_mm: float, timing: DipToTouch) -> Press:
-    """The press with its place, and what was measured of it."""
-    [patch] = context.patches
-    wait_s = None if timing.longest_s is None else round(timing.longest_s, 3)
-    place = {"sheet": context.run.store.state.sheet, "patch": patch.index}
-    return press.model_copy(update={**place, "reached_mm": reached_mm, "dip_to_touch_s": wait_s})
-
-
-def _peak_n(context: StepContext, peak_n: float) -> float | None:
-    return None if context.run.rig.force is None else peak_n
 
 
 async def zero_touch(context: StepContext, step: ZeroTouchStep) -> ZeroTouchResult:
@@ -149,7 +113,7 @@ async def zero_touch(context: StepContext, step: ZeroTouchStep) -> ZeroTouchResu
         await within_limits("", rig.config, step_poses(rig.config, run.procedures.plane, step))
     measured = await _measured(context, touch_of(rig.config, step))
     plane = plane_of(measured)
-    poses = all_poses(rig.config, run.protocol, plane)
+    poses = all_poses(rig.config, run.opening.protocol, plane)
     await within_limits("over the paper as it was touched, ", rig.config, poses)
     moved_mm = _moved_mm(measured, run.procedures.plane)
     if measured.method != "taught":

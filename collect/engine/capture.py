@@ -3,13 +3,11 @@ shows of them."""
 
 from __future__ import annotations
 
-import contextlib
-
 import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.board.pix2len import Plane, see_board
-from brushloop.calibrate.compare import ANCHOR_MM, MM_PER_PX, SIZE_PX, covered, field_around
+from brushloop.calibrate.compare import ANCHOR_MM, MM_PER_PX, covered, field_around, field_grid
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.stroke import PX_PER_MM, Gray, on_window, prepare, rectify
 from brushloop.collect.engine.recorder import RunContext, StepContext, meanwhile, uninterrupted
@@ -26,16 +24,17 @@ from brushloop.collect.photograph.checks import (
 )
 from brushloop.collect.photograph.frames import undistorted
 from brushloop.collect.protocols.steps import MARKING, CaptureStep
+from brushloop.collect.rig.config import PaperConfig
 from brushloop.collect.rig.paper import Patch
 from brushloop.drivers.devices import Frame
 from brushloop.model.fitted import FittedPress
 from brushloop.sessions.events import Again, BoardResult, CaptureResult, Press, ReviewResult
 from brushloop.sessions.recording import bad_stills
-from brushloop.sessions.records import Check, Condition, Quality, Stroke
+from brushloop.sessions.records import Check, Condition, Quality, Stroke, Topic
 
 KEEP, AGAIN, SKIP = Choice("g", "good anyway: it counts"), Choice("r", "press it again"), Choice("k", "skip it")
-PICTURE_MARGIN_PX = 40
-"""Margin around the patch in the picture that goes with a question."""
+PICTURE_MARGIN_MM, PICTURE_PX_PER_MM = 10.0, 10.0
+"""Margin around the patch, and scale, of the picture that goes with a question."""
 
 
 async def decide(
@@ -62,24 +61,16 @@ async def decide(
         return False, False
     text = f"{stroke_id}, take {press.take}: {verdict.reason}"
     await run.procedures.park()  # a person may reach under the arm
-    prompt = Prompt(text, (KEEP, AGAIN, SKIP), SKIP.key, image=_cut_out(run.image_plane(image), image, patch))
-    answer = await run.asker.ask(prompt)
+    answer = await run.asker.ask(Prompt(text, (KEEP, AGAIN, SKIP), SKIP.key, image=_around(run, image, patch)))
     return answer == KEEP.key, answer == AGAIN.key
 
 
-def _cut_out(plane: Plane, image: Gray, patch: Patch) -> Gray:
-    """The patch and a margin around it."""
+def _around(run: RunContext, image: Gray, patch: Patch) -> Gray:
+    """The patch and a margin around it, seen from above."""
     x_mm, y_mm, size_x_mm, size_y_mm = patch.rect_mm
-    px = plane.to_image(_corners_mm((x_mm, y_mm), (size_x_mm, size_y_mm)))
-    (left, top), (right, bottom) = px.min(axis=0).astype(int), px.max(axis=0).astype(int)
-    m = PICTURE_MARGIN_PX
-    return image[max(0, top - m) : bottom + m, max(0, left - m) : right + m]
-
-
-def _corners_mm(at_mm: tuple[float, float], size_mm: tuple[float, float]) -> NDArray[np.float64]:
-    """(4, 2) corners of a rectangle of the sheet, in the paper frame."""
-    (x, y), (width, height) = at_mm, size_mm
-    return np.array([[x + right, y + up] for right in (0.0, width) for up in (0.0, height)])
+    margin_mm, sizes_mm = PICTURE_MARGIN_MM, (size_x_mm + 2 * PICTURE_MARGIN_MM, size_y_mm + 2 * PICTURE_MARGIN_MM)
+    window_mm = (x_mm - margin_mm, y_mm - margin_mm, *sizes_mm)
+    return rectify(image, run.view.homography, window_mm, PICTURE_PX_PER_MM)
 
 
 def marked_bad(run: RunContext) -> list[str]:
@@ -97,9 +88,8 @@ def marked_bad(run: RunContext) -> list[str]:
 
 def review(run: RunContext) -> ReviewResult:
     """The REVIEW step: the strokes to press again."""
-    reviews = run.store.state.results(ReviewResult)
-    first = run.progress.first_free_index + sum(len(review.again) for review in reviews)
-    again = tuple(Again(stroke_id=name, index=first + n) for n, name in enumerate(marked_bad(run)))
+    bad = enumerate(marked_bad(run), start=run.progress.first_free_index)
+    again = tuple(Again(stroke_id=name, index=index) for index, name in bad)
     for stroke in again:
         run.progress.log(f"{stroke.stroke_id} was marked bad in the review and is pressed again")
     return ReviewResult(again=again)
@@ -121,7 +111,7 @@ async def board(context: StepContext) -> BoardResult:
         mm_per_px=plane.mm_per_px,
         rms_px=plane.rms_px,
         size_px=(image.shape[1], image.shape[0]),
-        sheet_px=plane.to_image(_corners_mm((0.0, 0.0), context.run.rig.config.paper.size_mm)).tolist(),
+        sheet_px=plane.to_image(_corners_mm(context.run.rig.config.paper)).tolist(),
         checks=checks,
         camera_delay_ms=delay_ms,
         camera_jitter_ms=jitter_ms,
@@ -134,7 +124,7 @@ def _board(run: RunContext, image: Gray) -> tuple[Plane, tuple[Check, ...]]:
     except CalibrationError as error:
         raise StepError(f"the board is not seen: {error.what}") from None
     if (before := _before_first_mark(run)) is not None:
-        _check_view(before, image, plane, run.rig.config.paper.size_mm)
+        _check_view(before, image, plane, run.rig.config.paper)
     run.view = plane
     limits = run.rig.config.quality
     frame = check_frame(image, plane, limits)
@@ -154,7 +144,13 @@ def _before_first_mark(run: RunContext) -> BoardResult | None:
     return None
 
 
-def _check_view(before: BoardResult, image: Gray, plane: Plane, sheet_mm: tuple[float, float]) -> None:
+def _corners_mm(paper: PaperConfig) -> NDArray[np.float64]:
+    """(4, 2) corners of the sheet, in the paper frame."""
+    width_mm, height_mm = paper.size_mm
+    return np.array([[x_mm, y_mm] for x_mm in (0.0, width_mm) for y_mm in (0.0, height_mm)])
+
+
+def _check_view(before: BoardResult, image: Gray, plane: Plane, paper: PaperConfig) -> None:
     """Raise `NeedsOperator` unless frame size and place of the board are those of the session's other strokes."""
     height_px, width_px = image.shape
     if (size_px := before.size_px) != (width_px, height_px):
@@ -163,7 +159,7 @@ def _check_view(before: BoardResult, image: Gray, plane: Plane, sheet_mm: tuple[
             "began: set it back (camera.locked in rig.toml), or start a new session with --new."
         )
     seen_mm = plane.to_paper(np.array(before.sheet_px))
-    moved_mm = float(np.linalg.norm(seen_mm - _corners_mm((0.0, 0.0), sheet_mm), axis=1).max())
+    moved_mm = float(np.linalg.norm(seen_mm - _corners_mm(paper), axis=1).max())
     if moved_mm > MOVED_MM:
         raise NeedsOperator(
             f"the board is seen {moved_mm:.1f} mm from where it was when the session began, at most {MOVED_MM:g} mm: "
@@ -247,7 +243,7 @@ async def capture(context: StepContext, step: CaptureStep) -> CaptureResult:
         image, verdict = await looking  # a dip for a retake goes to the well by itself
     kept, retake = await decide(run, press, verdict, image, patch)
     if kept:
-        context.recorder.stroke(_stroke(step, patch, still))
+        context.recorder.event(Topic.STROKE, _stroke(step, patch, still), still)
     else:
         run.progress.not_kept()
     cause = None if verdict is None else verdict.cause
@@ -272,7 +268,7 @@ async def _looked_at(
     verdict = None
     if run.rig.config.quality.enabled:
         verdict = await uninterrupted(_judge, run, step, image, patch)
-        context.recorder.quality(Quality(stroke_id=stroke_id, checks=verdict.checks), still)
+        context.recorder.event(Topic.QUALITY, Quality(stroke_id=stroke_id, checks=verdict.checks), still)
         if verdict.cause is not None:
             run.progress.log(f"{stroke_id}: {verdict.reason}", warning=True)
             if Failure(verdict.cause.name).of_picture:
@@ -297,13 +293,12 @@ def _judge(run: RunContext, step: CaptureStep, image: Gray, patch: Patch) -> Ver
 
 
 def _show(context: StepContext, step: CaptureStep, verdict: Verdict | None, image: Gray, patch: Patch) -> None:
-    photo = binary = None
-    with contextlib.suppress(BadPicture):
-        photo, binary = pictures_of(image, context.run.image_plane(image), patch)
-    brush, press = context.run.rig.config.brush, step.press
+    run = context.run
+    photo, binary = pictures_of(image, run.view, patch)
+    brush, press = run.rig.config.brush, step.press
     published = FittedPress(brush.radius_mm, brush.length_mm)
     model = None if step.drawn else mark_of(published, press.condition)
-    context.run.progress.show(LastCapture(press, context.attempt.serial, True, verdict, photo, binary, model))
+    run.progress.show(LastCapture(press, context.attempt.serial, True, verdict, photo, binary, model))
 
 
 def _stroke(step: CaptureStep, patch: Patch, still: int) -> Stroke:
@@ -326,25 +321,17 @@ def _stroke(step: CaptureStep, patch: Patch, still: int) -> Stroke:
 # What a screen shows of a capture
 
 
-FINE = 8
-"""Points per pixel and axis at which the model's mark is evaluated."""
-
-
 def mark_of(brush: FittedPress, condition: Condition) -> NDArray[np.bool_] | None:
     """Mark of a brush, (128, 128) on the default field; None if the model gives none there. Takes a few ms.
 
     A brush of which only radius and length are given leaves the mark of CCD-BSM as published.
     """
-    left, top = ANCHOR_MM
-    centres = (np.arange(FINE * SIZE_PX) + 0.5) * (MM_PER_PX / FINE)
+    grid = field_grid()
     try:
-        upper, lower = brush.edges_at(condition.depth_mm, condition.tilt_deg, np.asarray(centres - left, np.float64))
+        chance = brush.chance(condition.depth_mm, condition.tilt_deg, grid.x_mm, grid.y_mm, MM_PER_PX)
     except ValueError:
         return None
-    up_mm = (top - centres)[:, None]
-    edge_mm = np.asarray(np.where(up_mm > 0.0, upper, lower), np.float64)
-    fine = np.abs(up_mm) <= edge_mm
-    return np.asarray(fine.reshape(SIZE_PX, FINE, SIZE_PX, FINE).mean(axis=(1, 3)) > 0.5)
+    return np.asarray(chance > 0.5)
 
 
 def pictures_of(image: Gray, plane: Plane, patch: Patch) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:

@@ -43,39 +43,25 @@ step; `asking` waits for a person, with the arm at rest."""
 FINAL = frozenset({State.STOPPED, State.FAILED, State.DONE})
 
 
-class IllegalTransition(Exception):
-    """The engine tried a transition that is not in the table, which is a bug."""
-
-
 class RunControl:
     """State of a run and the requests from keys, under one lock. Talks to no device."""
 
-    def __init__(self, doing: Callable[[str], None]) -> None:
-        """`doing` is called with what the run is doing, in words."""
-        self._doing = doing
+    def __init__(self) -> None:
         self._lock = threading.Lock()
         self._state = State.IDLE
         self._loop: asyncio.AbstractEventLoop | None = None
         self._go_on = asyncio.Event()
         self._stop_wanted = False
         self._pause_wanted = False
-        self._park_wanted = False
-        self._closing = False
+        self.park_wanted = False
+        """Whether the run is to end before the next step."""
+        self.closing = False
+        """Whether everything is collected and the arm parked; the run then ends by itself."""
 
     @property
     def state(self) -> State:
         """What the run is doing."""
         return self._state
-
-    @property
-    def park_wanted(self) -> bool:
-        """Whether the run is to end before the next step."""
-        return self._park_wanted
-
-    @property
-    def closing(self) -> bool:
-        """Whether everything is collected and the arm parked; the run then ends by itself."""
-        return self._closing
 
     def entered(self, task: asyncio.Task[None]) -> None:
         """Note that the engine's event loop runs `task`; cancel it if a stop was requested before."""
@@ -95,7 +81,7 @@ class RunControl:
             self._stop_wanted = True
             if self._loop is None or self._state in FINAL:
                 return
-            if self._state != State.STOPPING and not self._closing:
+            if self._state != State.STOPPING and not self.closing:
                 self._set(State.STOPPING)
             self._loop.call_soon_threadsafe(act)
 
@@ -117,7 +103,7 @@ class RunControl:
     def park(self) -> None:
         """End the run before the next step; from any thread."""
         with self._lock:
-            self._park_wanted = True
+            self.park_wanted = True
             self._wake()
 
     async def pause_point(self) -> None:
@@ -126,11 +112,10 @@ class RunControl:
             if self._state != State.PAUSING:
                 return
             self._set(State.PAUSED)
-        self._doing("paused")
         while True:
             self._go_on.clear()
             with self._lock:
-                if self._park_wanted or not self._pause_wanted:
+                if self.park_wanted or not self._pause_wanted:
                     self._change(State.RUNNING)
                     return
             await self._go_on.wait()
@@ -149,7 +134,7 @@ class RunControl:
         """Ignore stops from now on: one would lose the merge. Raises `CancelledError` if one was already requested."""
         with self._lock:
             self._refuse_after_a_stop()
-            self._closing = True
+            self.closing = True
 
     def end(self, state: State) -> None:
         """End the run in a final state."""
@@ -173,5 +158,5 @@ class RunControl:
 
     def _set(self, new: State) -> None:
         if new not in TRANSITIONS[self._state]:
-            raise IllegalTransition(f"{self._state} -> {new}")
+            raise RuntimeError(f"{self._state} -> {new} is not in the table of transitions")
         self._state = new

@@ -74,7 +74,7 @@ class Engine:
         self._asker = Asker(watched=bool(self._request.on_screen), waiting=self._waiting)
         self._telemetry = Telemetry()
         self._requests = OperatorRequests()
-        self._control = RunControl(self._progress.doing)
+        self._control = RunControl()
         self._task: asyncio.Task[None] | None = None
         self._stopper: asyncio.Task[None] | None = None
         self._rig: Rig | None = None
@@ -242,16 +242,14 @@ class Engine:
                     self._progress.log(f"live view: {live.url}")
                 shows = ([self._telemetry.frame] if self._request.on_screen else []) + ([live.frame] if live else [])
                 self._run = Run(
-                    rig=rig,
-                    protocol=self._opening.protocol,
-                    store=store,
-                    progress=self._progress,
-                    asker=self._asker,
-                    requests=self._requests,
-                    control=self._control,
-                    telemetry=self._telemetry,
-                    live=live,
-                    guided=self._request.guided,
+                    self._opening,
+                    rig,
+                    store,
+                    self._progress,
+                    self._control,
+                    self._asker,
+                    self._requests,
+                    self._telemetry,
                 )
                 async with each_frame(rig.camera, shows):
                     await self._run.carry_out()

@@ -18,11 +18,13 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from brushloop.calibrate.board.pix2len import Plane, see_board
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.stroke import Gray
+from brushloop.collect.engine.control import RunControl
+from brushloop.collect.engine.live import Telemetry
+from brushloop.collect.engine.open_or_resume import Opening
 from brushloop.collect.engine.snapshot import Progress
-from brushloop.collect.errors import BadPicture, ConfigError, ForceTooHigh, StepError, describe
+from brushloop.collect.errors import ConfigError, ForceTooHigh, StepError, describe
 from brushloop.collect.motion import Procedures
 from brushloop.collect.operator import Asker, OperatorRequests
-from brushloop.collect.protocols.config import ProtocolConfig
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import Rig
 from brushloop.collect.rig.paper import Patch, Sheet
@@ -34,7 +36,7 @@ from brushloop.drivers.host import Clock, finished
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.mcap_writer import Outgoing, SegmentWriter
 from brushloop.sessions.messages import encode_png, image_message, pose_message
-from brushloop.sessions.records import Event, InkState, Quality, Stroke, Topic, Wrench
+from brushloop.sessions.records import Event, Topic, Wrench
 from brushloop.sessions.store import Attempt, SessionStore
 
 if TYPE_CHECKING:
@@ -152,10 +154,6 @@ class Recorder:
         wrench = Wrench(fx_n=fx, fy_n=fy, fz_n=fz, mx_nm=mx, my_nm=my, mz_nm=mz)
         self._sample(Topic.WRENCH, sample.stamp, wrench)
 
-    def ink(self, level: float | None, dosed_ml: float, light: float | None) -> None:
-        """Record the state of the well before a dip."""
-        self._now(Topic.INK, InkState(level=level, dosed_ml=dosed_ml, light=light))
-
     def paper(self, origin_mm: tuple[float, float, float], quaternion: tuple[float, float, float, float]) -> None:
         """Record where the paper's frame lies in the base frame; metres on disk, and (x, y, z, w)."""
         message, now_ns = FrameTransforms(), self._clock.now_ns()
@@ -185,28 +183,21 @@ class Recorder:
         message.timestamp.FromNanoseconds(now_ns)
         self._put(Topic.CALIBRATION, now_ns, now_ns, 0, message)
 
-    def quality(self, quality: Quality, number: int) -> None:
-        """Record the checks of the stroke on still `number`."""
-        self._now(Topic.QUALITY, quality, number)
-
     def still(self, frame: Frame, number: int) -> None:
         """Record a lossless still; `number` is unique in the session. Encoding takes tens of ms: call in a thread."""
         stamp = frame.stamp
         message = image_message(stamp.host_ns, encode_png(frame.image))
         self._put(Topic.STILL, self._clock.now_ns(), stamp.host_ns, number, message)
 
-    def stroke(self, stroke: Stroke) -> None:
-        """Record a captured stroke; call it after its still."""
-        self._now(Topic.STROKE, stroke, stroke.still)
-
-    def log(self, text: str, *, warning: bool = False) -> None:
+    def log(self, text: str) -> None:
         """Record a line of the log."""
         now_ns = self._clock.now_ns()
-        message = Log(level=Log.WARNING if warning else Log.INFO, message=text, name="brushloop")
+        message = Log(level=Log.INFO, message=text, name="brushloop")
         message.timestamp.FromNanoseconds(now_ns)
         self._put(Topic.LOG, now_ns, now_ns, 0, message)
 
-    def _now(self, topic: Topic, event: Event, sequence: int = 0) -> None:
+    def event(self, topic: Topic, event: Event, sequence: int = 0) -> None:
+        """Record what is known now; `sequence` is the number of the still that it is about, if any."""
         now_ns = self._clock.now_ns()
         self._put(topic, now_ns, now_ns, sequence, event)
 
@@ -231,39 +222,41 @@ class Recorder:
             self._show(outgoing)
 
 
-@dataclass(slots=True, kw_only=True)
+@dataclass(slots=True)
 class RunContext:
-    """The rig, the session and the operator, for the length of a run, and in what state brush, well and view are.
+    """The rig, the session and the operator, for the length of a run, and in what state brush and view are.
 
     A new process knows nothing of that state.
     """
 
+    opening: Opening
     rig: Rig
-    protocol: ProtocolConfig
     store: SessionStore
     progress: Progress
+    control: RunControl
     asker: Asker
     requests: OperatorRequests
+    telemetry: Telemetry
+    """Gets every force."""
     procedures: Procedures = field(init=False)
     sheet: Sheet = field(init=False)
+    view: Plane = field(init=False)
+    """Where the paper lies in the newest frame in which the board was seen. Set by the BOARD step that comes before the
+    first dip of every process, and raises if no board is seen."""
     left_ink_ns: int | None = None
     """Host time at which the brush left the ink; None if it has marked since or may have lost its ink."""
-    view: Plane | None = None
-    """Where the paper lies in the newest frame in which the board was seen."""
-    view_of: tuple[Gray, Plane] | None = None
-    """The frame that was last searched for the board, and its plane: a capture is judged, then shown."""
     sound_frame: Gray | None = None
     """Newest valid gray photograph of the current sheet."""
     looked_at_sheet: int | None = None
     """Sheet whose free patches were seen to be blank."""
     dips: int = 0
-    """Times that the well was filled up for a dip since the run began."""
+    """Times that the well was filled up for a dip since the run began: a dip that fails is not paid for twice."""
     light: float | None = None
     """Light of the ink station as it was set; None without one."""
 
     def __post_init__(self) -> None:
         self.procedures = Procedures(self.rig)
-        self.sheet = sheet_of(self.rig.config, self.protocol)
+        self.sheet = sheet_of(self.rig.config, self.opening.protocol)
 
     def used_patches(self) -> set[int]:
         """Patches of the current sheet on which any mark was started, or which zero touch may ink."""
@@ -272,29 +265,16 @@ class RunContext:
         return marked | touched_patches(self.sheet, config.paper, config.touch)
 
     def image_plane(self, image: Gray) -> Plane:
-        """Where the paper lies in this frame: from the board in it, else from the newest frame that showed one.
-
-        Raises `BadPicture` if none did.
-        """
-        if self.view_of is not None and self.view_of[0] is image:
-            return self.view_of[1]
-        try:
+        """Where the paper lies in this frame: from the board in it, else from the newest frame that showed one."""
+        with contextlib.suppress(CalibrationError):
             self.view = see_board(image, self.rig.config.board)
-        except CalibrationError as error:
-            if self.view is None:
-                raise BadPicture(f"the board is not seen: {error.what}") from None
-        self.view_of = image, self.view
         return self.view
-
-    def forget_camera(self) -> None:
-        """Measure the camera's delay again before the next photograph: a person may have changed what it sees."""
-        self.procedures.photographer.forget()
 
     def fresh_sheet(self) -> None:
         """Record that a person has put a fresh sheet in."""
         self.store.fresh_sheet()
         self.sound_frame = None
-        self.forget_camera()
+        self.procedures.photographer.forget()
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,12 +7,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
-from collections.abc import Awaitable, Callable, Generator
+from collections.abc import Generator
 from dataclasses import dataclass, field
 
 from brushloop.collect.engine import brush, capture
-from brushloop.collect.engine.control import RunControl, State
-from brushloop.collect.engine.live import LiveView, Telemetry
+from brushloop.collect.engine.control import State
 from brushloop.collect.engine.policy import (
     GO_ON,
     STOP,
@@ -47,27 +46,20 @@ HEIGHTS = MARKING | {StepKind.ZERO_TOUCH, StepKind.TOUCH}
 """Steps whose heights count only if the tool is still the one that was set, and the poses came in time."""
 
 
-@dataclass(slots=True, kw_only=True)
+@dataclass(slots=True)
 class Run(RunContext):
     """One run of a protocol in one process."""
 
-    control: RunControl
-    telemetry: Telemetry
-    """Gets every force."""
-    live: LiveView | None = None
-    """Is shown every message that is recorded."""
-    guided: bool = False
-    """A person accepts what each set-up step measured before it counts."""
     done: set[str] = field(default_factory=set[str])
     """Keys of the steps that this process has done."""
+    enabled: bool = False
+    """Whether this run has set power and tool of the arm, and no person has handled the arm since."""
 
     async def carry_out(self) -> None:
         """Power on, retreat, do every step that is not in the journal yet, repeat what was marked bad, park."""
-        protocol = steps_on(self.rig.config, self.protocol)
-        self.progress.doing("power on")
-        await self._once_arm_is_free(self.rig.robot.enable)
-        await self._once_arm_is_free(self._recover)
-        await self._walk(board_first(protocol) if self.guided else protocol)
+        protocol = steps_on(self.rig.config, self.opening.protocol)
+        await self._retreat()
+        await self._walk(board_first(protocol) if self.opening.request.guided else protocol)
         for number in itertools.count():
             step = steps.ReviewStep(number)
             if step.key not in self.store.state.done and not capture.marked_bad(self):
@@ -76,7 +68,7 @@ class Run(RunContext):
             assert isinstance(reviewed, ReviewResult)
             for again in reviewed.again:
                 await self._walk(takes(self.progress.planned(again.index)))
-        await self._once_arm_is_free(self._recover)  # the arm may have left for a dip that does not follow
+        await self._retreat()  # the arm may have left for a dip that does not follow
 
     async def _walk(self, protocol: Protocol) -> None:
         step = next(protocol)
@@ -84,29 +76,21 @@ class Run(RunContext):
             while True:
                 step = protocol.send(await self._result(step))
 
-    async def _once_arm_is_free(self, act: Callable[[], Awaitable[None]], *, released: bool = False) -> None:
-        """Run `act` between steps. If the arm is stopped, was moved by another client or is outside the limits, ask a
-        watching person to release it, and try again.
-
-        `released`: a person has handled the arm; first set its power and tool again.
-        """
+    async def _retreat(self) -> None:
+        """Lift and park between steps. If the arm is stopped, was moved by another client or is outside the limits, ask
+        a watching person to release it, and try again."""
         while True:
             try:
-                if released:
-                    await self.rig.robot.enable()
-                return await act()
+                return await self._recover()
             except (MotionError, LimitExceeded) as error:
-                if not self.asker.watched:
-                    raise
                 await self._ask(error)
-                released = True
 
     async def _result(self, step: Step) -> StepResult:
         """Return the result of a step: from the journal if it is done, else by doing it until it succeeds."""
         known = self.store.state.done.get(step.key)
         if known is not None and (not step.run_scoped or step.key in self.done):
             return known.result
-        failures, asked = 0, self.guided and in_set_up(step)
+        failures, asked = 0, self.opening.request.guided and in_set_up(step)
         while True:
             await self._between(step)
             try:
@@ -115,7 +99,7 @@ class Run(RunContext):
                 if answer == GO_ON:
                     self.done.add(step.key)
                     return result
-                self.forget_camera()
+                self.procedures.photographer.forget()
                 step = by_method(step, answer)
             except (StepError, DeviceError) as error:
                 if isinstance(error, NeedsOperator) and self.control.park_wanted:
@@ -131,8 +115,7 @@ class Run(RunContext):
                 if action is Action.ASK:
                     await self._ask(error)
                     failures = 0
-                released = action is Action.ASK and isinstance(error, MotionError)
-                await self._once_arm_is_free(self._recover, released=released)
+                await self._retreat()
             except SessionError as error:
                 await self._lift(error)  # the disk is at fault, the arm is in order
                 raise
@@ -142,6 +125,8 @@ class Run(RunContext):
         change the sheet or find the paper again if asked to."""
         if self.control.park_wanted:
             await self._park()
+        if self.control.state is State.PAUSING:
+            self.progress.doing("paused")
         await self.control.pause_point()
         await self._back_in_control()
         if isinstance(step, steps.DipStep) and self.requests.take(OperatorRequest.NEW_SHEET):
@@ -154,43 +139,36 @@ class Run(RunContext):
     async def _back_in_control(self) -> None:
         """Retreat along the tool axis if the arm is not where it was left: somebody may have moved it during a pause
         or a question, or with another client."""
-        released = False
         try:
             return await self.rig.robot.confirm()
-        except ArmMoved:
-            pass
         except MotionError as error:
-            if not self.asker.watched:
-                raise
-            await self._ask(error)
-            released = True
-        await self._once_arm_is_free(self._recover, released=released)
+            if not isinstance(error, ArmMoved):
+                await self._ask(error)
+        await self._retreat()
 
     async def _park(self) -> None:
-        await self._once_arm_is_free(self._recover)
+        await self._retreat()
         raise Parked("parked on request; the same command resumes from here")
 
     async def _new_sheet(self) -> None:
         sheet = self.store.state.sheet
         text = f"Replace sheet {sheet + 1} by a blank one, then go on."
         choices = (Choice(GO_ON, f"the blank sheet lies there: it becomes sheet {sheet + 2}"), KEEP_SHEET)
-        await self._once_arm_is_free(self._recover)
+        await self._retreat()
         if await self.asker.ask_or_default(Prompt(text, choices, KEEP_SHEET.key)) == GO_ON:
             self.fresh_sheet()
-        await self._once_arm_is_free(self._recover)
+        await self._retreat()
 
     async def _touch_again(self, step: Step) -> None:
         """Zero touch by jog between two strokes; if it fails, the plane stays as it was."""
         touch = steps.ZeroTouchStep(step.index + 1, method="jog", between_strokes=True)
-        released = False
         try:
             await self.perform(touch)
         except (StepError, DeviceError) as error:
             self.progress.log(f"zero touch by jog: {error} The previous height of the paper is kept.", warning=True)
             if arm_at_fault(error):
                 await self._ask(error)
-                released = isinstance(error, MotionError)
-        await self._once_arm_is_free(self._recover, released=released)
+        await self._retreat()
 
     async def _ask_about(self, result: StepResult) -> str:
         """Let a person accept what a set-up step measured. Raises `Parked` if the answer is to stop."""
@@ -200,7 +178,9 @@ class Run(RunContext):
         return answer
 
     async def _ask(self, error: StepError | DeviceError) -> None:
-        """Let a person decide after `error`; raise an error if the answer is to stop."""
+        """Let a person decide after `error`; raise an error if nobody watches or the answer is to stop."""
+        if not self.asker.watched:
+            raise error
         in_order = False
         if not arm_at_fault(error):
             with contextlib.suppress(StepError, DeviceError):
@@ -214,7 +194,9 @@ class Run(RunContext):
             if in_order:
                 raise Parked(f"stopped at a question, parked: {describe(error)}") from error
             raise error
-        self.forget_camera()
+        self.procedures.photographer.forget()  # a person may have changed what the camera sees
+        if isinstance(error, MotionError | LimitExceeded):
+            self.enabled = False
         if isinstance(error, SheetFull):
             self.fresh_sheet()
 
@@ -228,6 +210,10 @@ class Run(RunContext):
             error.add_note(f"The brush could not be lifted: {describe(failure)}")
 
     async def _recover(self) -> None:
+        if not self.enabled:
+            self.progress.doing("power on")
+            await self.rig.robot.enable()
+            self.enabled = True
         self.control.move_to(State.RECOVERING)
         self.progress.doing("retreat")
         try:
@@ -250,7 +236,7 @@ class Run(RunContext):
             self.sheet.free(used, sheet)  # a brush full of ink does not wait for a fresh sheet
         patches = patches_of(step, self.sheet, used, sheet)
         attempt = store.begin(step.key, step.kind, patches=tuple(patch.index for patch in patches), press=press)
-        self.progress.begun(step)
+        self.progress.count()
         try:
             with self._observed(attempt) as (recorder, guard):
                 result = await self._do(step, StepContext(self, patches, attempt, recorder, guard))
@@ -272,7 +258,8 @@ class Run(RunContext):
     @contextlib.contextmanager
     def _observed(self, attempt: Attempt) -> Generator[tuple[Recorder, ForceGuard]]:
         """Within the block, record the poses and forces of an attempt, and show them to whoever watches."""
-        rig, show = self.rig, None if self.live is None else self.live.offer
+        rig, live = self.rig, self.opening.request.live
+        show = None if live is None else live.offer
         recorder = Recorder(attempt.writer, rig.clock, show)
         if show is not None:
             show(step_message(attempt.begin))
@@ -315,10 +302,8 @@ class Run(RunContext):
                 return await capture.board(context)
             case steps.DipStep():
                 return await brush.dip(context)
-            case steps.PressStep():
-                return await brush.press(context, step)
-            case steps.DrawStep():
-                return await brush.draw(context, step)
+            case steps.PressStep() | steps.DrawStep():
+                return await brush.mark(context, step)
             case steps.CaptureStep():
                 return await capture.capture(context, step)
             case steps.ReviewStep():

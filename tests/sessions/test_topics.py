@@ -41,7 +41,7 @@ def each(make):
     outgoing = [Outgoing(topic, t_ns, t_ns, n, message) for n, (topic, message) in enumerate(messages.items())]
     recorder = Recorder(SimpleNamespace(write=outgoing.append), HostClock())
     recorder.paper((400.0, -100.0, 5.0), (0.0, 0.0, 0.0, 1.0))
-    recorder.log("brush is dry", warning=True)
+    recorder.log("brush is dry")
     pose = Pose(1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0)
     recorder.pose(PoseSample(Stamp(t_ns, None, 0), pose, joints_rad=(0.0, 1.0, 2.0, 3.0, 4.0, 5.0)))
     return [*outgoing, make.still(0), make.stroke(0)]
@@ -85,7 +85,7 @@ def test_any_viewer_decodes_them_from_the_schemas_in_the_file(make, tmp_path, ea
     assert (transform.parent_frame_id, transform.translation.x, transform.rotation.w) == ("base", 0.4, 1.0)
     assert (decoded["/camera/preview"].format, decoded["/camera/still"].format) == ("jpeg", "png")
     assert decoded["/camera/still"].data == make.png(0)
-    assert (decoded["/log"].message, decoded["/log"].level) == ("brush is dry", 3)
+    assert (decoded["/log"].message, decoded["/log"].level) == ("brush is dry", 2)
 
 
 LAYOUT = Path(__file__).parents[2] / "docs" / "foxglove-layout.json"
