@@ -258,7 +258,7 @@ class Run(RunContext):
     @contextlib.contextmanager
     def _observed(self, attempt: Attempt) -> Generator[tuple[Recorder, ForceGuard]]:
         """Within the block, record the poses and forces of an attempt, and show them to whoever watches."""
-        rig, live = self.rig, self.opening.request.live
+        rig, live = self.rig, self.opening.live
         show = None if live is None else live.offer
         recorder = Recorder(attempt.writer, rig.clock, show)
         if show is not None:
