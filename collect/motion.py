@@ -42,14 +42,9 @@ class Path:
     speed_mm_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class Region:
-    """The outermost poses of the region in which a touch that decides by itself may move the upright brush."""
-
-    poses: tuple[Pose, ...]
-    """Lowest first."""
-    speed_mm_s: float
-    """Highest speed of any move in the region."""
+class Region(Path):
+    """The outermost poses, lowest first, of the region in which a touch that decides by itself may move the upright
+    brush; and the highest speed of any move there."""
 
     @classmethod
     def over(
@@ -59,10 +54,10 @@ class Region:
         x_mm, y_mm, size_x_mm, size_y_mm = rect_mm
         places = dict.fromkeys((x, y) for x in (x_mm, x_mm + size_x_mm) for y in (y_mm, y_mm + size_y_mm))
         heights = (lowest_z_mm, config.motion.safe_z_mm)
-        return cls(tuple(touching(config, *place, z_mm) for z_mm in heights for place in places), speed_mm_s)
+        return cls([touching(config, *place, z_mm) for z_mm in heights for place in places], speed_mm_s)
 
 
-Segment = Move | Path | Region
+Segment = Move | Path
 Dip = Callable[[], Awaitable[None]]
 """Fills the brush; begins and ends at travel height."""
 
@@ -138,7 +133,7 @@ def wash_moves(config: RigConfig, wash: WashConfig) -> list[Move]:
 
 
 def press_moves(
-    config: RigConfig, plane: PaperPlane, patch: Patch, condition: Condition, dwell_s: float = 0.0
+    config: RigConfig, plane: PaperPlane, patch: Patch, condition: Condition, dwell_s: float
 ) -> tuple[list[Move], list[Move]]:
     """Two lists: over the patch, and down to clearance while the brush tilts; down to touch height and by H, dwell, up.
 
@@ -167,7 +162,7 @@ def press_moves(
 
 def stroke_moves(
     config: RigConfig, plane: PaperPlane, patch: Patch, points: Sequence[TrajectoryPoint], speed_mm_s: float
-) -> list[Move | Path]:
+) -> list[Segment]:
     """Over the first point with the wrist turned as the stroke begins, tilt just above the paper, land, follow, lift.
 
     Points are in the patch's frame: origin at its lower left corner, axes along the sheet's.
@@ -276,12 +271,17 @@ class Procedures:
         self._dips = 0
         self.photographer = Photographer(rig, self.go, over_sheet_move(rig.config), *park_moves(rig.config))
 
-    async def go(self, *moves: Move) -> None:
-        """Make moves one after the other, each when the arm rests after the one before."""
-        acc_mm_s2 = self._config.motion.acc_mm_s2
-        for move in moves:
-            self.target_mm = move.target.position_mm
-            await self.rig.robot.move(move.target, speed_mm_s=move.speed_mm_s, acc_mm_s2=acc_mm_s2)
+    async def go(self, *segments: Segment) -> None:
+        """Make moves and follow paths one after the other, each when the arm rests after the one before."""
+        robot, acc_mm_s2 = self.rig.robot, self._config.motion.acc_mm_s2
+        for segment in segments:
+            speed_mm_s = segment.speed_mm_s
+            if isinstance(segment, Move):
+                self.target_mm = segment.target.position_mm
+                await robot.move(segment.target, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
+            else:
+                self.target_mm = segment.poses[-1].position_mm
+                await robot.follow(segment.poses, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2, blend_mm=BLEND_MM)
 
     async def queue(self, moves: Sequence[Move]) -> list[Pose]:
         """Send all moves to the controller before the first begins; it then ends them whatever happens to this program.
@@ -375,15 +375,11 @@ class Procedures:
 
         Returns the depth at which the brush landed, in mm.
         """
-        robot, acc_mm_s2, depth_mm = self.rig.robot, self._config.motion.acc_mm_s2, 0.0
-        for segment in stroke_moves(self._config, self.plane, patch, drawn.strokes[number], drawn.speed_mm_s):
-            if isinstance(segment, Move):
-                await self.go(segment)
-            else:
-                depth_mm = -self.plane.above_mm(self._config.paper, await robot.where())
-                poses, speed_mm_s = segment.poses, segment.speed_mm_s
-                self.target_mm = poses[-1].position_mm
-                await robot.follow(poses, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2, blend_mm=BLEND_MM)
+        moves = stroke_moves(self._config, self.plane, patch, drawn.strokes[number], drawn.speed_mm_s)
+        *down, path, lift, up = moves
+        await self.go(*down)
+        depth_mm = -self.plane.above_mm(self._config.paper, await self.rig.robot.where())
+        await self.go(path, lift, up)
         return depth_mm
 
     async def capture(self) -> Frame:

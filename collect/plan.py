@@ -13,8 +13,8 @@ from pydantic import TypeAdapter
 from rich.console import Group
 from rich.table import Table
 
+from brushloop.collect.motion import Move, Region, park_moves
 from brushloop.collect.motion import Path as MotionPath
-from brushloop.collect.motion import park_moves
 from brushloop.collect.protocols.config import ProtocolConfig
 from brushloop.collect.protocols.steps import Drawn, DrawStep, PressStep, TouchStep
 from brushloop.collect.rig.check import BLUE, GREY, ORANGE, Axes, finish, from_above, shown_name
@@ -22,7 +22,7 @@ from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import limits_of
 from brushloop.collect.rig.paper import PaperPlane, Sheet, to_base
 from brushloop.collect.touch.selfcheck import partners
-from brushloop.collect.walk import StepMoves, moves_of, poses_of, sheet_of, walk
+from brushloop.collect.walk import StepMoves, moves_of, sheet_of, walk
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import distance
 from brushloop.drivers.limits import Limits
@@ -68,16 +68,17 @@ def path_s(start: Pose, path: MotionPath, acc_mm_s2: float, limits: Limits) -> f
 def step_s(config: RigConfig, here: Pose, moves: StepMoves) -> tuple[float, Pose]:
     """(seconds of a step that begins at `here`, pose at its end)."""
     limits, acc_mm_s2 = limits_of(config), config.motion.acc_mm_s2
-    total_s = moves.dwell_s + moves.captures * (config.camera.latency_ms / 1e3 + FRAME_S)
+    total_s = moves.captures * (config.camera.latency_ms / 1e3 + FRAME_S)
     for segment in moves.segments:
-        if isinstance(segment, MotionPath):
+        if isinstance(segment, Region):
+            # One descent: the number of descents of a measured touch is not known beforehand.
+            segment = Move(segment.poses[0], segment.speed_mm_s)
+        if isinstance(segment, Move):
+            total_s += max(move_s(here, segment.target, segment.speed_mm_s, acc_mm_s2, limits), segment.least_s)
+            here = segment.target
+        else:
             total_s += path_s(here, segment, acc_mm_s2, limits)
             here = segment.poses[-1]
-        else:
-            # Of a region one descent: the number of descents of a measured touch is not known beforehand.
-            target = poses_of(segment)[0]
-            total_s += move_s(here, target, segment.speed_mm_s, acc_mm_s2, limits)
-            here = target
         total_s += SETTLE_S
     return total_s, here
 
@@ -98,7 +99,6 @@ class Plan:
     dips: int
     ink_ml: float | None
     """What the ink device doses; None without a device that doses by count."""
-    poses: int
     seconds: float
     seconds_by_kind: dict[str, float]
     touches_mm: tuple[tuple[float, float], ...]
@@ -118,7 +118,7 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
     seconds: dict[str, float] = {}
     measured = config.touch.method != "taught" and config.touch.points_mm
     touches = list(measured or [config.paper.touch_point_mm])
-    dips = poses = 0
+    dips = 0
     sheets = 1
     plane, here = PaperPlane(config.paper.touch_z_mm), park_moves(config)[-1].target
     for walked in walk(config, protocol):
@@ -128,7 +128,6 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
         took_s, here = step_s(config, here, moves)
         seconds[kind] = seconds.get(kind, 0.0) + took_s
         dips += moves.dips
-        poses += len(moves.poses)
         if isinstance(step, TouchStep):
             touches.append((step.x_mm, step.y_mm))
         if isinstance(step, PressStep | DrawStep):
@@ -145,7 +144,6 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
         sheet_changes=tuple(changes),
         dips=dips,
         ink_ml=None if config.ink.device is None else config.ink.device.doses_ml(dips),
-        poses=poses,
         seconds=sum(seconds.values()),
         seconds_by_kind=seconds,
         touches_mm=tuple(dict.fromkeys(touches)),

@@ -10,7 +10,7 @@ import contextlib
 import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from brushloop.collect.errors import ConfigError, StepError
@@ -62,24 +62,22 @@ from brushloop.sessions.events import PressResult, StepKind, StepResult
 from brushloop.sessions.records import Condition
 
 
-def poses_of(segment: Segment) -> Sequence[Pose]:
-    """Every pose that a segment commands; of a region, the outermost ones."""
-    return (segment.target,) if isinstance(segment, Move) else segment.poses
-
-
 @dataclass(frozen=True, slots=True)
 class StepMoves:
     """The moves of a step in order, and what else in it takes time or ink."""
 
-    segments: list[Segment] = field(default_factory=list[Segment])
-    dwell_s: float = 0.0
+    segments: Sequence[Segment] = ()
     captures: int = 0
     dips: int = 0
 
     @property
     def poses(self) -> list[tuple[Pose, float]]:
         """Every pose that is commanded, with its speed in mm/s; of a `Region`, the outermost poses."""
-        return [(pose, segment.speed_mm_s) for segment in self.segments for pose in poses_of(segment)]
+        return [
+            (pose, segment.speed_mm_s)
+            for segment in self.segments
+            for pose in ([segment.target] if isinstance(segment, Move) else segment.poses)
+        ]
 
 
 def moves_of(
@@ -98,17 +96,17 @@ def moves_of(
         case ZeroTouchStep() | TouchStep():
             return _touches(config, plane, step, dips)
         case DipStep():
-            return StepMoves([*inking_moves(config, dips)], dips=1)
+            return StepMoves(inking_moves(config, dips), dips=1)
         case ReviewStep():
             return StepMoves()
         case BoardStep():
-            return StepMoves([*photograph_moves(config)], captures=1)
+            return StepMoves(photograph_moves(config), captures=1)
         case CaptureStep():
             return StepMoves([*photograph_moves(config), inking_moves(config, dips)[0]], captures=1)
         case PressStep(press=press, dwell_s=dwell_s):
             [patch] = patches
-            down, up = press_moves(config, plane, patch, press.condition)
-            return StepMoves([*down, *up], dwell_s=dwell_s)
+            before, pressing = press_moves(config, plane, patch, press.condition, dwell_s)
+            return StepMoves([*before, *pressing])
         case SelfCheckStep():
             moves = [
                 move

@@ -25,7 +25,7 @@ from brushloop.collect.protocols.steps import MARKING, Drawn, DrawStep, Step, St
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.rig.devices import Rig, limits_of
 from brushloop.collect.rig.paper import PaperPlane, Sheet
-from brushloop.collect.walk import all_poses, check_poses, check_protocol, moves_of, sheet_of, walk
+from brushloop.collect.walk import StepMoves, all_poses, check_poses, check_protocol, moves_of, sheet_of, walk
 from brushloop.drivers.devices import Identity, Pose, QueuedLine
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.config import SimConfig
@@ -292,15 +292,16 @@ def test_a_stroke_may_come_down_on_its_way(config: RigConfig) -> None:
     """Points above the paper: a flying start. The brush is as far above it as asked when the way begins."""
     patch = sheet_of(config, example("protocol-write.toml")).patch(0)
     points = [(10.0, 10.0, -4.0, 3.0, 0.0), (20.0, 10.0, 5.0, 3.0, 0.0), (30.0, 10.0, -4.0, 3.0, 0.0)]
-    *down, path, _, _ = stroke_moves(config, PLANE, patch, points, 15.0)
-    assert [move.target.z_mm for move in down] == pytest.approx([180.0, 132.0, 132.0, 124.0])
-    assert [pose.z_mm for pose in path.poses] == pytest.approx([115.0, 124.0])
+    *down, path, _, _ = (StepMoves([each]) for each in stroke_moves(config, PLANE, patch, points, 15.0))
+    assert [move.poses[0][0].z_mm for move in down] == pytest.approx([180.0, 132.0, 132.0, 124.0])
+    assert [pose.z_mm for pose, _ in path.poses] == pytest.approx([115.0, 124.0])
 
 
 def test_the_wrist_turns_where_the_brush_is_upright_and_high(config: RigConfig) -> None:
     patch = sheet_of(config, example("protocol-write.toml")).patch(0)
-    [high, clear, *_] = stroke_moves(config, PLANE, patch, first_drawn(config).strokes[1], 15.0)
-    assert high.target.quaternion == pytest.approx(clear.target.quaternion)
+    moves = stroke_moves(config, PLANE, patch, first_drawn(config).strokes[1], 15.0)
+    [(high, _), (clear, _), *_] = StepMoves(moves).poses
+    assert high.quaternion == pytest.approx(clear.quaternion)
 
 
 # Every target that reaches the arm's queue is one that the plan has checked, for every kind of protocol
