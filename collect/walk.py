@@ -45,7 +45,6 @@ from brushloop.collect.protocols.steps import (
     TouchStep,
     ZeroTouchStep,
     press_of,
-    with_self_check,
 )
 from brushloop.collect.rig.config import BrushConfig, PaperConfig, RigConfig, TouchConfig
 from brushloop.collect.rig.devices import limits_of
@@ -187,8 +186,7 @@ def sheet_of(config: RigConfig, protocol: ProtocolConfig) -> Sheet:
 
 def steps_on(config: RigConfig, protocol: ProtocolConfig) -> Protocol:
     """The steps as this rig runs them: balanced over its sheet, with the self-check if it is on."""
-    steps = protocol.steps(sheet_of(config, protocol))
-    return with_self_check(steps) if config.self_check.enabled else steps
+    return protocol.steps(sheet_of(config, protocol), self_check=bool(config.self_check.enabled))
 
 
 def as_planned(step: Step, sheet: int, patch: int) -> StepResult | None:

@@ -1,6 +1,6 @@
 """Reads `protocol.toml`, a frozen union by `kind`, and its CSV files, whose rows become part of it.
 
-Bad input is refused in one line: file, line, field, allowed range. A new kind is a subclass of `ProtocolBase` in a
+Bad input is refused in one line: file, line, field, allowed range. A new kind is a subclass of `StrokesConfig` in a
 module of its own, and a member of `ProtocolConfig`.
 """
 

@@ -9,7 +9,6 @@ import itertools
 import math
 import random
 from abc import abstractmethod
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Annotated, ClassVar, Literal, Self, TypeVar, cast
@@ -82,26 +81,23 @@ Tilts = Annotated[list[TiltDeg], Field(min_length=1, max_length=100), AfterValid
 Place = tuple[Finite, Finite]
 
 
-class ProtocolBase(Config):
-    """Fields and methods of every kind."""
+class StrokesConfig(Config):
+    """A protocol that presses or draws."""
 
     board_every: Annotated[int, Field(ge=1, le=MAX_STROKES)] | None = None
     """Photograph the board again after this many strokes, to see whether camera or sheet moved; if left out, only at
     the start."""
 
+    @abstractmethod
     def planned(self, layout: Layout | None = None) -> list[Planned]:
-        """Every stroke exactly once, in order; none for a protocol that marks nothing.
+        """Every stroke exactly once, in order. With a `layout`, conditions are spread over the sheet."""
 
-        With a `layout`, conditions are spread over the sheet.
-        """
-        return []
-
-    def steps(self, layout: Layout | None = None) -> Protocol:
+    def steps(self, layout: Layout | None = None, *, self_check: bool = False) -> Protocol:
         """Return the generator of steps. The layout changes the order of the steps, never their keys."""
-        return stroke_steps(self.planned(layout), board_every=self.board_every)
+        return stroke_steps(self.planned(layout), board_every=self.board_every, self_check=self_check)
 
 
-class RoundsConfig(ProtocolBase):
+class RoundsConfig(StrokesConfig):
     """A protocol that presses or draws the same in each of several rounds."""
 
     repeats: Repeats = 1
@@ -118,9 +114,7 @@ class RoundsConfig(ProtocolBase):
         strokes = len(self.round(1)) * self.repeats
         if strokes > MAX_STROKES:
             raise ValueError(f"{strokes} strokes with repeats, at most {MAX_STROKES}")
-        for stroke_id, count in Counter(stroke.stroke_id for stroke in self.planned()).items():
-            if count > 1:
-                raise ValueError(f"{stroke_id!r} occurs twice")
+        distinct([stroke.stroke_id for stroke in self.planned()])
         return self
 
     def planned(self, layout: Layout | None = None) -> list[Planned]:
@@ -146,7 +140,7 @@ class RoundsConfig(ProtocolBase):
 # Presses of a grid
 
 
-class _DesignConfig(ProtocolBase):
+class _DesignConfig(StrokesConfig):
     """Presses of a grid of depths and tilts."""
 
     depths_mm: Depths = Field(validation_alias=EARLIER_DEPTHS)
@@ -187,11 +181,8 @@ class FewStrokesConfig(_DesignConfig):
     def planned(self, layout: Layout | None = None) -> list[Planned]:
         """The presses in the order of the design, which does not depend on the sheet."""
         order = [Condition(depth_mm, tilt_deg) for depth_mm, tilt_deg in spread_out(self.depths_mm, self.tilts_deg)]
-        presses: list[Planned] = []
-        for index in range(self.strokes):
-            again, k = divmod(index, len(order))
-            presses.append(replace(self.press(order[k], again + 1), index=index))
-        return presses
+        presses = [self.press(order[k % len(order)], k // len(order) + 1) for k in range(self.strokes)]
+        return [replace(press, index=k) for k, press in enumerate(presses)]
 
 
 # Presses one by one
@@ -395,7 +386,7 @@ class WriteConfig(RoundsConfig):
         return strokes
 
 
-class CalibrationConfig(ProtocolBase):
+class CalibrationConfig(Config):
     """Touches and views of the board, nothing else: no ink, no mark."""
 
     kind: Literal["calibration"]
@@ -406,14 +397,12 @@ class CalibrationConfig(ProtocolBase):
     board_views: Annotated[int, Field(ge=1, le=100)] = 1
     """How often the board is photographed in each round."""
 
-    @model_validator(mode="after")
-    def _without_strokes(self) -> Self:
-        if self.board_every is not None:
-            raise ValueError("board_every counts strokes, and this protocol has none: use board_views")
-        return self
+    def planned(self, layout: Layout | None = None) -> list[Planned]:
+        """No stroke."""
+        return []
 
-    def steps(self, layout: Layout | None = None) -> Protocol:
-        """Zero touch, then in each round every touch and every view of the board."""
+    def steps(self, layout: Layout | None = None, *, self_check: bool = False) -> Protocol:
+        """Zero touch, then in each round every touch and every view of the board; no self-check, which would mark."""
         yield ZeroTouchStep(0)
         for number in range(self.rounds):
             for k, (x_mm, y_mm) in enumerate(self.touches_mm):

@@ -9,7 +9,6 @@ condition alike. A void press shifts what follows by one patch: only the plan st
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import itertools
 from collections import defaultdict
@@ -163,20 +162,6 @@ MARKING = frozenset({StepKind.PRESS, StepKind.DRAW, StepKind.SELF_CHECK})
 Protocol = Generator[Step, StepResult | None, None]
 """Yields steps and is sent their results, so that later steps can depend on earlier ones; None for a step that was only
 planned and has nothing to tell."""
-KNOWING = frozenset({StepKind.ZERO_TOUCH, StepKind.TOUCH, StepKind.BOARD})
-"""Steps that come before the self-check, which needs paper and board."""
-
-
-def with_self_check(protocol: Protocol) -> Protocol:
-    """The same protocol, with a SELF_CHECK step before the first one that prepares a mark."""
-    step = next(protocol)
-    checked = False
-    with contextlib.suppress(StopIteration):
-        while True:
-            if not checked and step.kind not in KNOWING:
-                yield SelfCheckStep(0)
-                checked = True
-            step = protocol.send((yield step))
 
 
 def press_of(step: Step) -> Press | None:
@@ -222,10 +207,12 @@ def with_review(plan: Iterable[Planned], reviewed: ReviewResult) -> list[Planned
     ]
 
 
-def stroke_steps(plan: Iterable[Planned], *, board_every: int | None) -> Protocol:
-    """Zero touch, board, then dip, press or draw, capture for each stroke of the plan."""
+def stroke_steps(plan: Iterable[Planned], *, board_every: int | None, self_check: bool) -> Protocol:
+    """Zero touch, board, self-check if wanted, then dip, press or draw, capture for each stroke of the plan."""
     yield ZeroTouchStep(0)
     yield BoardStep(0)
+    if self_check:
+        yield SelfCheckStep(0)
     for number, stroke in enumerate(plan):
         if board_every is not None and number > 0 and number % board_every == 0:
             yield BoardStep(number // board_every)

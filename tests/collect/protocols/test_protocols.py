@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections import Counter, defaultdict
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -205,7 +206,7 @@ def test_a_calibration_touches_and_looks_and_leaves_no_mark() -> None:
 
 # Grids and their sheets
 
-GRID = {"depths_mm": [11.0, 13.0, 15.0, 17.0, 20.0], "tilts_deg": [0.0, 5.0, 10.0]}
+GRID: dict[str, Any] = {"depths_mm": [11.0, 13.0, 15.0, 17.0, 20.0], "tilts_deg": [0.0, 5.0, 10.0]}
 
 
 def thirds(plan: list[Planned], layout: Layout) -> dict[Condition, list[float]]:
@@ -349,7 +350,7 @@ def load(folder: Path, protocol: str, csv: str | bytes | None = None):
         (WRITE.replace('"a"', '"a b"') + POINTS, None, r"figures.0.name: .*spaces"),
         ('kind = "write"\ncell_mm = [60.0, 60.0]\nfigures = 3\n', None, r"figures: "),
         (CALIBRATION + "touches_mm = [[1.0, 1.0], [1.0, 1.0]]\n", None, r"touches_mm: \(1.0, 1.0\) occurs twice"),
-        (CALIBRATION + "board_every = 3\n", None, r"use board_views"),
+        (CALIBRATION + "board_every = 3\n", None, r"board_every: unknown field; did you mean board_views"),
         ('kind = "teapot"\n', None, r"kind: .*'grid', 'few-strokes', 'list', 'replay', 'write', 'calibration'"),
         ("x = 1\n", None, r"protocol.toml: kind: "),
         ('kind = "grid"\ndepths_mm = [11.0]\ntilts_deg = [0.0]\nspeed = 3\n', None, r"speed: unknown field"),
