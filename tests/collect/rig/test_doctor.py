@@ -89,7 +89,7 @@ def test_a_rig_in_order_is_reported_with_all_that_was_answered_and_left_as_it_wa
     assert document["platform"]["python"]
     assert document["rig"]["robot"]["tcp_offset_mm"] == [0.0, 0.0, 180.0]
     assert len(rtde["sample"]) == 2
-    lines = Archive.read(report).lines
+    lines = Archive(report).lines
     answered = {line["method"]: line["answer"] for line in lines}
     assert answered["rob1.RobotState.getSafetyModeType"] == {"result": "Normal"}
     assert answered["rob1.MotionControl.getSpeedFraction"]["result"] == 1.0
@@ -142,7 +142,7 @@ def test_on_the_first_day_there_is_no_rig_yet_and_the_archive_holds_what_is_know
     ran = brushloop("doctor", "--config", rig, "--report", report)
     assert ran.returncode == 0, ran.stderr
     assert "new.toml yet" in ran.stdout
-    archive = Archive.read(report)
+    archive = Archive(report)
     answered = {line["method"]: line["answer"] for line in archive.lines}
     assert answered["rob1.RobotState.getSafetyModeType"] == {"result": "Normal"}
     with zipfile.ZipFile(report) as held:

@@ -12,6 +12,8 @@ from brushloop.drivers.arcs.controller import Controller
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.arcs.settings import ArcsTable
 from brushloop.drivers.arcs.wire import RpcConnection
+from brushloop.drivers.devices import Pose
+from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.limits import Limits
 from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
@@ -22,16 +24,62 @@ from tests.simulated_time import LoopClock, SimulatedTimeLoop
 RATE = 20.0
 LIMITS = Limits((-2000.0, 2000.0), (-260.0, 260.0), (95.0, 400.0), tilt_deg=15.0, speed_mm_s=250.0, acc_mm_s2=1000.0)
 MakeArm = Callable[..., AuboArcs]
+NEAR = brush_pose(260.0, -220.0, 250.0)
+QUICK = {"speed_mm_s": 200.0, "acc_mm_s2": 800.0}
 
 
 def pytest_asyncio_loop_factories() -> dict[str, Callable[[], asyncio.AbstractEventLoop]]:
     return {"simulated": SimulatedTimeLoop}
 
 
+class Cabinet(ArcsServer):
+    """The loopback controller, and what tests ask of it."""
+
+    @property
+    def tool(self) -> Pose:
+        """Where the tip is."""
+        return self.cabinet.world.tool()
+
+    @property
+    def taken(self) -> int:
+        """Number of lines that it has taken."""
+        return self.cabinet.world.motion._next_id
+
+    @property
+    def queued(self) -> int:
+        """Number of lines that it holds."""
+        return self.cabinet.queue_size()
+
+    @property
+    def rests(self) -> bool:
+        return self.cabinet.motion.exec_id(self.cabinet.now_s()) == -1
+
+    def answers(self, method: str, answer: object) -> None:
+        """Give this answer to a method of the robot, and do nothing."""
+        self._methods[f"rob1.{method}"] = lambda _: answer
+
+    def before_each(self, method: str, act: Callable[[int], object]) -> None:
+        """Call `act` with the number of the request, from 1, before it is carried out."""
+        carry_out, number = self._methods[f"rob1.{method}"], 0
+
+        def noted(params: dict[str, Any]) -> Any:
+            nonlocal number
+            number += 1
+            act(number)
+            return carry_out(params)
+
+        self._methods[f"rob1.{method}"] = noted
+
+    def refuses_lines(self, code: int, refused: Callable[[dict[str, Any]], bool]) -> None:
+        """Answer lines like these with this code and do not queue them."""
+        move_line = self._methods["rob1.MotionControl.moveLine"]
+        self._methods["rob1.MotionControl.moveLine"] = lambda p: code if refused(p) else move_line(p)
+
+
 @pytest.fixture
-async def cabinet() -> AsyncIterator[ArcsServer]:
+async def cabinet() -> AsyncIterator[Cabinet]:
     """A controller with its power off, 20 times faster than life."""
-    server = ArcsServer(World(SimConfig(rate=RATE), SimClock(RATE, asyncio.get_running_loop().time)))
+    server = Cabinet(World(SimConfig(rate=RATE), SimClock(RATE, asyncio.get_running_loop().time)))
     await server.start(HOST, 0)
     yield server
     await server.stop()
@@ -43,7 +91,7 @@ def notices() -> list[str]:
 
 
 @pytest.fixture
-async def make_arm(cabinet: ArcsServer, notices: list[str]) -> AsyncIterator[MakeArm]:
+async def make_arm(cabinet: Cabinet, notices: list[str]) -> AsyncIterator[MakeArm]:
     """An arm that is not connected, by fields of its table."""
     arms: list[AuboArcs] = []
 
@@ -67,7 +115,7 @@ async def arm(make_arm: MakeArm) -> AuboArcs:
 
 
 @pytest.fixture
-async def other(cabinet: ArcsServer) -> AsyncIterator[Controller]:
+async def other(cabinet: Cabinet) -> AsyncIterator[Controller]:
     """A second client of the same cabinet."""
     client = Controller(RpcConnection(HOST, cabinet.port))
     client.robot = "rob1"

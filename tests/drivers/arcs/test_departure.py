@@ -14,7 +14,6 @@ from brushloop.drivers.arcs.settings import Settings, require_same
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import (
     ArmMoved,
-    LimitExceeded,
     MotionError,
     MotionFailed,
     MotionRefused,
@@ -23,14 +22,11 @@ from brushloop.drivers.errors import (
     SettingsChanged,
 )
 from brushloop.drivers.geometry import brush_pose, distance, from_wire, lean
-from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.kinematics import forward, pose_of
-from tests.drivers.arcs.conftest import MakeArm
+from tests.drivers.arcs.conftest import NEAR, QUICK, Cabinet, MakeArm
 
-NEAR = brush_pose(260.0, -220.0, 250.0)
 ABOVE, LOW = brush_pose(300.0, -200.0, 200.0), brush_pose(300.0, -200.0, 130.0)
 ELSEWHERE = brush_pose(340.0, -180.0, 100.0, tilt_deg=10.0)
-QUICK = {"speed_mm_s": 200.0, "acc_mm_s2": 800.0}
 
 
 async def enabled(make: MakeArm, **options: Any) -> AuboArcs:
@@ -42,17 +38,17 @@ async def enabled(make: MakeArm, **options: Any) -> AuboArcs:
 
 @pytest.mark.parametrize("mode", ["Manual", "Sideways", 7, None])
 async def test_an_arm_that_is_not_on_automatic_is_neither_set_nor_powered(
-    make_arm: MakeArm, cabinet: ArcsServer, mode: object
+    make_arm: MakeArm, cabinet: Cabinet, mode: object
 ):
-    cabinet._methods["rob1.RobotManage.getOperationalMode"] = lambda _: mode
+    cabinet.answers("RobotManage.getOperationalMode", mode)
     with pytest.raises(MotionError, match=f"operational mode is {mode}.*on the pendant"):
         await enabled(make_arm)
     assert cabinet.cabinet.power.mode == RobotMode.POWER_OFF
     assert cabinet.cabinet.tcp_offset == [0.0] * 6
 
 
-async def test_what_is_configured_is_set_in_the_wires_units_and_nothing_moves(make_arm: MakeArm, cabinet: ArcsServer):
-    before = cabinet.cabinet.world.tool()
+async def test_what_is_configured_is_set_in_the_wires_units_and_nothing_moves(make_arm: MakeArm, cabinet: Cabinet):
+    before = cabinet.tool
     await enabled(make_arm, payload_kg=0.4, payload_cog_mm=(0.0, 1.0, 60.0), collision_level=8)
     box = cabinet.cabinet
     assert box.payload == [0.4, [0.0, 0.001, 0.06], [0.0] * 3, [0.0] * 6]
@@ -61,13 +57,13 @@ async def test_what_is_configured_is_set_in_the_wires_units_and_nothing_moves(ma
     assert box.world.tool() == before
 
 
-async def test_reduced_mode_and_a_cabinet_without_operational_modes_are_allowed(make_arm: MakeArm, cabinet: ArcsServer):
+async def test_reduced_mode_and_a_cabinet_without_operational_modes_are_allowed(make_arm: MakeArm, cabinet: Cabinet):
     cabinet.cabinet.operational_mode = "Disabled"
     cabinet.cabinet.power.safety = SafetyMode.REDUCED
     await (await enabled(make_arm)).move(NEAR, **QUICK)
 
 
-async def test_a_brush_that_is_not_square_to_the_flange_is_pressed_upright(make_arm: MakeArm, cabinet: ArcsServer):
+async def test_a_brush_that_is_not_square_to_the_flange_is_pressed_upright(make_arm: MakeArm, cabinet: Cabinet):
     turn = {"tcp_offset_mm": (4.0, -7.0, 180.0), "tcp_rotation_deg": (2.0, -1.5, 0.0)}
     arm = await enabled(make_arm, **turn)
     expected = [0.004, -0.007, 0.18, math.radians(2.0), math.radians(-1.5), 0.0]
@@ -90,9 +86,9 @@ async def test_a_brush_that_is_not_square_to_the_flange_is_pressed_upright(make_
     ],
 )
 async def test_what_the_controller_does_not_take_keeps_the_power_off(
-    make_arm: MakeArm, cabinet: ArcsServer, method: str, code: int, error: type[Exception], words: str
+    make_arm: MakeArm, cabinet: Cabinet, method: str, code: int, error: type[Exception], words: str
 ):
-    cabinet._methods[f"rob1.RobotConfig.{method}"] = lambda _: code
+    cabinet.answers(f"RobotConfig.{method}", code)
     with pytest.raises(error, match=words):
         await enabled(make_arm, payload_kg=0.4, collision_level=8)
     assert cabinet.cabinet.power.mode == RobotMode.POWER_OFF
@@ -113,37 +109,31 @@ async def send(client: Controller, target: Pose) -> None:
     await until_settled(client.rest, target, planned_s=2.0)
 
 
-def lines(cabinet: ArcsServer) -> int:
-    return cabinet.cabinet.world.motion._next_id
-
-
 async def test_an_arm_that_was_moved_is_not_sent_anywhere_until_it_is_taken_up(
-    arm: AuboArcs, other: Controller, cabinet: ArcsServer
+    arm: AuboArcs, other: Controller, cabinet: Cabinet
 ):
     await arm.move(ABOVE, **QUICK)
     await arm.confirm()
     await send(other, ELSEWHERE)
-    sent = lines(cabinet)
+    sent = cabinet.taken
     for refused in (arm.move(LOW, **QUICK), arm.follow([LOW, ABOVE], blend_mm=1.0, **QUICK), arm.confirm()):
         with pytest.raises(ArmMoved, match=r"109\.\d mm and 10\.0 deg from where it was left") as caught:
             await refused
         assert caught.value.off_deg == pytest.approx(10.0, abs=0.01)
-    assert lines(cabinet) == sent
+    assert cabinet.taken == sent
     assert distance(await arm.take_up(), ELSEWHERE)[0] < 0.05
     await arm.move(LOW, **QUICK)
 
 
-async def test_an_arm_that_somebody_moves_right_now_is_not_fought(
-    arm: AuboArcs, other: Controller, cabinet: ArcsServer
-):
+async def test_an_arm_that_somebody_moves_right_now_is_not_fought(arm: AuboArcs, other: Controller, cabinet: Cabinet):
     await arm.move(ABOVE, **QUICK)
     await other.move_line(LOW, 1.0, 800.0)
-    sent = lines(cabinet)
+    sent = cabinet.taken
     for refused in (arm.move(ELSEWHERE, **QUICK), arm.take_up(), arm.confirm()):
         with pytest.raises(ArmMoved, match="Wait until it rests") as caught:
             await refused
         assert caught.value.moving
-    assert lines(cabinet) == sent, "nothing was queued behind it"
+    assert cabinet.taken == sent, "nothing was queued behind it"
     assert not await other.at_rest(), "and it was not stopped"
 
 
@@ -163,23 +153,23 @@ TAMPERED: list[tuple[str, dict[str, Any], str]] = [
 
 @pytest.mark.parametrize(("method", "params", "words"), TAMPERED)
 async def test_what_a_press_depends_on_is_read_back_before_each_way_down(
-    arm: AuboArcs, other: Controller, cabinet: ArcsServer, method: str, params: dict[str, Any], words: str
+    arm: AuboArcs, other: Controller, cabinet: Cabinet, method: str, params: dict[str, Any], words: str
 ):
     await arm.move(ABOVE, **QUICK)
     assert await other.ask(method, **params) == 0
-    sent, before = lines(cabinet), cabinet.cabinet.world.tool()
+    sent, before = cabinet.taken, cabinet.tool
     for refused in (arm.move(LOW, **QUICK), arm.follow([ABOVE, LOW], blend_mm=1.0, **QUICK), arm.take_up()):
         with pytest.raises(SettingsChanged, match=words):
             await refused
-    assert lines(cabinet) == sent
-    assert cabinet.cabinet.world.tool() == before
+    assert cabinet.taken == sent
+    assert cabinet.tool == before
     await other.ask("RobotManage.setOperationalMode", mode="Automatic")
     await arm.enable()  # sets what is configured again; what is not is taken as it is
     await arm.move(LOW, **QUICK)
-    assert distance(cabinet.cabinet.world.tool(), LOW)[0] < 0.05
+    assert distance(cabinet.tool, LOW)[0] < 0.05
 
 
-async def test_a_safety_stop_is_reported_before_what_it_changes(arm: AuboArcs, other: Controller, cabinet: ArcsServer):
+async def test_a_safety_stop_is_reported_before_what_it_changes(arm: AuboArcs, other: Controller, cabinet: Cabinet):
     await arm.move(ABOVE, **QUICK)
     await other.ask("RobotManage.setOperationalMode", mode="Manual")
     cabinet.cabinet.safety_stop()
@@ -208,20 +198,3 @@ def test_a_tool_that_is_read_back_in_other_angles_is_the_same_tool_and_one_turne
     require_same("enable", tool(180.0, 0.0, 30.0), tool(0.0, 180.0, -150.0))
     with pytest.raises(SettingsChanged, match=r"\(-179\.99, 0, 0\) deg, not .*\(-?180, 0, 0\)"):
         require_same("enable", tool(180.0, 0.0, 0.0), tool(-179.99, 0.0, 0.0))
-
-
-async def test_from_below_the_floor_only_the_tool_axis_leads_up(arm: AuboArcs, other: Controller, cabinet: ArcsServer):
-    deep = brush_pose(300.0, -200.0, 80.0, tilt_deg=10.0)
-    x_mm = 300.0 + 120.0 * 0.17632698  # tan 10 deg
-    await send(other, deep)
-    await arm.take_up()
-    for wrong in (
-        brush_pose(300.0, -200.0, 200.0, tilt_deg=10.0),
-        brush_pose(x_mm, -200.0, 200.0),
-        brush_pose(450.0, -100.0, 200.0, tilt_deg=10.0),
-    ):
-        with pytest.raises(LimitExceeded, match=r"the arm stands where z = 80.000 mm is outside \[95"):
-            await arm.move(wrong, **QUICK)
-    up = brush_pose(x_mm, -200.0, 200.0, tilt_deg=10.0)
-    await arm.move(up, **QUICK)
-    assert distance(cabinet.cabinet.world.tool(), up)[0] < 0.05

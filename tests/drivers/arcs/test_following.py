@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import AsyncIterator, Awaitable, Callable
-from typing import Any
 
 import pytest
 
@@ -22,13 +21,11 @@ from brushloop.drivers.errors import (
     RobotNotSafe,
 )
 from brushloop.drivers.geometry import brush_pose, distance
-from brushloop.drivers.sim.arcs_server import ArcsServer
-from tests.drivers.arcs.conftest import LIMITS
+from tests.drivers.arcs.conftest import LIMITS, Cabinet
 from tests.drivers.failing import cut
 
 WAY = {"speed_mm_s": 40.0, "acc_mm_s2": 800.0, "blend_mm": 1.0}
 SLOW = {**WAY, "speed_mm_s": 3.0}
-LINE = "rob1.MotionControl.moveLine"
 
 
 def arc(points: int = 40, radius_mm: float = 40.0) -> list[Pose]:
@@ -53,38 +50,33 @@ LONG = line(130, 3.0)
 """More points than are queued at a time."""
 
 
-def sent(cabinet: ArcsServer) -> int:
-    return cabinet.cabinet.world.motion._next_id
-
-
 @pytest.fixture
-async def way(arm: AuboArcs, cabinet: ArcsServer) -> AsyncIterator[asyncio.Task[None]]:
+async def way(arm: AuboArcs, cabinet: Cabinet) -> AsyncIterator[asyncio.Task[None]]:
     """A long slow way that is under way."""
     task = asyncio.create_task(arm.follow(LONG, **SLOW))
-    while sent(cabinet) < queueing.MOST_QUEUED or cabinet.cabinet.world.motion.exec_id(cabinet.cabinet.now_s()) < 1:
+    while cabinet.taken < queueing.MOST_QUEUED or cabinet.cabinet.world.motion.exec_id(cabinet.cabinet.now_s()) < 1:
         await asyncio.sleep(0.01)
     yield task
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
 
 
-async def rests_short(cabinet: ArcsServer) -> bool:
+async def rests_short(cabinet: Cabinet) -> bool:
     """At rest well before the end, and no line comes after it."""
-    before = sent(cabinet)
+    before = cabinet.taken
     await asyncio.sleep(0.15)
-    idle = cabinet.cabinet.world.motion.exec_id(cabinet.cabinet.now_s()) == -1
-    return idle and sent(cabinet) == before and distance(cabinet.cabinet.world.tool(), LONG[-1])[0] > 100.0
+    return cabinet.rests and cabinet.taken == before and distance(cabinet.tool, LONG[-1])[0] > 100.0
 
 
 async def test_the_arm_halts_nowhere_but_at_the_last_pose_having_passed_near_all_the_others(
-    arm: AuboArcs, cabinet: ArcsServer
+    arm: AuboArcs, cabinet: Cabinet
 ):
     travelled: list[Pose] = []
     motion = cabinet.cabinet.world.motion
     world_saw = motion._on_path
     motion._on_path = lambda a, b: (travelled.extend((a, b)), world_saw(a, b))[1]
     await arm.follow(arc(), **WAY)
-    off_mm, off_deg = distance(cabinet.cabinet.world.tool(), arc()[-1])
+    off_mm, off_deg = distance(cabinet.tool, arc()[-1])
     assert off_mm <= 0.05
     assert off_deg <= 0.1
     for pose in arc():
@@ -93,7 +85,7 @@ async def test_the_arm_halts_nowhere_but_at_the_last_pose_having_passed_near_all
     assert len(motion.rests) == 1
 
 
-async def test_never_more_lines_are_queued_than_allowed(arm: AuboArcs, cabinet: ArcsServer):
+async def test_never_more_lines_are_queued_than_allowed(arm: AuboArcs, cabinet: Cabinet):
     motion = cabinet.cabinet.world.motion
     cabinet.cabinet.hold()
     task = asyncio.create_task(arm.follow(arc(), **WAY))
@@ -101,33 +93,33 @@ async def test_never_more_lines_are_queued_than_allowed(arm: AuboArcs, cabinet: 
     assert motion.size == queueing.MOST_QUEUED
     cabinet.cabinet.resume()
     await task
-    assert sent(cabinet) == len(arc())
+    assert cabinet.taken == len(arc())
 
 
 @pytest.mark.parametrize(
     "bad", [brush_pose(250.0, -230.0, 60.0), brush_pose(250.0, -230.0, 260.0, tilt_deg=20.0)], ids=["floor", "cone"]
 )
-async def test_one_pose_outside_the_limits_and_nothing_is_sent(arm: AuboArcs, cabinet: ArcsServer, bad: Pose):
+async def test_one_pose_outside_the_limits_and_nothing_is_sent(arm: AuboArcs, cabinet: Cabinet, bad: Pose):
     with pytest.raises(LimitExceeded):
         await arm.follow([*line(5), bad], **WAY)
     with pytest.raises(ValueError, match="no poses"):
         await arm.follow([], **WAY)
-    assert sent(cabinet) == 0
+    assert cabinet.taken == 0
 
 
-async def loses_its_connection(arm: AuboArcs, _: ArcsServer) -> None:
+async def loses_its_connection(arm: AuboArcs, _: Cabinet) -> None:
     cut(arm._motion.connection)
 
 
-async def is_held(_: AuboArcs, cabinet: ArcsServer) -> None:
+async def is_held(_: AuboArcs, cabinet: Cabinet) -> None:
     cabinet.cabinet.hold()
 
 
-async def is_stopped_by_another_client(_: AuboArcs, cabinet: ArcsServer) -> None:
+async def is_stopped_by_another_client(_: AuboArcs, cabinet: Cabinet) -> None:
     cabinet.cabinet.stop(2.0, 2.0)
 
 
-async def stops_by_itself(_: AuboArcs, cabinet: ArcsServer) -> None:
+async def stops_by_itself(_: AuboArcs, cabinet: Cabinet) -> None:
     cabinet.cabinet.safety_stop()
 
 
@@ -143,9 +135,9 @@ async def stops_by_itself(_: AuboArcs, cabinet: ArcsServer) -> None:
 )
 async def test_whatever_ends_a_way_is_named_and_no_line_follows(
     arm: AuboArcs,
-    cabinet: ArcsServer,
+    cabinet: Cabinet,
     way: asyncio.Task[None],
-    act: Callable[[AuboArcs, ArcsServer], Awaitable[None]],
+    act: Callable[[AuboArcs, Cabinet], Awaitable[None]],
     error: type[Exception],
     words: str,
 ):
@@ -155,25 +147,19 @@ async def test_whatever_ends_a_way_is_named_and_no_line_follows(
     assert await rests_short(cabinet)
 
 
-async def test_a_stop_while_lines_are_being_sent_lets_none_follow(arm: AuboArcs, cabinet: ArcsServer):
-    queue_line, stops = cabinet._methods[LINE], list[asyncio.Task[None]]()
-
-    def noted(params: dict[str, Any]) -> object:
-        stops.append(asyncio.create_task(arm.stop()))
-        return queue_line(params)
-
-    cabinet._methods[LINE] = noted
+async def test_a_stop_while_lines_are_being_sent_lets_none_follow(arm: AuboArcs, cabinet: Cabinet):
+    stops: list[asyncio.Task[None]] = []
+    cabinet.before_each("MotionControl.moveLine", lambda _: stops.append(asyncio.create_task(arm.stop())))
     with pytest.raises(MotionFailed):
         await arm.follow(line(10), **WAY)
     await asyncio.gather(*stops)
-    assert sent(cabinet) == 1
+    assert cabinet.taken == 1
 
 
-async def test_a_controller_that_holds_few_lines_is_fed_as_it_takes_them(arm: AuboArcs, cabinet: ArcsServer):
-    move_line = cabinet._methods[LINE]
-    cabinet._methods[LINE] = lambda p: 2 if cabinet.cabinet.motion.size >= 3 else move_line(p)
+async def test_a_controller_that_holds_few_lines_is_fed_as_it_takes_them(arm: AuboArcs, cabinet: Cabinet):
+    cabinet.refuses_lines(2, lambda _: cabinet.queued >= 3)
     await arm.follow(arc(), **WAY)
-    assert distance(cabinet.cabinet.world.tool(), arc()[-1])[0] <= 0.05
+    assert distance(cabinet.tool, arc()[-1])[0] <= 0.05
 
 
 @pytest.mark.parametrize(
@@ -186,29 +172,26 @@ async def test_a_controller_that_holds_few_lines_is_fed_as_it_takes_them(arm: Au
     ids=["a queue that somebody else fills", "one that stays full", "a line that is refused"],
 )
 async def test_a_line_that_is_not_taken_ends_the_way(
-    arm: AuboArcs, cabinet: ArcsServer, accepted: int, code: int, error: type[Exception], words: str
+    arm: AuboArcs, cabinet: Cabinet, accepted: int, code: int, error: type[Exception], words: str
 ):
-    move_line = cabinet._methods[LINE]
-    cabinet._methods[LINE] = lambda p: code if sent(cabinet) >= accepted else move_line(p)
+    cabinet.refuses_lines(code, lambda _: cabinet.taken >= accepted)
     with pytest.raises(error, match=words):
         await arm.follow(LONG, **SLOW)
     assert await rests_short(cabinet)
 
 
 async def test_a_way_that_is_fed_too_slowly_goes_on_and_is_reported(
-    arm: AuboArcs, cabinet: ArcsServer, monkeypatch: pytest.MonkeyPatch
+    arm: AuboArcs, cabinet: Cabinet, notices: list[str], monkeypatch: pytest.MonkeyPatch
 ):
-    reported: list[str] = []
-    arm._notice = reported.append
     monkeypatch.setattr(queueing, "MOST_QUEUED", 1)
     await arm.follow(line(4), **WAY)
-    assert distance(cabinet.cabinet.world.tool(), line(4)[-1])[0] <= 0.05
-    assert reported[0] == "the arm halted at point 1 of 4: lines did not reach the controller in time"
+    assert distance(cabinet.tool, line(4)[-1])[0] <= 0.05
+    assert notices[0] == "the arm halted at point 1 of 4: lines did not reach the controller in time"
 
 
 @pytest.mark.parametrize("answer", [None, -1, True])
-async def test_a_queue_without_a_size_is_a_violation(arm: AuboArcs, cabinet: ArcsServer, answer: object):
-    cabinet._methods["rob1.MotionControl.getQueueSize"] = lambda _: answer
+async def test_a_queue_without_a_size_is_a_violation(arm: AuboArcs, cabinet: Cabinet, answer: object):
+    cabinet.answers("MotionControl.getQueueSize", answer)
     with pytest.raises(ProtocolViolation, match="getQueueSize"):
         await arm.follow(LONG, **SLOW)
 

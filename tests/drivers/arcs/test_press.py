@@ -22,9 +22,8 @@ from brushloop.drivers.errors import (
     RobotNotSafe,
 )
 from brushloop.drivers.geometry import brush_pose, distance
-from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
-from tests.drivers.arcs.conftest import MakeArm
+from tests.drivers.arcs.conftest import Cabinet, MakeArm
 from tests.drivers.failing import cut, mute
 
 X_MM, Y_MM = 250.0, -230.0
@@ -35,60 +34,43 @@ ACC = 800.0
 ASIDE = brush_pose(X_MM + 40.0, Y_MM + 10.0, 205.0)
 """In the paper, and 41 mm beside the press."""
 LINE, SIZE, STOP_MOVE, START_MOVE = (
-    f"rob1.MotionControl.{name}" for name in ("moveLine", "getQueueSize", "stopMove", "startMove")
+    f"MotionControl.{name}" for name in ("moveLine", "getQueueSize", "stopMove", "startMove")
 )
 
 
-def z_mm(cabinet: ArcsServer) -> float:
-    return cabinet.cabinet.world.tool().z_mm
+def z_mm(cabinet: Cabinet) -> float:
+    return cabinet.tool.z_mm
 
 
-def queued(cabinet: ArcsServer) -> int:
-    return cabinet.cabinet.queue_size()
-
-
-def before_each(cabinet: ArcsServer, method: str, act: Callable[[int], object]) -> None:
-    """Call `act` with the number of the request, from 1, before the controller carries it out."""
-    carry_out, number = cabinet._methods[method], 0
-
-    def noted(params: dict[str, Any]) -> Any:
-        nonlocal number
-        number += 1
-        act(number)
-        return carry_out(params)
-
-    cabinet._methods[method] = noted
-
-
-async def below(cabinet: ArcsServer, height_mm: float) -> None:
+async def below(cabinet: Cabinet, height_mm: float) -> None:
     """Return once the tip is lower than this."""
     while z_mm(cabinet) > height_mm:
         await asyncio.sleep(0.002)
 
 
-async def nothing_is_left(cabinet: ArcsServer) -> bool:
+async def nothing_is_left(cabinet: Cabinet) -> bool:
     """No line is queued, and none begins when somebody lets the path go on."""
-    here = cabinet.cabinet.world.tool()
+    here = cabinet.tool
     cabinet.cabinet.resume()
     await asyncio.sleep(0.1)
-    return queued(cabinet) == 0 and cabinet.cabinet.world.tool() == here
+    return cabinet.queued == 0 and cabinet.tool == here
 
 
 async def test_the_arm_goes_down_dwells_and_comes_up_once_the_controller_has_every_line(
-    arm: AuboArcs, cabinet: ArcsServer
+    arm: AuboArcs, cabinet: Cabinet
 ):
     held: list[tuple[float, int]] = []
-    before_each(cabinet, START_MOVE, lambda _: held.append((z_mm(cabinet), queued(cabinet))))
+    cabinet.before_each(START_MOVE, lambda _: held.append((z_mm(cabinet), cabinet.queued)))
     seen = await arm.sequence(PRESS, acc_mm_s2=ACC)
     assert held == [(HOME.z_mm, 3)]
-    assert distance(cabinet.cabinet.world.tool(), TOP)[0] <= 0.05
+    assert distance(cabinet.tool, TOP)[0] <= 0.05
     assert min(pose.z_mm for pose in seen) == pytest.approx(200.0, abs=0.05)
     near, deep, top = list(cabinet.cabinet.world.motion.rests)[-3:]
     assert (near.pose.z_mm, deep.pose.z_mm, top.pose.z_mm) == pytest.approx((200.05, 200.0, 300.0))
     assert deep.at_s - near.at_s == pytest.approx(DWELL_S, abs=1e-3)
 
 
-async def test_a_host_that_is_gone_once_the_path_was_let_go_is_not_needed(arm: AuboArcs, cabinet: ArcsServer):
+async def test_a_host_that_is_gone_once_the_path_was_let_go_is_not_needed(arm: AuboArcs, cabinet: Cabinet):
     lowest: list[float] = []
     cabinet.cabinet.world.motion._on_path = lambda a, b: lowest.append(min(a.z_mm, b.z_mm))
     task = asyncio.create_task(arm.sequence(PRESS, acc_mm_s2=ACC))
@@ -96,7 +78,7 @@ async def test_a_host_that_is_gone_once_the_path_was_let_go_is_not_needed(arm: A
     for controller in (arm._motion, arm._stop, arm._state):
         cut(controller.connection)
     mute(cabinet)
-    while queued(cabinet):
+    while cabinet.queued:
         await asyncio.sleep(0.01)
     assert z_mm(cabinet) == pytest.approx(TOP.z_mm)
     assert min(lowest) == pytest.approx(DEEP.z_mm)
@@ -105,15 +87,15 @@ async def test_a_host_that_is_gone_once_the_path_was_let_go_is_not_needed(arm: A
     cabinet.faults.clear()
 
 
-def cuts(arm: AuboArcs, _: ArcsServer) -> None:
+def cuts(arm: AuboArcs, _: Cabinet) -> None:
     cut(arm._motion.connection)
 
 
-def stops(arm: AuboArcs, _: ArcsServer) -> asyncio.Task[None]:
+def stops(arm: AuboArcs, _: Cabinet) -> asyncio.Task[None]:
     return asyncio.create_task(arm.stop())
 
 
-def sends_aside(_: AuboArcs, cabinet: ArcsServer) -> None:
+def sends_aside(_: AuboArcs, cabinet: Cabinet) -> None:
     """Another client's line reaches the controller now."""
     assert cabinet.cabinet.world.motion.add(ASIDE, 200.0, ACC, cabinet.cabinet.now_s())
 
@@ -129,15 +111,15 @@ def sends_aside(_: AuboArcs, cabinet: ArcsServer) -> None:
 @pytest.mark.parametrize(("method", "number"), [(STOP_MOVE, 1), (LINE, 1), (LINE, 3), (SIZE, 1)])
 async def test_whatever_happens_before_the_path_is_let_go_drops_it_and_leaves_the_arm_where_it_is(
     arm: AuboArcs,
-    cabinet: ArcsServer,
+    cabinet: Cabinet,
     method: str,
     number: int,
-    act: Callable[[AuboArcs, ArcsServer], asyncio.Task[None] | None],
+    act: Callable[[AuboArcs, Cabinet], asyncio.Task[None] | None],
     error: type[Exception],
     words: str,
 ):
     tasks: list[asyncio.Task[None] | None] = []
-    before_each(cabinet, method, lambda now: tasks.append(act(arm, cabinet)) if now == number else None)
+    cabinet.before_each(method, lambda now: tasks.append(act(arm, cabinet)) if now == number else None)
     with pytest.raises(error, match=words):
         await arm.sequence(PRESS, acc_mm_s2=ACC)
     await asyncio.gather(*filter(None, tasks))
@@ -148,7 +130,7 @@ async def test_whatever_happens_before_the_path_is_let_go_drops_it_and_leaves_th
 
 
 @pytest.mark.parametrize("below_mm", [250.0, 200.1])
-async def test_a_stop_on_the_way_down_or_at_depth_drops_the_lift(arm: AuboArcs, cabinet: ArcsServer, below_mm: float):
+async def test_a_stop_on_the_way_down_or_at_depth_drops_the_lift(arm: AuboArcs, cabinet: Cabinet, below_mm: float):
     task = asyncio.create_task(arm.sequence(PRESS, acc_mm_s2=ACC))
     await below(cabinet, below_mm)
     await arm.stop()
@@ -160,7 +142,7 @@ async def test_a_stop_on_the_way_down_or_at_depth_drops_the_lift(arm: AuboArcs, 
 
 @pytest.mark.parametrize("counted", [True, False], ids=["a held line counts as running", "or not"])
 async def test_lines_that_a_dead_process_left_held_are_dropped_and_do_not_hold_up_the_next_one(
-    arm: AuboArcs, cabinet: ArcsServer, make_arm: MakeArm, counted: bool
+    arm: AuboArcs, cabinet: Cabinet, make_arm: MakeArm, counted: bool
 ):
     await arm.close()
     cabinet.cabinet.hold()
@@ -176,23 +158,17 @@ async def test_lines_that_a_dead_process_left_held_are_dropped_and_do_not_hold_u
     await other.move(TOP, speed_mm_s=100.0, acc_mm_s2=ACC)
 
 
-def drops_the_dwell(cabinet: ArcsServer, code: int) -> None:
-    """The controller answers the line that dwells with this code and does not queue it."""
-    move_line = cabinet._methods[LINE]
-    cabinet._methods[LINE] = lambda p: code if p["duration"] else move_line(p)
-
-
 @pytest.mark.parametrize(
     ("tamper", "error", "words"),
     [
-        (lambda c: c._methods.update({STOP_MOVE: lambda _: 0}), MotionFailed, "does not hold its path|holds . of 3"),
-        (lambda c: drops_the_dwell(c, 0), MotionFailed, "holds 2 of 3 lines"),
-        (lambda c: drops_the_dwell(c, 2), MotionRefused, "QUEUE_FULL"),
+        (lambda c: c.answers(STOP_MOVE, 0), MotionFailed, "does not hold its path|holds . of 3"),
+        (lambda c: c.refuses_lines(0, lambda line: line["duration"]), MotionFailed, "holds 2 of 3 lines"),
+        (lambda c: c.refuses_lines(2, lambda line: line["duration"]), MotionRefused, "QUEUE_FULL"),
     ],
     ids=["does not hold", "keeps fewer lines", "refuses a line"],
 )
 async def test_a_controller_that_does_not_keep_all_lines_is_not_let_go(
-    arm: AuboArcs, cabinet: ArcsServer, tamper: Callable[[ArcsServer], None], error: type[Exception], words: str
+    arm: AuboArcs, cabinet: Cabinet, tamper: Callable[[Cabinet], None], error: type[Exception], words: str
 ):
     tamper(cabinet)
     with pytest.raises(error, match=words):
@@ -201,8 +177,8 @@ async def test_a_controller_that_does_not_keep_all_lines_is_not_let_go(
     assert await nothing_is_left(cabinet)
 
 
-async def test_what_cannot_be_carried_out_is_refused_before_anything_is_sent(arm: AuboArcs, cabinet: ArcsServer):
-    before_each(cabinet, STOP_MOVE, lambda _: pytest.fail("sent"))
+async def test_what_cannot_be_carried_out_is_refused_before_anything_is_sent(arm: AuboArcs, cabinet: Cabinet):
+    cabinet.before_each(STOP_MOVE, lambda _: pytest.fail("sent"))
     with pytest.raises(LimitExceeded):
         await arm.sequence([*PRESS, QueuedLine(brush_pose(250.0, -230.0, 60.0), 40.0)], acc_mm_s2=ACC)
     for lines in ([], [QueuedLine(DEEP, 40.0), QueuedLine(HOME, 40.0)]):
@@ -213,10 +189,10 @@ async def test_what_cannot_be_carried_out_is_refused_before_anything_is_sent(arm
 @pytest.mark.parametrize("kind", ["malformed", "garbage", "mute", "wrong-id", "drop"])
 @pytest.mark.parametrize("method", ["startMove", "getExecId", "getTcpPose", "getSafetyModeType"])
 async def test_an_answer_that_cannot_be_read_once_the_path_was_let_go_does_not_stop_it(
-    arm: AuboArcs, cabinet: ArcsServer, kind: str, method: str
+    arm: AuboArcs, cabinet: Cabinet, kind: str, method: str
 ) -> None:
     fault = Fault(device=Device.ROBOT, kind=kind, on=method, count=1 if method == "startMove" else 2)
-    before_each(cabinet, START_MOVE, lambda _: cabinet.faults.hang(fault))
+    cabinet.before_each(START_MOVE, lambda _: cabinet.faults.hang(fault))
     await arm.sequence(PRESS, acc_mm_s2=ACC)
     _, deep, top = list(cabinet.cabinet.world.motion.rests)[-3:]
     assert (deep.pose.z_mm, top.pose.z_mm) == pytest.approx((DEEP.z_mm, TOP.z_mm))
@@ -224,7 +200,7 @@ async def test_an_answer_that_cannot_be_read_once_the_path_was_let_go_does_not_s
 
 
 async def test_a_controller_that_never_answers_again_is_given_the_time_of_the_press(
-    arm: AuboArcs, cabinet: ArcsServer
+    arm: AuboArcs, cabinet: Cabinet
 ) -> None:
     press = asyncio.create_task(arm.sequence(PRESS, acc_mm_s2=ACC))
     await below(cabinet, 255.0)
@@ -235,19 +211,19 @@ async def test_a_controller_that_never_answers_again_is_given_the_time_of_the_pr
     cabinet.faults.clear()
 
 
-async def test_a_stop_is_carried_out_at_once_although_no_answer_can_be_read(arm: AuboArcs, cabinet: ArcsServer) -> None:
+async def test_a_stop_is_carried_out_at_once_although_no_answer_can_be_read(arm: AuboArcs, cabinet: Cabinet) -> None:
     press = asyncio.create_task(arm.sequence(PRESS, acc_mm_s2=ACC))
     await below(cabinet, 255.0)
     cabinet.faults.hang(Fault(device=Device.ROBOT, kind="malformed", on="getSafetyModeType", count=ALWAYS))
     await arm.stop()
     assert z_mm(cabinet) > DEEP.z_mm
-    assert queued(cabinet) == 0
+    assert cabinet.queued == 0
     cabinet.faults.clear()
     with pytest.raises(MotionFailed):
         await press
 
 
-async def test_a_safety_stop_that_can_be_read_ends_the_press_at_once(arm: AuboArcs, cabinet: ArcsServer) -> None:
+async def test_a_safety_stop_that_can_be_read_ends_the_press_at_once(arm: AuboArcs, cabinet: Cabinet) -> None:
     press = asyncio.create_task(arm.sequence(PRESS, acc_mm_s2=ACC))
     await below(cabinet, 255.0)
     cabinet.cabinet.safety_stop()
@@ -260,7 +236,7 @@ async def test_a_safety_stop_that_can_be_read_ends_the_press_at_once(arm: AuboAr
 
 
 @pytest.fixture
-def strays_mm(cabinet: ArcsServer) -> list[float]:
+def strays_mm(cabinet: Cabinet) -> list[float]:
     """How far from the axis of the press the tip moved in the paper."""
     strays: list[float] = [0.0]
     motion = cabinet.cabinet.world.motion
@@ -275,18 +251,18 @@ def strays_mm(cabinet: ArcsServer) -> list[float]:
 
 
 async def test_a_line_that_comes_between_the_last_check_and_the_release_is_stopped(
-    arm: AuboArcs, cabinet: ArcsServer, strays_mm: list[float]
+    arm: AuboArcs, cabinet: Cabinet, strays_mm: list[float]
 ) -> None:
-    before_each(cabinet, START_MOVE, lambda _: sends_aside(arm, cabinet))
+    cabinet.before_each(START_MOVE, lambda _: sends_aside(arm, cabinet))
     with pytest.raises(PathDisturbed, match="nother client"):
         await arm.sequence(PRESS, acc_mm_s2=ACC)
     assert max(strays_mm) < 0.5
-    assert queued(cabinet) == 0
+    assert cabinet.queued == 0
 
 
 @pytest.mark.parametrize("at_mm", [250.0, 200.01])
 async def test_a_line_that_comes_during_the_press_is_not_begun(
-    arm: AuboArcs, cabinet: ArcsServer, other: Controller, strays_mm: list[float], at_mm: float
+    arm: AuboArcs, cabinet: Cabinet, other: Controller, strays_mm: list[float], at_mm: float
 ) -> None:
     press = asyncio.create_task(arm.sequence(PRESS, acc_mm_s2=ACC))
     await below(cabinet, at_mm)
@@ -294,12 +270,12 @@ async def test_a_line_that_comes_during_the_press_is_not_begun(
     with pytest.raises(PathDisturbed, match=r"holds \d lines, at most \d of ours are left.*nother client"):
         await press
     assert max(strays_mm) < 0.5
-    assert queued(cabinet) == 0
+    assert cabinet.queued == 0
 
 
 @pytest.mark.parametrize("telemetry", [True, False], ids=["by telemetry", "by asking"])
 async def test_a_client_that_stops_the_press_and_sends_its_own_line_is_seen_by_the_way_that_the_tip_took(
-    arm: AuboArcs, cabinet: ArcsServer, other: Controller, monkeypatch: pytest.MonkeyPatch, telemetry: bool
+    arm: AuboArcs, cabinet: Cabinet, other: Controller, monkeypatch: pytest.MonkeyPatch, telemetry: bool
 ) -> None:
     if not telemetry:
         monkeypatch.setattr(arm._telemetry, "_take", lambda *_: None)
@@ -309,7 +285,7 @@ async def test_a_client_that_stops_the_press_and_sends_its_own_line_is_seen_by_t
     await other.move_line(ASIDE, 200.0, ACC)
     with pytest.raises(PathDisturbed, match=r"from its path.*nother client"):
         await press
-    assert queued(cabinet) == 0
+    assert cabinet.queued == 0
 
 
 async def test_one_pose_beside_the_path_is_enough_even_if_the_arm_arrives(arm: AuboArcs) -> None:

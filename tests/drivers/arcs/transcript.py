@@ -10,7 +10,6 @@ import json
 import zipfile
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -90,20 +89,13 @@ async def following(script: list[Line], framing: Framing = "sof") -> AsyncIterat
     assert not controller.script, f"never asked for: {controller.script}"
 
 
-@dataclass(frozen=True)
 class Archive:
     """What `brushloop doctor --report` wrote."""
 
-    framing: Framing
-    lines: list[dict[str, Any]]
-    """`arcs.jsonl`: each has method, params and answer."""
-
-    @classmethod
-    def read(cls, path: Path) -> Archive:
+    def __init__(self, path: Path) -> None:
         with zipfile.ZipFile(path) as archive:
-            report = json.loads(archive.read("report.json"))
-            lines = [json.loads(line) for line in archive.read("arcs.jsonl").splitlines()]
-        return cls(report["framing"], lines)
+            self.framing: Framing = json.loads(archive.read("report.json"))["framing"]
+            self.lines = [json.loads(line) for line in archive.read("arcs.jsonl").splitlines()]
 
     def script(self) -> list[Line]:
         """Its lines as a test writes them."""
