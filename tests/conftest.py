@@ -30,7 +30,8 @@ settings.load_profile("same")
 gc.disable()
 
 # Our command line does not change between tests: its tree of commands is built once instead of at every command.
-typer.main.get_command = typer.testing._get_command = functools.cache(typer.main.get_command)
+typer.main.get_command = functools.cache(typer.main.get_command)
+typer.testing._get_command = typer.main.get_command  # pyright: ignore[reportPrivateImportUsage]
 
 # What comes late names the load of the computer; the words that tests compare must not depend on it.
 os.getloadavg = lambda: (0.0, 0.0, 0.0)
@@ -47,22 +48,6 @@ FIRST = (
     "tests/collect/commission/test_first_day.py",
 )
 """The longest tests and groups, longest first, so that no worker is left alone with one of them at the end."""
-
-DEVICES = (
-    "tests/contract",
-    "tests/drivers/arcs",
-    "tests/drivers/test_force.py",
-    "tests/drivers/test_ink.py",
-)
-"""Tests that mostly wait for a device."""
-RUNS = (
-    "tests/collect/durability",
-    "tests/collect/engine",
-    "tests/collect/faults",
-    "tests/collect/commission",
-    "tests/collect/test_headless.py",
-)
-"""Tests of whole runs, which wait for half of their time. Both kinds are mixed with tests that only compute."""
 
 TOGETHER = {
     "tests/calibrate/validate/": "comparing",
@@ -81,22 +66,11 @@ TOGETHER = {
 
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    parts: dict[tuple[str, ...], list[pytest.Item]] = {FIRST: [], DEVICES: [], RUNS: [], (): []}
-    for item in items:
-        parts[next((part for part in parts if item.nodeid.startswith(part)), ())].append(item)
-    first = parts.pop(FIRST)
-    first.sort(key=lambda item: next(place for place, start in enumerate(FIRST) if item.nodeid.startswith(start)))
-    items[:] = first + _evenly_mixed(list(parts.values()))
+    items.sort(key=lambda item: next((n for n, start in enumerate(FIRST) if item.nodeid.startswith(start)), len(FIRST)))
     for item in items:
         for folder, group in TOGETHER.items():
             if item.nodeid.startswith(folder) and item.get_closest_marker("xdist_group") is None:
                 item.add_marker(pytest.mark.xdist_group(group))
-
-
-def _evenly_mixed(parts: list[list[pytest.Item]]) -> list[pytest.Item]:
-    """All parts in one list, each in its order and spread over the whole of it."""
-    places = [(place / len(part), item) for part in parts for place, item in enumerate(part)]
-    return [item for _, item in sorted(places, key=lambda one: one[0])]
 
 
 @pytest.hookimpl(trylast=True)

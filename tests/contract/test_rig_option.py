@@ -40,17 +40,12 @@ def rig_toml(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
             sim.terminate()
 
 
-def command(rig_toml: Path, *more: str) -> list[str]:
-    what = [sys.executable, "-m", "pytest", "tests/contract", "--rig", str(rig_toml), "-k", CHOSEN]
-    return [*what, "-p", "no:cacheprovider", "--color=no", *more]
-
-
 def on_a_terminal(rig_toml: Path, answer: str) -> tuple[int, str]:
     """Exit code and output of a run that is given `answer` once it asks."""
     ours, theirs = pty.openpty()
-    with subprocess.Popen(
-        command(rig_toml), cwd=ROOT, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True
-    ) as run:
+    chosen = ["tests/contract", "--rig", str(rig_toml), "-k", CHOSEN, "-p", "no:cacheprovider", "--color=no"]
+    command, terminal = [sys.executable, "-m", "pytest", *chosen], dict.fromkeys(("stdin", "stdout", "stderr"), theirs)
+    with subprocess.Popen(command, cwd=ROOT, start_new_session=True, **terminal) as run:
         os.close(theirs)
         try:
             output, answered = "", False

@@ -32,6 +32,10 @@ def failure(call: Callable[[], object]) -> str:
         return f"AuboException: {error}"
 
 
+def at_rest(robot: Any) -> bool:
+    return robot.getMotionControl().getExecId() == -1 and robot.getRobotState().isSteady()
+
+
 def shifted(pose: list[float], x_m: float) -> list[float]:
     return [pose[0] + x_m, *pose[1:]]
 
@@ -69,24 +73,20 @@ def power(robot: Any) -> None:
 
 def move(rpc: Any, robot: Any) -> None:
     motion, state, machine = robot.getMotionControl(), robot.getRobotState(), rpc.getRuntimeMachine()
-
-    def at_rest() -> bool:
-        return motion.getExecId() == -1 and state.isSteady()
-
     start = state.getTcpPose()
     SEEN["move"] = [motion.moveLine(shifted(start, 0.05), 1.0, 0.1, 0.0, 0.0), motion.getExecId()]
     SEEN["queue"] = motion.getQueueSize()
-    SEEN["arrived"] = until(at_rest)
+    SEEN["arrived"] = until(lambda: at_rest(robot))
     SEEN["moved by"] = state.getTcpPose()[0] - start[0]
     SEEN["same"] = motion.moveLine(state.getTcpPose(), 1.0, 0.1, 0.0, 0.0)
     for way, stop in (("stopLine", lambda: motion.stopLine(2.0, 2.0)), ("abort", machine.abort)):
         before = state.getTcpPose()
         motion.moveLine(shifted(before, -0.04), 1.0, 0.01, 0.0, 0.0)
         time.sleep(0.05)
-        SEEN[way] = [stop(), until(at_rest, 1.0), before[0] - state.getTcpPose()[0]]
+        SEEN[way] = [stop(), until(lambda: at_rest(robot), 1.0), before[0] - state.getTcpPose()[0]]
     motion.moveLine(start, 1.0, 0.05, 0.0, 0.0)
     SEEN["pause"] = [machine.pause(), str(machine.getRuntimeState()), motion.getExecId() >= 0]
-    SEEN["resume"] = [machine.resume(), str(machine.getRuntimeState()), until(at_rest)]
+    SEEN["resume"] = [machine.resume(), str(machine.getRuntimeState()), until(lambda: at_rest(robot))]
     SEEN["fraction"] = [motion.setSpeedFraction(0.5), motion.getSpeedFraction(), motion.setSpeedFraction(1.0)]
 
 
@@ -100,24 +100,20 @@ def joints(robot: Any) -> None:
     SEEN["ik far"] = algorithm.inverseKinematics(q, [2.0, 0.0, 0.2, 3.14, 0.0, 0.0])[1]
     target = [v + 0.05 for v in q]
     SEEN["joint move"] = motion.moveJoint(target, 2.0, 1.0, 0.0, 0.0)
-    until(lambda: motion.getExecId() == -1 and state.isSteady())
+    until(lambda: at_rest(robot))
     SEEN["joints off"] = max(abs(a - b) for a, b in zip(target, state.getJointPositions(), strict=True))
 
 
 def blend(robot: Any) -> None:
     """Four moves, sent while the path is held, as a client does that must not be slower than the arm."""
     motion, state = robot.getMotionControl(), robot.getRobotState()
-
-    def at_rest() -> bool:
-        return motion.getExecId() == -1 and state.isSteady()
-
     start = state.getTcpPose()
     corner, end = shifted(start, 0.04), [start[0] + 0.04, start[1] + 0.04, *start[2:]]
     motion.stopMove(True, True)
     SEEN["blend sent"] = [motion.moveLine(pose, 1.0, 0.02, 0.015, 0.0) for pose in (corner, end)]
     SEEN["blend start"] = motion.startMove()
     nearest, ids = 1.0, set()
-    while not at_rest():
+    while not at_rest(robot):
         pose = state.getTcpPose()
         nearest = min(nearest, sum((a - b) ** 2 for a, b in zip(pose[:3], corner[:3], strict=True)) ** 0.5)
         ids.add(motion.getExecId())
