@@ -57,8 +57,6 @@ BURST_SHARE = 0.5
 PERIODS_KEPT = 31
 PERIODS_LEARNED = 3
 """Number of gaps from which the usual period is taken."""
-STEADY_AFTER = 8
-"""Number of frames at the usual period after which it is no longer taken for misjudged."""
 
 
 class FrameFault(StrEnum):
@@ -116,10 +114,6 @@ class Backlog:
         self._periods: deque[int] = deque(maxlen=PERIODS_KEPT)
         self._waiting = 0
         """Number of coming frames that may have waited in a buffer."""
-        self._steady = 0
-        """Number of frames that came at the usual period."""
-        self._stalled = False
-        self._learning_again = False
 
     def is_late(self, arrival_ns: int) -> bool:
         """True for a frame that had waited in a buffer: its arrival says nothing about its exposure."""
@@ -127,29 +121,18 @@ class Backlog:
         self._last_ns = arrival_ns
         if len(self._periods) < PERIODS_LEARNED:
             self._periods.append(gap_ns)
-            return self._learning_again
+            return False
         usual_ns = max(sorted(self._periods)[len(self._periods) // 2], 1)
         stalled = gap_ns > max(3 * usual_ns, self._latency_ns)
-        again, self._stalled = stalled and self._stalled, stalled
-        if again and self._steady < STEADY_AFTER:
-            # A backlog comes in a burst, so two pauses in a row are the period; the gaps of a first burst were not.
-            self._periods.clear()
-            self._steady, self._learning_again = 0, True
-            return True
         if stalled:
-            # No more frames can have waited than came in the gap, so a camera with a misjudged period recovers.
-            self._waiting = 1 + gap_ns // usual_ns
-        if self._waiting == 0:
-            self._periods.append(gap_ns)
-            self._steady, self._learning_again = self._steady + 1, False
-            return False
-        if stalled or gap_ns < BURST_SHARE * usual_ns:
+            self._waiting = 1 + gap_ns // usual_ns  # no more frames can have waited than came in the gap
+        if self._waiting and gap_ns < BURST_SHARE * usual_ns:
             self._waiting -= 1
-            if self._waiting == 0:
-                self._periods.clear()
             return True
-        self._waiting = 0
-        return False
+        # A pause counts as a period too: where every frame comes after one, it is the period that was misjudged.
+        self._periods.append(gap_ns)
+        self._waiting = self._waiting - 1 if stalled else 0
+        return stalled
 
 
 # ---------------------------------------------------------------- the driver

@@ -295,6 +295,7 @@ MS = 1_000_000
 ARRIVALS: dict[str, tuple[int, list[int], list[int]]] = {
     "a backlog after a pause": (250, [*range(0, 600, 100), 2500, 2501, 2502, 2602, 2702], [6, 7, 8]),
     "slow at first, then fast": (250, [*range(0, 2000, 500), *range(3500, 4700, 100)], [4, 5, 6, 7, 8]),
+    "fast at first, then slow": (250, [*range(0, 1000, 100), *range(1400, 9000, 500)], list(range(10, 20))),
     "a burst at first": (60, [*range(0, 25, 5), *range(100, 3300, 80)], [5, 6, 7, 8, 9]),
 }
 
