@@ -166,7 +166,7 @@ class ForceStep(Step):
             sensor.listen(samples.append)
             await asyncio.sleep(REST_S)
             noise_n = float(np.std([sample.force_n for sample in samples], axis=0).max()) if samples else math.inf
-            visit.say(f"{identity.model}: {sensor.stream.rate_hz():.0f} rounds/s, noise {noise_n:.4f} N")
+            visit.say(f"{identity.model}: {len(samples) / REST_S:.0f} rounds/s, noise {noise_n:.4f} N")
             samples.clear()
             how = (
                 "Push the tip of the brush gently up with a finger for a second, along the brush toward the flange, "

@@ -139,11 +139,13 @@ async def _camera(config: RigConfig, finding: Finding, clock: Clock) -> Finding:
 async def _force(config: ForceTable, finding: Finding, clock: Clock) -> Finding:
     sensor = SriM8123(config, clock)
     async with _connected(sensor) as identity:
+        first = sensor.latest().stamp
         await asyncio.sleep(0.5)  # a hundred rounds give the rate
-        age_ms = (clock.now_ns() - sensor.latest().stamp.host_ns) / 1e6
-        force_n, stream = math.hypot(*sensor.latest().force_n), sensor.stream
-    dropped = stream.assembler
-    answer = finding.answered(identity, age_ms, f"{stream.rate_hz():.0f} rounds/s, {force_n:.3f} N before bias")
+        newest, stream = sensor.latest(), sensor.stream
+        age_ms = (clock.now_ns() - newest.stamp.host_ns) / 1e6
+    dropped, force_n = stream.assembler, math.hypot(*newest.force_n)
+    rate_hz = 1e9 * (newest.stamp.seq - first.seq) / max(newest.stamp.host_ns - first.host_ns, 1)
+    answer = finding.answered(identity, age_ms, f"{rate_hz:.0f} rounds/s, {force_n:.3f} N before bias")
     if dropped.torn or dropped.refused or stream.bus_errors:
         problem = f"{dropped.torn} torn, {dropped.refused} refused rounds, {stream.bus_errors} bus errors"
         return answer.trouble(problem, "Check wiring, shielding and termination.")

@@ -179,14 +179,10 @@ class RoundStream:
         self._clock = clock
         self._on_round = on_round
         self._closing = threading.Event()
-        self.rounds = self.bus_errors = 0
-        self._first_ns = 0
-        """Time at which the first round arrived."""
+        self.bus_errors = 0
         self.newest: Round | None = None
-        self.alike = 0
-        """Number of newest rounds in a row that exactly equal the one before; a strain gauge is never that still."""
-        self.alike_since_ns = 0
-        """Time at which the first round equal to the newest arrived."""
+        self.alike_since = Stamp(0)
+        """Of the first round in a row that exactly equals the newest; a strain gauge is never that still."""
         self.loss: tuple[str, str] | None = None
         """Why the stream ended, and what to do about it."""
         self.collecting: list[Wrench] | None = None
@@ -198,11 +194,6 @@ class RoundStream:
         """Stop the sensor, shut the bus down, join the thread; blocks."""
         self._closing.set()
         self._thread.join(timeout_s)
-
-    def rate_hz(self) -> float:
-        """Mean rate of the rounds so far; 0 before the second round."""
-        span_ns = self.newest[0].host_ns - self._first_ns if self.newest is not None else 0
-        return (self.rounds - 1) * 1e9 / span_ns if span_ns else 0.0
 
     def _run(self) -> None:
         try:
@@ -262,14 +253,10 @@ class RoundStream:
         if wrench is None:
             return
         device_ns = round(message.timestamp * 1e9) or None  # 0: the adapter has no clock
-        now_ns = self._clock.now_ns()
-        self._first_ns = self._first_ns or now_ns
-        stamp = Stamp(now_ns, device_ns, self.rounds)
-        self.rounds += 1
-        if self.newest is not None and wrench == self.newest[1]:
-            self.alike += 1
-        else:
-            self.alike, self.alike_since_ns = 0, now_ns
+        seq = self.newest[0].seq + 1 if self.newest is not None else 0
+        stamp = Stamp(self._clock.now_ns(), device_ns, seq)
+        if self.newest is None or wrench != self.newest[1]:
+            self.alike_since = stamp
         self.newest = (stamp, wrench)
         if (collecting := self.collecting) is not None:
             collecting.append(wrench)
@@ -336,16 +323,17 @@ class SriM8123:
     def latest(self) -> ForceSample:
         """The newest sample; never blocks. Raises `Stale`, `Stuck`, `ConnectionLost`, `NotConnected`."""
         stream = self._require("latest")
-        newest, alike = stream.newest, stream.alike
+        newest, since = stream.newest, stream.alike_since
         if newest is None:
             raise NotConnected(DEVICE, "latest", "no sample yet")
-        age_ms = (self._clock.now_ns() - newest[0].host_ns) / 1e6
+        stamp, wrench = newest
+        age_ms = (self._clock.now_ns() - stamp.host_ns) / 1e6
         if age_ms > self._table.stale_ms:
             raise Stale(DEVICE, age_ms, self._table.stale_ms)
-        alike_ms = (newest[0].host_ns - stream.alike_since_ns) / 1e6
+        alike, alike_ms = stamp.seq - since.seq, (stamp.host_ns - since.host_ns) / 1e6
         if alike >= STUCK_ROUNDS and alike_ms > STUCK_MS:
             raise Stuck(DEVICE, alike_ms, alike)
-        return self._sample(*newest)
+        return self._sample(stamp, wrench)
 
     def listen(self, on_sample: Callable[[ForceSample], None] | None) -> None:
         """Hand every sample to `on_sample`, in the event loop; None ends it."""
@@ -386,7 +374,7 @@ class SriM8123:
 
     @property
     def stream(self) -> RoundStream:
-        """Rate and counters since `connect`. Raises `NotConnected`; a lost connection still has them."""
+        """Counters since `connect`. Raises `NotConnected`; a lost connection still has them."""
         if self._stream is None:
             raise NotConnected(DEVICE, "stream", "not connected")
         return self._stream

@@ -60,17 +60,15 @@ def find_reply(received: bytes, request: bytes) -> int | None:
     Noise before the reply is skipped: the CRC decides where a frame is. Of two replies the one that ends first
     counts, so the result does not depend on how the bytes were split.
     """
-    confirmed = received.find(request)
-    before = received if confirmed < 0 else received[: confirmed + len(request) - 1]
     head = bytes([request[0], request[1] | EXCEPTION_BIT])
-    start = before.find(head)
-    while 0 <= start <= len(before) - EXCEPTION_BYTES:
-        frame = before[start : start + EXCEPTION_BYTES]
+    for end in range(EXCEPTION_BYTES, len(received) + 1):
+        if received.endswith(request, 0, end):
+            return 0
+        frame = received[end - EXCEPTION_BYTES : end]
         # Code 0 is not an exception, and would read as a confirmation.
-        if seal(frame[:3]) == frame and frame[2]:
+        if frame.startswith(head) and seal(frame[:3]) == frame and frame[2]:
             return frame[2]
-        start = before.find(head, start + 1)
-    return None if confirmed < 0 else 0
+    return None
 
 
 SPEED_REGISTER = 1

@@ -12,7 +12,7 @@ import time
 import tty
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol, Self
+from typing import Self
 
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.ink import pump
@@ -23,26 +23,17 @@ LATE_S = 0.3
 RESERVOIR_ML = 100.0
 
 
-class Instrument(Protocol):
-    """The device at the other end of the line; bytes in, bytes out."""
-
-    def take(self, buffer: bytearray) -> bytes | None:
-        """Remove one request from the buffer; None while it is incomplete."""
-        ...
-
-    def answer(self, request: bytes) -> bytes | None:
-        """Carry out the request and reply; None for silence."""
-        ...
-
-
 class PtyLine:
     """An instrument on a pseudo terminal, served by the running event loop; open `path` as the serial port.
+
+    Its method `take` removes one request from a buffer, None while it is incomplete; `answer` carries it out and
+    returns the reply, None for silence.
 
     `path` is a link of its own that goes with the cable, as udev's do: the kernel gives the number of a closed
     terminal to the next one, so a driver that connects again by number would reach another instrument.
     """
 
-    def __init__(self, instrument: Instrument) -> None:
+    def __init__(self, instrument: StationFirmware | PumpFirmware) -> None:
         self.instrument = instrument
         self.path = ""
         self.next_fault: Callable[[], str | None] = lambda: None
@@ -152,7 +143,7 @@ class StationFirmware:
         self._memory: tuple[bytes, bytes] = (b"", b"")
 
     def take(self, buffer: bytearray) -> bytes | None:
-        """One line."""
+        """Take one line; None while it is incomplete."""
         if b"\n" not in buffer:
             return None
         line, newline, buffer[:] = buffer.partition(b"\n")

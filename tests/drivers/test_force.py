@@ -165,7 +165,7 @@ async def test_a_sensor_that_says_the_same_again_and_again_is_named_as_stuck(
     with served(channel, ForceBoard(lambda _: WRENCH, noise_n=0.002, noise_nm=2e-4)) as board:
         sensor = sensor_on(channel)
         await sensor.connect()
-        await until(lambda: sensor.stream.rounds > 50, "rounds")
+        await until(lambda: sensor.latest().stamp.seq > 50, "rounds")
         assert sensor.latest().force_n == pytest.approx(WRENCH[:3], abs=0.02)
         board.next_fault = lambda: "stuck"
         await until(lambda: isinstance(latest_error(sensor), Stuck), "a stuck sensor")
