@@ -9,16 +9,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from brushloop.drivers.arcs.wire import RpcConnection
-from brushloop.drivers.force.simulator import ForceBoard
 from brushloop.drivers.ink.simulator import PtyLine
 from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
-
-
-def fail_rounds(board: ForceBoard, *faults: str) -> None:
-    """Apply these faults to the board's next rounds, one each."""
-    coming = iter(faults)
-    board.next_fault = lambda: next(coming, None)
 
 
 @dataclass

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import AsyncIterator, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from itertools import count, pairwise
 
 import can
@@ -22,7 +23,6 @@ from brushloop.drivers.force import sri_m8123
 from brushloop.drivers.force.simulator import CanFrame, ForceBoard
 from brushloop.drivers.force.sri_m8123 import FIRST_ID, ForceTable, RoundAssembler, SriM8123, Wrench, encode_round
 from brushloop.drivers.host import HostClock
-from tests.drivers.failing import fail_rounds
 from tests.waiting import until
 
 WRENCH: Wrench = (1.0, -2.0, 3.5, 0.25, -0.5, 0.125)
@@ -49,14 +49,7 @@ def served(channel: str, board: ForceBoard, rate_hz: float = 200.0) -> Iterator[
             elif time.monotonic() >= due_s:
                 due_s = max(due_s + 1.0 / rate_hz, time.monotonic())
                 for frame in board.round(due_s - began_s):
-                    bus.send(
-                        can.Message(
-                            arbitration_id=frame.can_id,
-                            is_extended_id=frame.error,
-                            is_error_frame=frame.error,
-                            data=frame.data,
-                        )
-                    )
+                    bus.send(can.Message(0.0, frame.can_id, frame.error, False, frame.error, data=frame.data))
 
     thread = threading.Thread(target=stream, daemon=True)
     thread.start()
@@ -97,8 +90,7 @@ def readers() -> int:
 async def test_connecting_starts_the_board_and_closing_stops_it(board: ForceBoard, channel: str):
     sensor = sensor_on(channel)
     identity = await sensor.connect()
-    assert identity.model == f"SRI M8123B2 on virtual {channel}"
-    assert identity.simulated
+    assert (identity.model, identity.simulated) == (f"SRI M8123B2 on virtual {channel}", True)
     assert sensor.latest().force_n == WRENCH[:3]
     assert sensor.latest().torque_nm == WRENCH[3:]
     await sensor.close()
@@ -179,10 +171,10 @@ async def test_a_sensor_that_says_the_same_again_and_again_is_named_as_stuck(
 async def test_bus_off_is_a_lost_connection_that_says_what_to_do_and_a_bus_error_is_counted(
     board: ForceBoard, sensor: SriM8123
 ):
-    fail_rounds(board, "bus-error")
+    board.next_fault = partial(next, iter(["bus-error"]), None)
     await until(lambda: sensor.stream.bus_errors == 1, "the driver")
     assert sensor.latest().force_n == WRENCH[:3]
-    fail_rounds(board, "bus-off")
+    board.next_fault = partial(next, iter(["bus-off"]), None)
     await until(lambda: readers() == 0, "the driver")
     with pytest.raises(ConnectionLost, match=r"off after too many errors.*termination.*1000000 bit/s"):
         sensor.latest()
@@ -233,7 +225,6 @@ async def test_a_bias_is_subtracted_from_now_on(channel: str):
         sensor = sensor_on(channel)
         await sensor.connect()
         await sensor.bias(0.4)
-        assert sensor.latest().force_n == pytest.approx((0.0, 0.0, 0.0), abs=0.1)
         assert sensor.bias_wrench == pytest.approx(WRENCH, abs=0.02)
         seen: list[ForceSample] = []
         load[0] = (1.0, -2.0, 8.5, 0.25, -0.5, 0.125)
@@ -257,13 +248,10 @@ async def test_a_bias_while_something_moves_is_refused(channel: str, axis: int, 
         await sensor.close()
 
 
-async def test_over_silence_a_bias_is_refused(board: ForceBoard, sensor: SriM8123):
+async def test_a_bias_over_silence_is_refused_and_closing_ends_one(board: ForceBoard, sensor: SriM8123):
     board.next_fault = lambda: "silence"
     with pytest.raises(DeviceTimeout):
         await sensor.bias(0.4)
-
-
-async def test_closing_while_averaging_ends_in_an_error(sensor: SriM8123):
     averaging = asyncio.create_task(sensor.bias(1.0))
     await asyncio.sleep(0)
     await sensor.close()
@@ -280,22 +268,18 @@ def feed(parts: RoundAssembler, wrench: Sequence[float], leave_out: int = -1, at
 
 
 @pytest.mark.parametrize("leave_out", [0, 1, 2])
-def test_each_round_without_one_frame_is_dropped_and_counted_once(leave_out: int):
-    parts = RoundAssembler()
-    assert feed(parts, WRENCH) == [WRENCH]
-    for _ in range(5):
-        assert feed(parts, WRENCH, leave_out) == []
-    assert feed(parts, WRENCH) == [WRENCH]
-    assert (parts.torn, parts.refused) == (5, 0)
-
-
-def test_joining_in_mid_round_is_no_fault_and_a_frame_of_the_wrong_size_tears_its_round():
+def test_joining_in_mid_round_is_no_fault_and_each_round_without_one_frame_is_dropped_and_counted_once(leave_out: int):
     parts, (first, second, third) = RoundAssembler(), encode_round(WRENCH)
     assert parts.feed(*third, 0.0) is None
     assert feed(parts, WRENCH) == [WRENCH]
     assert parts.torn == 0
-    assert [parts.feed(*frame, 0.0) for frame in (first, (second[0], second[1][:4]), third)] == [None] * 3
-    assert parts.torn == 1
+    for _ in range(5):
+        assert feed(parts, WRENCH, leave_out) == []
+    assert feed(parts, WRENCH) == [WRENCH]
+    assert (parts.torn, parts.refused) == (5, 0)
+    cut = (second[0], second[1][:4])
+    assert [parts.feed(*frame, 0.0) for frame in (first, cut, third)] == [None] * 3
+    assert parts.torn == 6
 
 
 @pytest.mark.parametrize("bad", [math.nan, -math.inf, -1000.5])
@@ -311,8 +295,8 @@ def test_what_no_sensor_can_measure_is_refused(axis: int, bad: float):
 def injured(rounds: int, rng: random.Random) -> Iterator[tuple[int, bytes, float]]:
     """A stream of rounds of which some frames are lost, doubled, cut, late, or say what none could measure."""
     for number in range(rounds):
-        wrench = [rng.choice((rng.uniform(-9, 9), math.nan, math.inf, 3e38)) if rng.random() < 0.1 else 1.0] * 6
-        for can_id, data in encode_round(tuple(wrench)):  # type: ignore[arg-type]
+        value = rng.choice((rng.uniform(-9, 9), math.nan, math.inf, 3e38)) if rng.random() < 0.1 else 1.0
+        for can_id, data in encode_round((value,) * 6):
             late_s = rng.choice((-1.0, 0.006, 1e9, math.nan, math.inf)) if rng.random() < 0.1 else 0.0
             data = data[: rng.randint(0, 8)] + rng.randbytes(rng.randint(0, 2)) if rng.random() < 0.1 else data
             can_id = rng.randint(0x28F, 0x295) if rng.random() < 0.1 else can_id

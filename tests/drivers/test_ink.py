@@ -98,33 +98,23 @@ async def test_a_session_reads_like_the_documented_one(clock: PatientClock):
         assert refusal.value.code == 4
 
 
-async def test_a_lost_reply_is_asked_for_again_with_the_same_line_and_then_says_what_may_have_happened(
-    clock: PatientClock,
-):
-    again = seal(2, "dose 0.500")
-    exchanges = [(DOSE, b""), (DOSE, b"001 ok 0.500*41C5\n"), (again, b""), (again, b"")]
-    async with talking(clock, *exchanges) as station:
-        await station.dose(0.5)
-        with pytest.raises(DeviceTimeout, match=r"Between 0 and 0.500 ml may be in the well"):
-            await station.dose(0.5)
-
-
 @pytest.mark.parametrize(
-    ("request_line", "reply", "error", "says"),
+    ("exchanges", "error", "says"),
     [
-        (LEVEL, b"001 ok 1.5*CD6C\n", ProtocolViolation, "above 1"),
-        (LEVEL, b"001 ok nan*1429\n", ProtocolViolation, "not a decimal"),
-        (LEVEL, b"001 ok*C626\n", ProtocolViolation, "not a decimal: ''"),
-        (LEVEL, b"001 err 6 jammed*4073\n", InkRefused, "Look at the pump"),
-        (DOSE, b"001 ok 0.400*8194\n", DeviceError, r"gave 0.400 ml instead of 0.500 ml"),
+        ([(LEVEL, b"001 ok 1.5*CD6C\n")], ProtocolViolation, "above 1"),
+        ([(LEVEL, b"001 ok nan*1429\n")], ProtocolViolation, "not a decimal"),
+        ([(LEVEL, b"001 ok*C626\n")], ProtocolViolation, "not a decimal: ''"),
+        ([(LEVEL, b"001 err 6 jammed*4073\n")], InkRefused, "Look at the pump"),
+        ([(DOSE, b"001 ok 0.400*8194\n")], DeviceError, r"gave 0.400 ml instead of 0.500 ml"),
+        ([(DOSE, b""), (DOSE, b"")], DeviceTimeout, r"Between 0 and 0.500 ml may be in the well"),
     ],
 )
-async def test_a_reply_that_makes_no_sense_is_an_error(
-    clock: PatientClock, request_line: bytes, reply: bytes, error: type[DeviceError], says: str
+async def test_a_reply_that_is_lost_twice_or_makes_no_sense_is_an_error(
+    clock: PatientClock, exchanges: list[tuple[bytes, bytes]], error: type[DeviceError], says: str
 ):
-    async with talking(clock, (request_line, reply)) as station:
+    async with talking(clock, *exchanges) as station:
         with pytest.raises(error, match=says):
-            await (station.level() if request_line == LEVEL else station.dose(0.5))
+            await (station.level() if exchanges[0][0] == LEVEL else station.dose(0.5))
 
 
 async def test_a_board_that_starts_slowly_is_waited_for_and_another_device_is_refused(clock: PatientClock):
@@ -369,17 +359,21 @@ async def test_a_cancelled_dose_whose_stop_fails_says_so(rotor: PumpFirmware, pu
 
 
 @pytest.mark.parametrize("fault", ["deaf", "garbage", "late"])
-@pytest.mark.parametrize("at", ["start", "stop"])
-async def test_a_fault_anywhere_leaves_the_pump_stopped(
+@pytest.mark.parametrize("at", ["speed", "start", "stop"])
+async def test_a_fault_anywhere_leaves_the_pump_stopped_and_no_late_reply_passes_for_the_next(
     fault: str, at: str, rotor: PumpFirmware, pump_line: PtyLine, pump: ModbusPump, clock: PatientClock
 ):
-    fail_requests(pump_line, clock, *[None] * {"start": 1, "stop": 2}[at], fault)
+    fail_requests(pump_line, clock, *[None] * ("speed", "start", "stop").index(at), fault)
     if at == "stop":
         await pump.dose(0.01)  # the second stop is confirmed
     else:
-        with pytest.raises(DeviceError):
+        with pytest.raises(DeviceError, match="not started" if at == "speed" else "is stopped"):
             await pump.dose(0.01)
     assert not rotor.running
+    starts = rotor.starts
+    assert starts == (at == "stop" or (at == "start" and fault != "deaf"))
+    await pump.dose(0.01)
+    assert rotor.starts == starts + 1
 
 
 @pytest.mark.parametrize("after_requests", [0, 1, 2])
@@ -396,16 +390,6 @@ async def test_closing_in_mid_dose_leaves_the_pump_stopped(
     with pytest.raises(NotConnected):
         await dosing
     assert not rotor.running
-
-
-async def test_a_late_reply_does_not_pass_for_the_next(
-    pump_line: PtyLine, rotor: PumpFirmware, pump: ModbusPump, clock: PatientClock
-):
-    fail_requests(pump_line, clock, "late")
-    with pytest.raises(DeviceTimeout, match="not started"):
-        await pump.dose(0.01)
-    await pump.dose(0.01)
-    assert rotor.starts == 1
 
 
 async def test_a_host_that_was_held_up_reports_the_excess(
