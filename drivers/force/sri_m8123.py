@@ -1,14 +1,7 @@
 """A six-axis force sensor on a Sunrise SRI M8123B2 board, over python-can.
 
 The frame format is from public third-party code, not from the maker's manual; no board has confirmed it yet: three
-frames per round, two float32 each, low byte first.
-
-| id | direction | bytes |
-|---|---|---|
-| 0x080 | to the board | 02 starts the stream, 00 stops it |
-| 0x291 | from the board | Fx, Fy in N |
-| 0x292 | from the board | Fz in N, Mx in Nm |
-| 0x293 | from the board | My, Mz in Nm |
+frames per round, two float32 each, low byte first; see docs/zero-touch.md.
 
 The frames carry no counter: only their order and timing show which three belong together. The sensor needs a CAN
 adapter and a bus of its own: the arm's internal bus is never touched. A thread owns the bus from open to shutdown and

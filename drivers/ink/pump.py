@@ -49,11 +49,6 @@ def write_register(unit: int, register: int, value: int) -> bytes:
     return seal(struct.pack(">BBHH", unit, WRITE_REGISTER, register, value))
 
 
-def exception(unit: int, function: int, code: int) -> bytes:
-    """The exception reply of a unit that refuses a request."""
-    return seal(bytes([unit, function | EXCEPTION_BIT, code]))
-
-
 def find_reply(received: bytes, request: bytes) -> int | None:
     """0 if `received` confirms `request`, the code if it is an exception, None while it is neither.
 

@@ -81,17 +81,12 @@ class PtyLine:
             self.unplug()
             return
         reply = None if fault == "deaf" else self.instrument.answer(request)
-        if reply is None:
+        if reply is None or fault == "mute":
             return
-        match fault:
-            case "mute":
-                pass
-            case "garbage":
-                self._write(GARBAGE)
-            case "late":
-                asyncio.get_running_loop().call_later(LATE_S, self._write, reply)
-            case _:
-                self._write(reply)
+        if fault == "late":
+            asyncio.get_running_loop().call_later(LATE_S, self._write, reply)
+        else:
+            self._write(GARBAGE if fault == "garbage" else reply)
 
 
 BRUSH_ML = 0.5
@@ -215,19 +210,16 @@ class PumpFirmware:
         return frame
 
     def answer(self, request: bytes) -> bytes | None:
-        """The reply; None for a wrong CRC or another unit, as Modbus requires."""
+        """The request again; None for a wrong CRC or another unit, as Modbus requires, and for what no driver sends."""
         unit, function, register, value = struct.unpack(">BBHH", request[:-2])
-        if pump.seal(request[:-2]) != request or unit != 1:
+        if pump.seal(request[:-2]) != request or (unit, function) != (1, pump.WRITE_REGISTER):
             return None
         self._settle()
-        match function, register:
-            case pump.WRITE_REGISTER, pump.SPEED_REGISTER:
-                self.rpm = value / 100
-            case pump.WRITE_REGISTER, pump.RUN_REGISTER:
-                self.starts += value != pump.STOP and not self.running
-                self.running = value != pump.STOP
-            case _:
-                return pump.exception(unit, function & 0x7F, 1)
+        if register == pump.SPEED_REGISTER:
+            self.rpm = value / 100
+        elif register == pump.RUN_REGISTER:
+            self.starts += value != pump.STOP and not self.running
+            self.running = value != pump.STOP
         return request
 
     def _settle(self) -> None:

@@ -121,9 +121,6 @@ PUBLISHED: list[tuple[bytes, bytes]] = [
         bytes.fromhex("0291 0000803f 000000c0  0292 00006040 0000803e  0293 000000bf 0000003e"),
     ),
     (COMMAND_ID.to_bytes(2) + START_BOARD + STOP_BOARD, bytes.fromhex("0080 02 00")),
-    (pump.write_register(1, 1, 5000), bytes.fromhex("01 06 00 01 13 88 D5 5C")),
-    (START, bytes.fromhex("01 06 00 04 00 01 09 CB")),
-    (pump.write_register(1, 4, 0), bytes.fromhex("01 06 00 04 00 00 C8 0B")),
     (
         b"".join(FrameDecoder().feed(bytes.fromhex("53 4f 46 01 00 00 00 02 4f 4b") + b"SOF\x00\x00\x05hello")),
         b"OKhello",
@@ -202,8 +199,15 @@ LINES = [
     station.seal(5, text) for text in ("ok", "ok 0.730 1.250", "err 4 reservoir is empty", "ok nan inf 1e999", "hello")
 ]
 LINES += [LINES[0] + LINES[1], b"\r\n" + LINES[2], station.seal(4, "ok 1.0") + LINES[1]]
-REFUSAL = pump.exception(1, 6, 4)
-FRAMES = [START, REFUSAL, pump.write_register(1, 1, 6000), pump.exception(2, 6, 1), REFUSAL + START, START + REFUSAL]
+
+
+def refusal_of(unit: int, code: int) -> bytes:
+    """The exception reply of a pump that refuses a write."""
+    return pump.seal(bytes([unit, 0x86, code]))
+
+
+REFUSAL = refusal_of(1, 4)
+FRAMES = [START, REFUSAL, pump.write_register(1, 1, 6000), refusal_of(2, 1), REFUSAL + START, START + REFUSAL]
 VALUES: list[list[Any]] = [
     [0, POSE],
     [0, "Running", True, None, 5, -(2**63), 1.5e300, {"a": [1, {"b": "c"}]}],
@@ -355,7 +359,7 @@ def test_a_sound_line_that_is_no_reply_or_answers_another_request_is_passed_over
 
 def test_confirmations_of_other_units_registers_and_values_are_passed_over():
     others = pump.write_register(2, 4, 1) + pump.write_register(1, 1, 1) + pump.write_register(1, 4, 0)
-    others += pump.exception(2, 6, 2) + pump.exception(1, 6, 0)
+    others += refusal_of(2, 2) + refusal_of(1, 0)
     assert pump.find_reply(others, START) is None
     assert pump.find_reply(others + START, START) == 0
     assert pump.find_reply(REFUSAL + START, START) == 4

@@ -1,15 +1,6 @@
 """The constants of one individual simulated brush, with their allowed ranges, and the TOML file that describes it.
 
-```toml
-name = "our goat-hair brush no. 3, simulated"   # in every recording and report made with it
-[brush]
-stiffness_n_mm2 = 150.0                         # the fields of `BrushSpec`; a field that is left out has its default
-[camera]
-noise = 1.4                                     # gray levels; may be left out
-[quality]                                       # for the `[quality]` of the rig.toml; may be left out
-head_mm = 2.2
-misplaced_mm = 4.0
-```
+docs/loopback-brush.md shows such a file; a field of `BrushSpec` that it leaves out has its default.
 """
 
 from __future__ import annotations
