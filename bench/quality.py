@@ -194,8 +194,7 @@ class Bench:
                 u, v = self._scene.optics.image_of(np.array([place]))[0]
                 x, y = np.arange(view.width_px) - u, np.arange(view.height_px)[:, None] - v
                 glare = peak * np.exp(-0.5 * (x**2 + y**2) / (sigma_mm * view.px_per_mm) ** 2)
-                image = np.clip(self._render() + glare, 0.0, 255.0).astype(np.uint8)
-                return dataclasses.replace(sample, image=image)
+                return dataclasses.replace(sample, image=np.clip(self._render() + glare, 0.0, 255.0).astype(np.uint8))
             case Failure.EXPOSURE:
                 sheet = self._scene.optics.homography @ np.array([*np.array(self.table.sheet_mm) / 2, 1.0])
                 u, v = (round(float(q)) for q in sheet[:2] / sheet[2])

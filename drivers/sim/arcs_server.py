@@ -13,12 +13,12 @@ from typing import Any, cast
 
 from brushloop.drivers.arcs.telemetry import MAX_MESSAGE_BYTES, SET_RECIPE, decode_message, encode_sample
 from brushloop.drivers.arcs.wire import PING, BareDecoder, FrameDecoder, encode, parameters
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.geometry import to_wire
 from brushloop.drivers.loopback import LoopbackServer
 from brushloop.drivers.sim.cabinet import Cabinet, methods
 from brushloop.drivers.sim.faults import KINDS, LOST, STOPS, Device, Fault, FaultBoard
-from brushloop.drivers.sim.motion import Rest
 from brushloop.drivers.sim.world import World
 
 PIECE_S = 0.001
@@ -191,37 +191,35 @@ class RtdeServer(LoopbackServer):
             await asyncio.gather(*pushes.values(), return_exceptions=True)
 
     async def _push(self, chanel: int, period_s: float, names: list[str], writer: asyncio.StreamWriter) -> None:
-        loop = asyncio.get_running_loop()
+        loop, world = asyncio.get_running_loop(), self._cabinet.world
         due, before_s = loop.time(), self._cabinet.now_s()
         while not writer.is_closing():
-            now_s = self._cabinet.now_s()
+            now_s, tip = self._cabinet.now_s(), world.tool()
             if writer.transport.get_write_buffer_size() < BACKLOG_BYTES:
-                for rest in (*self._rests(before_s, now_s), None):
-                    self._push_once(chanel, [self._value(name, rest) for name in names], writer)
+                # With fast simulated time a whole press might pass between two pushes: rests are pushed too.
+                rests = [
+                    rest for rest in world.motion.rests if before_s < rest.at_s <= now_s and world.clock.rate > 1.0
+                ]
+                for at_s, pose in (*((rest.at_s, rest.pose) for rest in rests), (now_s, tip)):
+                    self._push_once(chanel, [self._value(name, at_s, pose) for name in names], writer)
             before_s = now_s
             due = max(due + period_s, loop.time())
             await asyncio.sleep(due - loop.time())
 
-    def _rests(self, after_s: float, until_s: float) -> list[Rest]:
-        """Rests of the arm between two pushes. With fast simulated time a whole press might pass between them."""
-        world = self._cabinet.world
-        world.motion.advance(until_s)
-        return [rest for rest in world.motion.rests if after_s < rest.at_s <= until_s] if world.clock.rate > 1.0 else []
-
-    def _value(self, name: str, rest: Rest | None) -> Any:
-        """An output as it is now, or as it was when the arm came to rest."""
+    def _value(self, name: str, at_s: float, tip: Pose) -> Any:
+        """An output with the arm there."""
         cabinet = self._cabinet
         match name:
             case "timestamp":
-                return cabinet.now_s() if rest is None else rest.at_s
+                return at_s
             case "R1_actual_q":
-                return list(cabinet.joints() if rest is None else cabinet.motion.near_joints(rest.pose))
+                return list(cabinet.motion.near_joints(tip))
             case "R1_robot_mode":
                 return cabinet.power.mode.value
             case "R1_safety_mode":
                 return cabinet.power.safety.value
             case _:
-                return to_wire(cabinet.tcp() if rest is None else cabinet.configured(rest.pose))
+                return to_wire(cabinet.configured(tip))
 
     def _push_once(self, chanel: int, values: list[Any], writer: asyncio.StreamWriter) -> None:
         fault = self.faults.meet(Device.TELEMETRY)

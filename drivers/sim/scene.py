@@ -41,7 +41,13 @@ class Optics:
         self.light = _light(view, np.random.default_rng([seed, 11]))
         self.camera_matrix = camera_matrix(view)
         self.distortion: Floats = np.array([view.k1, 0.0, 0.0, 0.0])
-        self._map = self._undistorted_places(view) if view.k1 else None
+        self._map = None
+        """(h, w, 2): for every pixel of the distorted image, its place in the undistorted one."""
+        if view.k1:
+            columns, rows = np.meshgrid(np.arange(view.width_px), np.arange(view.height_px))
+            pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2).astype(np.float64)
+            places = cv2.undistortPoints(pixels, self.camera_matrix, self.distortion, P=self.camera_matrix)
+            self._map = places.reshape(view.height_px, view.width_px, 2).astype(np.float32)
 
     def image_of(self, paper_mm: Floats) -> Floats:
         """(n, 2) pixels (centres on integers) of (n, 2) points of the paper plane, distortion included."""
@@ -57,13 +63,6 @@ class Optics:
             return undistorted
         distorted = cv2.remap(undistorted, self._map, np.empty(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return cast("NDArray[np.uint8]", distorted)
-
-    def _undistorted_places(self, view: View) -> NDArray[np.float32]:
-        """(h, w, 2): for every pixel of the distorted image, its place in the undistorted one."""
-        columns, rows = np.meshgrid(np.arange(view.width_px), np.arange(view.height_px))
-        pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2).astype(np.float64)
-        places = cv2.undistortPoints(pixels, self.camera_matrix, self.distortion, P=self.camera_matrix)
-        return places.reshape(view.height_px, view.width_px, 2).astype(np.float32)
 
 
 def mapped(homography: Floats, points: Floats) -> Floats:
@@ -202,8 +201,7 @@ class Scene:
         kept = 1.0 - (1.0 - INK_REFLECTANCE) * self._world.paper.density
         raster[sheet] = (raster[sheet] * kept).astype(np.uint8)
         # raster pixel centres (cv2 convention) -> mm in the paper frame -> image
-        (left_mm, bottom_mm), (_, along_mm) = _extent(table)
-        s, top_mm = 1.0 / PX_PER_MM, bottom_mm + along_mm
+        (left_mm, top_mm), s = _upper_left_mm(table), 1.0 / PX_PER_MM
         to_mm = np.array([[s, 0, left_mm + 0.5 * s], [0, -s, top_mm - 0.5 * s], [0, 0, 1]])
         return self._photograph(raster, self.optics.homography @ to_mm, TABLE_GRAY)
 
@@ -250,19 +248,17 @@ def _print(table: Table, px_per_mm: float, edge_mm: float) -> NDArray[np.uint8]:
     return np.pad(inked, round(edge_mm * px_per_mm), constant_values=WHITE)
 
 
-def _extent(table: Table) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Lower left corner, in the paper frame, and size of what is drawn, in mm: the board and a margin of table."""
-    left, bottom = (v - MARGIN_MM for v in table.board_origin_mm)
-    across, along = (n * table.board_square_mm + 2 * MARGIN_MM for n in table.board_squares)
-    return (left, bottom), (across, along)
+def _upper_left_mm(table: Table) -> tuple[float, float]:
+    """The corner of what is drawn, in the paper frame: the board and a margin of table."""
+    (left, bottom), (_, height) = table.board_origin_mm, table.board_size_mm
+    return left - MARGIN_MM, bottom + height + MARGIN_MM
 
 
 def _sheet_slices(table: Table) -> tuple[slice, slice]:
     """Rows and columns of the sheet in the drawn raster."""
-    (left_mm, bottom_mm), (_, along_mm) = _extent(table)
-    top = round((along_mm - (table.sheet_mm[1] - bottom_mm)) * PX_PER_MM)
-    left = round(-left_mm * PX_PER_MM)
+    left_mm, top_mm = _upper_left_mm(table)
     width, height = (round(v * PX_PER_MM) for v in table.sheet_mm)
+    top, left = round((top_mm - table.sheet_mm[1]) * PX_PER_MM), round(-left_mm * PX_PER_MM)
     return slice(top, top + height), slice(left, left + width)
 
 
@@ -272,14 +268,9 @@ def _draw(
 ) -> tuple[NDArray[np.uint8], list[NDArray[np.float32]]]:
     """The blank sheet on its board, and fields of noise of `shape`: the same for every rig of this configuration."""
     rng = np.random.default_rng([seed, 7])
-    (left_mm, bottom_mm), size_mm = _extent(table)
-    width, height = (round(v * PX_PER_MM) for v in size_mm)
-    raster = np.full((height, width), TABLE_GRAY, np.uint8)
-    fibre = cv2.GaussianBlur(rng.normal(0.0, 6.0, (height, width)).astype(np.float32), (0, 0), 3.0)
-    picture, edge = _print(table, PX_PER_MM, TRIMMED_EDGE_MM), round(TRIMMED_EDGE_MM * PX_PER_MM)
-    x, y = table.board_origin_mm
-    bottom, left = round((size_mm[1] - (y - bottom_mm)) * PX_PER_MM) + edge, round((x - left_mm) * PX_PER_MM) - edge
-    raster[bottom - picture.shape[0] : bottom, left : left + picture.shape[1]] = picture
+    around_px = round((MARGIN_MM - TRIMMED_EDGE_MM) * PX_PER_MM)
+    raster = np.pad(_print(table, PX_PER_MM, TRIMMED_EDGE_MM), around_px, constant_values=TABLE_GRAY)
+    fibre = cv2.GaussianBlur(rng.normal(0.0, 6.0, raster.shape).astype(np.float32), (0, 0), 3.0)
     sheet = _sheet_slices(table)
     raster[sheet] = np.clip(PAPER_GRAY + fibre[sheet], 0, 255).astype(np.uint8)
     return raster, [rng.normal(0.0, noise, shape).astype(np.float32) for _ in range(NOISE_FIELDS)]
