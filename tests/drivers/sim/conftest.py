@@ -1,8 +1,7 @@
-"""A cabinet on a clock that the test turns, and a rig that serves."""
+"""A cabinet on a clock that the test turns."""
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
@@ -10,8 +9,7 @@ import pytest
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import distance, to_wire
 from brushloop.drivers.sim.cabinet import Cabinet, methods
-from brushloop.drivers.sim.config import SimConfig, View
-from brushloop.drivers.sim.rig import LoopbackRig
+from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.world import World
 
 TOOL = [0.0, 0.0, 0.18, 0.0, 0.0, 0.0]
@@ -55,10 +53,6 @@ class Bench:
         self.clock.s += 1.5
 
     @property
-    def mode(self) -> str:
-        return self.ask("RobotState.getRobotModeType")
-
-    @property
     def safety(self) -> str:
         return self.ask("RobotState.getSafetyModeType")
 
@@ -79,16 +73,3 @@ def off() -> Bench:
 def on(off: Bench) -> Bench:
     off.run()
     return off
-
-
-@pytest.fixture
-def small_view() -> View:
-    """A camera image that renders in a few milliseconds."""
-    return View(width_px=640, height_px=480, px_per_mm=1.95)
-
-
-@pytest.fixture
-async def rig(small_view: View) -> AsyncIterator[LoopbackRig]:
-    """Everything that a rig has, 20 times faster than life."""
-    async with LoopbackRig(SimConfig(rate=20.0, view=small_view)) as it:
-        yield it

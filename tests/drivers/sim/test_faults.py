@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import pytest
@@ -112,48 +113,42 @@ def test_what_cannot_be_used_is_refused_with_one_printable_line(fields: dict[str
 
 
 TABLE = Table()
-OVER, NEAR, ON, IN = ((100.0, 80.0, h) for h in (60.0, 8.0, 0.03, -15.0))
-WELL, INK = (*TABLE.well_mm, 60.0), (*TABLE.well_mm, 2.0)
-HOME = None
-"""Where the tip rests when the rig starts."""
+HOME, OVER, NEAR, ON, IN, WELL, INK = (
+    brush_pose(*place)
+    for place in (
+        SimConfig().home_mm,
+        *(TABLE.to_base(100.0, 80.0, above_mm) for above_mm in (60.0, 8.0, 0.03, -15.0)),
+        *(TABLE.to_base(*TABLE.well_mm, above_mm) for above_mm in (60.0, 2.0)),
+    )
+)
+JOURNEY = (
+    (HOME, Phase.PARKED, Phase.PARKED),
+    (OVER, Phase.TRAVELLING, Phase.RESTING),
+    (NEAR, Phase.TRAVELLING, Phase.RESTING),  # the fast approach ends above the paper
+    (ON, Phase.DESCENDING, Phase.PRESSED),
+    (IN, Phase.DESCENDING, Phase.PRESSED),
+    (NEAR, Phase.LIFTING, Phase.RESTING),
+    (OVER, Phase.LIFTING, Phase.RESTING),
+    (WELL, Phase.TRAVELLING, Phase.RESTING),
+    (INK, Phase.DIPPING, Phase.DIPPING),
+    (WELL, Phase.DIPPING, Phase.RESTING),
+    (HOME, Phase.TRAVELLING, Phase.PARKED),
+)
+"""Where the arm is sent next, and its phases as it sets out and once it is there."""
 
 
-def doing(*poses: Pose, table: Table = TABLE) -> Phase:
-    """What the arm does when it has just set out for the last pose from the one before."""
+def phases(poses: Iterable[Pose], table: Table = TABLE) -> Iterator[tuple[Phase, Phase]]:
     world = World(SimConfig(table=table))
     world.clock = clock = StoppedClock()  # type: ignore[assignment]
     for pose in poses:
-        clock.s += 100.0
         world.motion.add(pose, 200.0, 1000.0, clock.s)
-    return phase_of(world)
+        setting_out = phase_of(world)
+        clock.s += 100.0
+        yield setting_out, phase_of(world)
 
 
-@pytest.mark.parametrize(
-    ("here", "to", "phase"),
-    [
-        (HOME, HOME, Phase.PARKED),
-        (OVER, OVER, Phase.RESTING),
-        (HOME, OVER, Phase.TRAVELLING),
-        (OVER, NEAR, Phase.TRAVELLING),  # the fast approach ends above the paper
-        (NEAR, ON, Phase.DESCENDING),
-        (ON, IN, Phase.DESCENDING),
-        (ON, ON, Phase.PRESSED),
-        (IN, IN, Phase.PRESSED),
-        (IN, NEAR, Phase.LIFTING),
-        (NEAR, OVER, Phase.LIFTING),
-        (OVER, HOME, Phase.TRAVELLING),
-        (HOME, WELL, Phase.TRAVELLING),
-        (WELL, INK, Phase.DIPPING),
-        (INK, INK, Phase.DIPPING),
-        (INK, WELL, Phase.DIPPING),
-        (WELL, HOME, Phase.TRAVELLING),
-    ],
-)
-def test_each_piece_of_a_press_and_of_a_dip_has_its_phase(
-    here: tuple[float, float, float] | None, to: tuple[float, float, float] | None, phase: Phase
-) -> None:
-    spots = [SimConfig().home_mm if spot is None else TABLE.to_base(*spot) for spot in (here, to)]
-    assert doing(*(brush_pose(*spot) for spot in spots)) is phase
+def test_each_piece_of_a_press_and_of_a_dip_has_its_phases() -> None:
+    assert list(phases(pose for pose, *_ in JOURNEY)) == [(there, then) for _, there, then in JOURNEY]
 
 
 @pytest.mark.parametrize(("above_mm", "phase"), [(3.0, Phase.RESTING), (0.05, Phase.PRESSED), (-2.0, Phase.PRESSED)])
@@ -162,5 +157,5 @@ def test_on_a_sloping_sheet_heights_count_from_the_paper_under_the_tip(
     corner_mm: tuple[float, float], above_mm: float, phase: Phase
 ) -> None:
     table = Table(yaw_deg=0.0, slope_deg=(1.0, -1.0))
-    pose = brush_pose(*table.to_base(*corner_mm, above_mm))
-    assert doing(pose, pose, table=table) is phase
+    [(_, at_rest)] = phases([brush_pose(*table.to_base(*corner_mm, above_mm))], table)
+    assert at_rest is phase

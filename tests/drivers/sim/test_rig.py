@@ -31,41 +31,43 @@ from brushloop.drivers.sim.brush.spec import SimFileError
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 from brushloop.drivers.sim.rig import HOST, ControlServer, LoopbackRig, live_control, serve
-from brushloop.drivers.sim.scene import MjpegServer, Scene, board, homography
+from brushloop.drivers.sim.scene import MjpegServer, Scene, board
 from brushloop.drivers.sim.world import World
 from tests.command import brushloop
 from tests.waiting import until
 
+SMALL = SimConfig(rate=20.0, view=View(width_px=640, height_px=480, px_per_mm=1.95))
+
 
 @pytest.fixture
-def config(small_view: View) -> SimConfig:
-    return SimConfig(rate=20.0, view=small_view)
+async def rig() -> AsyncIterator[LoopbackRig]:
+    """Everything that a rig has, 20 times faster than life."""
+    async with LoopbackRig(SMALL) as it:
+        yield it
 
 
-async def test_a_taken_port_leaves_no_half_a_rig(config: SimConfig):
+async def test_a_taken_port_leaves_no_half_a_rig():
     async with await asyncio.start_server(lambda *_: None, HOST, 0) as other:
         taken = other.sockets[0].getsockname()[1]
-        rig = LoopbackRig(SimConfig(view=config.view, camera_port=taken))
+        rig = LoopbackRig(replace(SMALL, camera_port=taken))
         with pytest.raises(OSError, match="in use"):
             await rig.__aenter__()
         with pytest.raises(OSError):  # noqa: PT011 (refused)
             await asyncio.open_connection(HOST, rig.arcs.port)
 
 
-async def test_serving_ends_by_itself_and_leaves_a_rig_toml_unless_another_file_stands_there(
-    config: SimConfig, tmp_path: Path
-):
+async def test_serving_ends_by_itself_and_leaves_a_rig_toml_unless_another_file_stands_there(tmp_path: Path):
     target, lines = tmp_path / "rig.toml", list[str]()
-    await serve(LoopbackRig(config), lines.append, write_rig=target, idle_exit_s=0.2)
+    await serve(LoopbackRig(SMALL), lines.append, write_rig=target, idle_exit_s=0.2)
     assert tomllib.loads(target.read_text())["robot"]["host"] == HOST == "127.0.0.1"
     assert [p.name for p in tmp_path.iterdir()] == ["rig.toml"]
     assert str(target) in lines[0]
     target.write_text("name = 'our rig'")
     with pytest.raises(SimFileError, match="was not written by a loopback rig"):
-        await serve(LoopbackRig(config), lines.append, write_rig=target)
+        await serve(LoopbackRig(SMALL), lines.append, write_rig=target)
     (tmp_path / "other.toml.part").mkdir()
     with pytest.raises(SimFileError, match=r"other\.toml: cannot be written: Is a directory"):
-        await serve(LoopbackRig(config), lines.append, write_rig=tmp_path / "other.toml")
+        await serve(LoopbackRig(SMALL), lines.append, write_rig=tmp_path / "other.toml")
 
 
 async def test_a_rig_with_a_client_is_not_idle(rig: LoopbackRig):
@@ -230,19 +232,9 @@ def test_where_no_rig_answers_it_is_said_in_one_line(tmp_path: Path):
 CONFIG = SimConfig(view=View(width_px=1024, height_px=768, px_per_mm=3.125))
 
 
-@pytest.fixture(scope="module")
-def scene() -> Scene:
-    return Scene(World(CONFIG))
-
-
-def pixel(x_mm: float, y_mm: float) -> tuple[int, int]:
-    """(column, row) of a point of the paper frame."""
-    u, v, w = homography(CONFIG.view) @ np.array([x_mm, y_mm, 1.0])
-    return round(u / w), round(v / w)
-
-
-def gray_at(image: np.ndarray, x_mm: float, y_mm: float) -> float:
-    column, row = pixel(x_mm, y_mm)
+def gray_at(scene: Scene, image: np.ndarray, x_mm: float, y_mm: float) -> float:
+    """The mean around a point of the paper frame."""
+    [[column, row]] = scene.optics.image_of(np.array([[x_mm, y_mm]])).round().astype(int)
     return float(image[row - 3 : row + 4, column - 3 : column + 4].mean())
 
 
@@ -265,17 +257,16 @@ def test_ink_shows_in_the_very_next_frame():
     world = World(CONFIG)
     scene = Scene(world)
     image = scene.render()
-    before = gray_at(image, 60.0, 60.0)
+    before = gray_at(scene, image, 60.0, 60.0)
     assert not np.array_equal(image, scene.render()), "the noise is new"
     world.paper.density = np.ones_like(world.paper.density)
     world.version += 1
-    assert gray_at(scene.render(), 60.0, 60.0) < 0.3 * before
+    assert gray_at(scene, scene.render(), 60.0, 60.0) < 0.3 * before
 
 
 def test_the_arm_hides_what_is_under_it():
-    home = CONFIG.table.to_base(82.0, 74.0, 140.0)
-    image = Scene(World(replace(CONFIG, home_mm=home))).render()
-    assert gray_at(image, 82.0, 74.0) == pytest.approx(70.0, abs=3.0)
+    scene = Scene(World(replace(CONFIG, home_mm=CONFIG.table.to_base(82.0, 74.0, 140.0))))
+    assert gray_at(scene, scene.render(), 82.0, 74.0) == pytest.approx(70.0, abs=3.0)
 
 
 async def test_no_late_picture_overtakes_another_and_the_server_notices_that_its_client_has_gone():

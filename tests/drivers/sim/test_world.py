@@ -67,24 +67,21 @@ def test_the_frozen_brushes_and_the_papers_press_and_draw_what_they_always_did()
     assert force_n == pytest.approx(PUSHED_N, rel=1e-4)
 
 
-def test_a_flaw_and_an_emptying_brush_take_the_ink_that_they_always_took(brush: Brush) -> None:
-    flawed = {flaw: brush.press(15.0, 5.0, ink_load=1.0, press_seed=1, flaw=flaw, severity=0.7) for flaw in FLAWED}
-    assert {flaw: float(mark.density.sum(dtype=float)) for flaw, mark in flawed.items()} == pytest.approx(
-        FLAWED, rel=1e-5
-    )
-    marks = {load: brush.press(15.0, 5.0, ink_load=load, press_seed=1) for load in EMPTYING}
-    assert {load: float(mark.density.sum(dtype=float)) for load, mark in marks.items()} == pytest.approx(
-        EMPTYING, rel=1e-5
-    )
+def ink_of(brush: Brush, depth_mm: float = 15.0, ink_load: float = 1.0, **flaw: Any) -> float:
+    press = brush.press(depth_mm, 5.0, ink_load=ink_load, press_seed=1, **flaw)
+    return float(press.density.sum(dtype=float))
+
+
+def test_a_flaw_and_an_emptying_brush_take_the_ink_that_they_always_took_and_no_touch_none(brush: Brush) -> None:
+    flawed = {flaw: ink_of(brush, flaw=flaw, severity=0.7) for flaw in FLAWED}
+    assert flawed == pytest.approx(FLAWED, rel=1e-5)
+    assert {load: ink_of(brush, ink_load=load) for load in EMPTYING} == pytest.approx(EMPTYING, rel=1e-5)
+    assert ink_of(brush, depth_mm=0.0) == 0.0
 
 
 @pytest.fixture(scope="module")
 def brush() -> Brush:
     return Brush(BrushSpec())
-
-
-def test_no_touch_no_ink(brush: Brush) -> None:
-    assert not brush.press(0.0, 5.0, ink_load=1.0, press_seed=1).density.any()
 
 
 @pytest.mark.parametrize(
