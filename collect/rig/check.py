@@ -96,19 +96,15 @@ def from_above(axes: Axes, config: RigConfig) -> None:
 
     limits, paper, board, places = limits_of(config), config.paper, config.board, places_of(config)
     axes.plot(0.0, 0.0, "+", color="black", markersize=14, mew=2.0, label="base of the arm")
+
+    def outline(label: str, corner_mm: tuple[float, float], size: tuple[float, float], **style: Any) -> None:
+        axes.add_patch(Rectangle(corner_mm, *size, label=label, **style))
+
     (left, right), (low, high) = limits.x_mm, limits.y_mm
-    box: dict[str, Any] = {"fill": False, "edgecolor": ORANGE, "linewidth": 1.6, "label": "box of limits"}
-    axes.add_patch(Rectangle((left, low), right - left, high - low, **box))
-    dashed: dict[str, Any] = {
-        "fill": False,
-        "edgecolor": GREY,
-        "linestyle": "--",
-        "label": "board",
-        "angle": paper.yaw_deg,
-    }
-    axes.add_patch(Rectangle(to_base(paper, *board.origin_mm), *size_mm(board), **dashed))
-    sheet: dict[str, Any] = {"facecolor": PAPER, "edgecolor": "black", "label": "sheet", "angle": paper.yaw_deg}
-    axes.add_patch(Rectangle(paper.origin_mm, *paper.size_mm, **sheet))
+    outline("box of limits", (left, low), (right - left, high - low), fill=False, edgecolor=ORANGE, linewidth=1.6)
+    dashed = {"fill": False, "edgecolor": GREY, "linestyle": "--", "angle": paper.yaw_deg}
+    outline("board", to_base(paper, *board.origin_mm), size_mm(board), **dashed)
+    outline("sheet", paper.origin_mm, paper.size_mm, facecolor=PAPER, edgecolor="black", angle=paper.yaw_deg)
     for name, tip in (("x", (40.0, 0.0)), ("y", (0.0, 40.0))):
         axes.annotate("", to_base(paper, *tip), paper.origin_mm, arrowprops={"arrowstyle": "->", "color": "black"})
         axes.annotate(name, to_base(paper, *(1.25 * v for v in tip)), ha="center", va="center", fontsize=9)

@@ -7,8 +7,7 @@ import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from types import UnionType
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, cast, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, cast, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -88,7 +87,7 @@ def _what(first: ErrorDetails, models: Sequence[type[BaseModel]]) -> str:
     """What is wrong in a table of these models."""
     match first["type"]:
         case "extra_forbidden":
-            known = fields(models)
+            known = list(dict.fromkeys(name for model in models for name in model.model_fields))
             meant = next(iter(difflib.get_close_matches(str(first["loc"][-1]), known, n=1)), None)
             hint = f"known are {', '.join(known)}" if meant is None else f"did you mean {meant}?"
             return f"unknown field; {hint}"
@@ -102,9 +101,6 @@ def _what(first: ErrorDetails, models: Sequence[type[BaseModel]]) -> str:
         case _:
             shown = repr(first["input"])
             return f"{first['msg']} (given: {shown if len(shown) <= 80 else shown[:77] + '...'})"
-
-
-HOLDERS = (Annotated, Union, UnionType, list, tuple)
 
 
 def located(of: object, loc: Sequence[str | int]) -> tuple[list[type[BaseModel]], list[str | int]]:
@@ -123,20 +119,14 @@ def located(of: object, loc: Sequence[str | int]) -> tuple[list[type[BaseModel]]
     return models, path
 
 
-def fields(models: Sequence[type[BaseModel]]) -> list[str]:
-    """Names of the fields that any of these tables may have, in order."""
-    return list(dict.fromkeys(name for model in models for name in model.model_fields))
-
-
 def kinds(models: Sequence[type[BaseModel]]) -> list[str]:
     """Values that `kind` may have in these tables."""
     tags = (model.model_fields["kind"].annotation for model in models if "kind" in model.model_fields)
-    return [str(kind) for tag in tags if get_origin(tag) is Literal for kind in get_args(tag)]
+    return [str(kind) for tag in tags for kind in get_args(tag)]
 
 
 def _models(annotation: object) -> Iterator[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(cast("type[Any]", annotation), BaseModel):
         yield annotation
-    elif get_origin(annotation) in HOLDERS:
-        for inner in get_args(annotation):
-            yield from _models(inner)
+    for inner in get_args(annotation):
+        yield from _models(inner)

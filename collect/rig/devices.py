@@ -17,6 +17,8 @@ from brushloop.drivers.force.sri_m8123 import SriM8123
 from brushloop.drivers.host import Claimed, Clock, claimed
 from brushloop.drivers.limits import Limits
 
+Device = AuboArcs | OpenCvCamera | SriM8123 | Ink
+
 
 @dataclass(frozen=True, slots=True)
 class Rig:
@@ -80,23 +82,18 @@ async def connected(config: RigConfig, clock: Clock, on_notice: Callable[[str], 
     `on_notice` gets what a device reports without being asked, from any thread. Raises `ConfigError` if another
     brushloop on this machine drives the arm: closing ours would stop its motion.
     """
+    camera, robot = OpenCvCamera(config.camera, clock, on_notice), make_robot(config, clock, on_notice)
+    force = None if config.force is None else SriM8123(config.force, clock)
+    ink = None if config.ink.device is None else config.ink.device.device(clock)
     async with contextlib.AsyncExitStack() as stack:
         stack.enter_context(sole_driver(config.robot.host, config.robot.port))
-        camera = OpenCvCamera(config.camera, clock, on_notice)
-        stack.push_async_callback(camera.close)
-        camera_identity = await camera.connect()
-        force = force_identity = ink = ink_identity = None
-        if config.force is not None:
-            force = SriM8123(config.force, clock)
-            stack.push_async_callback(force.close)
-            force_identity = await force.connect()
-        if config.ink.device is not None:
-            ink = config.ink.device.device(clock)
-            stack.push_async_callback(ink.close)
-            ink_identity = await ink.connect()
-        robot = make_robot(config, clock, on_notice)
-        stack.push_async_callback(robot.close)
-        robot_identity = await robot.connect()
-        yield Rig(
-            config, clock, robot, camera, robot_identity, camera_identity, force, ink, force_identity, ink_identity
-        )
+
+        async def identity(device: Device) -> Identity:
+            stack.push_async_callback(device.close)
+            return await device.connect()
+
+        camera_is = await identity(camera)
+        force_is = None if force is None else await identity(force)
+        ink_is = None if ink is None else await identity(ink)
+        robot_is = await identity(robot)
+        yield Rig(config, clock, robot, camera, robot_is, camera_is, force, ink, force_is, ink_is)

@@ -18,9 +18,8 @@ import socket
 import statistics
 import time
 import zipfile
-from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
-from dataclasses import asdict, dataclass, replace
-from functools import partial
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -30,13 +29,12 @@ from rich.text import Text
 from brushloop.calibrate.board.pix2len import see_board
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.rig.config import PREFIX, RigConfig
-from brushloop.collect.rig.devices import make_robot
+from brushloop.collect.rig.devices import Device, make_robot
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, RobotMode, survey
-from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.arcs.telemetry import rtde_answers
 from brushloop.drivers.arcs.wire import Framing
 from brushloop.drivers.camera import OpenCvCamera
-from brushloop.drivers.devices import Identity, Ink, Stamp
+from brushloop.drivers.devices import Stamp
 from brushloop.drivers.errors import DeviceError
 from brushloop.drivers.force.sri_m8123 import ForceTable, SriM8123
 from brushloop.drivers.host import Clock
@@ -46,9 +44,9 @@ T = TypeVar("T")
 CALLS = 20
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Finding:
-    """What one device answered."""
+    """What one device answered; filled in while it is asked."""
 
     device: str
     address: str
@@ -70,113 +68,113 @@ class Finding:
         """Every field, and the verdict."""
         return {**asdict(self), "well": self.well}
 
-    def answered(self, identity: Identity, latency_ms: float | None, notes: str) -> Finding:
-        """The same with what the device says of itself."""
-        notes += ", simulated" if identity.simulated else ""
-        who, version = identity.model, identity.firmware
-        return replace(self, answers=True, identity=who, firmware=version, latency_ms=latency_ms, notes=notes)
-
-    def trouble(self, problem: str, remedy: str) -> Finding:
-        """The same with what is wrong, and what to do about it."""
-        return replace(self, problem=problem, remedy=remedy)
+    async def timed(self, calls: int, ask: Callable[[], Awaitable[T]]) -> T:
+        """The last answer of several calls, whose median time is the latency."""
+        waits_ms: list[float] = []
+        while True:
+            began_s = time.perf_counter()
+            answer = await ask()
+            waits_ms.append((time.perf_counter() - began_s) * 1e3)
+            if len(waits_ms) == calls:
+                self.latency_ms = statistics.median(waits_ms)
+                return answer
 
 
 async def examine(config: RigConfig, clock: Clock) -> list[Finding]:
     """One finding for each configured device, in the order in which a session connects them."""
-    camera, robot = config.camera.source, f"{config.robot.host}:{config.robot.port}"
-    answers = [(Finding("camera", camera), partial(_camera, config))]
-    if (force := config.force) is not None:
-        gateway = "" if force.host is None else f" at {force.host}:{force.port}"
-        answers.append((Finding("force", f"{force.interface} {force.channel}{gateway}"), partial(_force, force)))
-    if (ink := config.ink.device) is not None:
-        answers.append((Finding("ink", ink.port), partial(_ink, ink)))
-    answers.append((Finding("robot", robot), partial(_robot, config)))
-    findings: list[Finding] = []
-    for silent, ask in answers:
-        try:
-            findings.append(await ask(silent, clock))
-        except DeviceError as error:
-            remedy = error.remedy or "Check power, cable and address."
-            findings.append(silent.trouble(f"{error.op}: {error.what}", remedy))
-    return findings
+    findings = [await _camera(config, clock)]
+    if config.force is not None:
+        findings.append(await _force(config.force, clock))
+    if config.ink.device is not None:
+        findings.append(await _ink(config.ink.device, clock))
+    return [*findings, await _robot(config, clock)]
 
 
-@contextlib.asynccontextmanager
-async def _connected(device: AuboArcs | OpenCvCamera | SriM8123 | Ink) -> AsyncGenerator[Identity]:
-    """Connect a device for the block."""
+async def _asked(finding: Finding, device: Device, look: Callable[[], Awaitable[None]]) -> Finding:
+    """Connect a device, note who it is, and `look` at it; an error of the device is noted."""
     try:
-        yield await device.connect()
-    finally:
-        await device.close()
+        async with contextlib.AsyncExitStack() as stack:
+            stack.push_async_callback(device.close)
+            identity = await device.connect()
+            await look()
+        finding.answers, finding.identity, finding.firmware = True, identity.model, identity.firmware
+        finding.notes += ", simulated" if identity.simulated else ""
+    except DeviceError as error:
+        finding.problem = f"{error.op}: {error.what}"
+        finding.remedy = error.remedy or "Check power, cable and address."
+    return finding
 
 
-async def _timed(calls: int, ask: Callable[[], Awaitable[T]]) -> tuple[T, float]:
-    """The last answer of several calls, and their median time in ms."""
-    waits_ms: list[float] = []
-    while True:
-        began_s = time.perf_counter()
-        answer = await ask()
-        waits_ms.append((time.perf_counter() - began_s) * 1e3)
-        if len(waits_ms) == calls:
-            return answer, statistics.median(waits_ms)
-
-
-async def _camera(config: RigConfig, finding: Finding, clock: Clock) -> Finding:
-    notices: list[str] = []
+async def _camera(config: RigConfig, clock: Clock) -> Finding:
+    finding, notices = Finding("camera", config.camera.source), list[str]()
     camera = OpenCvCamera(config.camera, clock, notices.append)
-    async with _connected(camera) as identity:
+
+    async def look() -> None:
         await camera.fresh(Stamp(clock.now_ns()))
-        frame, latency_ms = await _timed(5, lambda: camera.fresh(Stamp(clock.now_ns())))
-    try:
-        plane = await asyncio.to_thread(see_board, frame.image, config.board, lens=config.camera.optics)
-    except CalibrationError as error:
-        remedy = "Put the configured board into view, in focus and evenly lit."
-        return finding.answered(identity, latency_ms, "; ".join(notices)).trouble(f"board: {error.what}", remedy)
-    board = f"board: {plane.corners} corners, residual {plane.rms_px:.2f} px, {plane.mm_per_px:.4f} mm/px"
-    return finding.answered(identity, latency_ms, "; ".join([board, *notices]))
+        frame = await finding.timed(5, lambda: camera.fresh(Stamp(clock.now_ns())))
+        try:
+            plane = await asyncio.to_thread(see_board, frame.image, config.board, lens=config.camera.optics)
+        except CalibrationError as error:
+            finding.problem = f"board: {error.what}"
+            finding.remedy = "Put the configured board into view, in focus and evenly lit."
+        else:
+            board = f"board: {plane.corners} corners, residual {plane.rms_px:.2f} px, {plane.mm_per_px:.4f} mm/px"
+            notices.insert(0, board)
+        finding.notes = "; ".join(notices)
+
+    return await _asked(finding, camera, look)
 
 
-async def _force(config: ForceTable, finding: Finding, clock: Clock) -> Finding:
+async def _force(config: ForceTable, clock: Clock) -> Finding:
+    gateway = "" if config.host is None else f" at {config.host}:{config.port}"
+    finding = Finding("force", f"{config.interface} {config.channel}{gateway}")
     sensor = SriM8123(config, clock)
-    async with _connected(sensor) as identity:
+
+    async def look() -> None:
         first = sensor.latest().stamp
         await asyncio.sleep(0.5)  # a hundred rounds give the rate
         newest, stream = sensor.latest(), sensor.stream
-        age_ms = (clock.now_ns() - newest.stamp.host_ns) / 1e6
-    dropped, force_n = stream.assembler, math.hypot(*newest.force_n)
-    rate_hz = 1e9 * (newest.stamp.seq - first.seq) / max(newest.stamp.host_ns - first.host_ns, 1)
-    answer = finding.answered(identity, age_ms, f"{rate_hz:.0f} rounds/s, {force_n:.3f} N before bias")
-    if dropped.torn or dropped.refused or stream.bus_errors:
-        problem = f"{dropped.torn} torn, {dropped.refused} refused rounds, {stream.bus_errors} bus errors"
-        return answer.trouble(problem, "Check wiring, shielding and termination.")
-    if force_n > config.max_n:
-        problem = f"{force_n:.2f} N with nothing pressing, above the ceiling force.max_n = {config.max_n:g} N"
-        remedy = "Remove what touches the brush; the bias at each start takes off the weight of the holder."
-        return answer.trouble(problem, remedy)
-    return answer
+        rate_hz = 1e9 * (newest.stamp.seq - first.seq) / max(newest.stamp.host_ns - first.host_ns, 1)
+        finding.latency_ms = (clock.now_ns() - newest.stamp.host_ns) / 1e6
+        force_n, dropped = math.hypot(*newest.force_n), stream.assembler
+        finding.notes = f"{rate_hz:.0f} rounds/s, {force_n:.3f} N before bias"
+        if dropped.torn or dropped.refused or stream.bus_errors:
+            finding.problem = f"{dropped.torn} torn, {dropped.refused} refused rounds, {stream.bus_errors} bus errors"
+            finding.remedy = "Check wiring, shielding and termination."
+        elif force_n > config.max_n:
+            ceiling = f"above the ceiling force.max_n = {config.max_n:g} N"
+            finding.problem = f"{force_n:.2f} N with nothing pressing, {ceiling}"
+            finding.remedy = "Remove what touches the brush; the bias at each start takes off the weight of the holder."
+
+    return await _asked(finding, sensor, look)
 
 
-async def _ink(config: InkTable, finding: Finding, clock: Clock) -> Finding:
-    device = config.device(clock)
-    async with _connected(device) as identity:
-        level, latency_ms = await _timed(CALLS, device.level)
-    if level is None:
-        return finding.answered(identity, None, "no gauge")
-    return finding.answered(identity, latency_ms, f"well {level:.0%} full")
+async def _ink(config: InkTable, clock: Clock) -> Finding:
+    finding, device = Finding("ink", config.port), config.device(clock)
+
+    async def look() -> None:
+        level = await finding.timed(CALLS, device.level)
+        finding.notes = f"well {level:.0%} full" if level is not None else "no gauge"
+        finding.latency_ms = finding.latency_ms if level is not None else None  # nothing was asked
+
+    return await _asked(finding, device, look)
 
 
-async def _robot(config: RigConfig, finding: Finding, clock: Clock) -> Finding:
-    notices: list[str] = []
+async def _robot(config: RigConfig, clock: Clock) -> Finding:
+    finding, notices = Finding("robot", f"{config.robot.host}:{config.robot.port}"), list[str]()
     robot = make_robot(config, clock, notices.append)
-    async with _connected(robot) as identity:
-        _, latency_ms = await _timed(CALLS, robot.where)
+
+    async def look() -> None:
+        await finding.timed(CALLS, robot.where)
         mode, safety = await robot.modes()
-    answer = finding.answered(identity, latency_ms, "; ".join([*notices, f"{mode}, safety {safety}"]))
-    if safety not in MOVING_ALLOWED:
-        return answer.trouble(f"safety mode is {safety}", "Look at the pendant; this program clears nothing.")
-    if mode not in (RobotMode.POWER_OFF, RobotMode.IDLE, RobotMode.RUNNING):
-        return answer.trouble(f"robot mode is {mode}", "Look at the pendant.")
-    return answer
+        finding.notes = "; ".join([*notices, f"{mode}, safety {safety}"])
+        if safety not in MOVING_ALLOWED:
+            finding.problem = f"safety mode is {safety}"
+            finding.remedy = "Look at the pendant; this program clears nothing."
+        elif mode not in (RobotMode.POWER_OFF, RobotMode.IDLE, RobotMode.RUNNING):
+            finding.problem, finding.remedy = f"robot mode is {mode}", "Look at the pendant."
+
+    return await _asked(finding, robot, look)
 
 
 def doctor_table(findings: list[Finding]) -> Table:
