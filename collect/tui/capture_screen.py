@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, ClassVar
 
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
-from textual.containers import Horizontal, Vertical, VerticalScroll
+from textual.containers import Horizontal, VerticalScroll
 from textual.content import Content
 from textual.screen import Screen
-from textual.widgets import Footer
+from textual.widgets import Footer, TabbedContent, TabPane
 
 from brushloop.collect.tui.pictures import binary_picture, picture_widget
-from brushloop.collect.tui.widgets import STOP, Line, condition_text, labelled, one_line, plain
+from brushloop.collect.tui.widgets import STOP, Bar, Line, condition_text, labelled, one_line, plain
 
 if TYPE_CHECKING:
     import numpy as np
@@ -91,22 +91,14 @@ def _limit(check: Check) -> str:
 
 
 class CaptureScreen(Screen[None], inherit_bindings=False):
-    """One capture; arrows and digits choose the picture."""
+    """One capture; arrows choose the picture."""
 
-    AUTO_FOCUS = None
+    AUTO_FOCUS = "Tabs"
     DEFAULT_CSS = """
-    CaptureScreen #large-title { height: 1; padding: 0 1; background: $panel; text-style: bold; }
-    CaptureScreen #large-pictures { width: 1fr; padding: 0 1; }
-    CaptureScreen #large-names { height: 1; text-wrap: nowrap; }
-    CaptureScreen #large-side { width: 36; padding: 0 1; border-left: solid $foreground 40%; }
+    CaptureScreen #pictures { width: 1fr; }
+    CaptureScreen #side { width: 36; padding: 0 1; border-left: solid $foreground 40%; }
     """
-    BINDINGS: ClassVar[list[BindingType]] = [
-        STOP,
-        Binding("escape,enter,q", "app.pop_screen", "Back"),
-        Binding("right,tab", "turn(1)", "Next picture"),
-        Binding("left,shift+tab", "turn(-1)", "Picture before"),
-        *(Binding(str(number), f"choose({number - 1})", "Picture", show=False) for number in range(1, 5)),
-    ]
+    BINDINGS: ClassVar[list[BindingType]] = [STOP, Binding("escape,enter,q", "app.pop_screen", "Back")]
 
     def __init__(self, capture: LastCapture, model: str) -> None:
         """`model` says what predicts the mark of this capture, or why nothing does."""
@@ -121,44 +113,23 @@ class CaptureScreen(Screen[None], inherit_bindings=False):
         if photo is not None and binary is not None and predicted is not None:
             self._images["overlay"] = over_photograph(photo, predicted)
             self._images["difference"] = difference(binary, predicted)
-        self._at = len(self._images) - 1  # the last picture says most
-        self._names, self._picture = Line("large-names"), picture_widget("large-picture")
 
     def compose(self) -> ComposeResult:
-        """Lay out the picture beside the checks."""
-        title, words = Line("large-title"), Line("large-words")
+        """Lay out the pictures, of which the last says most, beside the checks."""
+        title, words = Bar("title"), Line("words")
         press = self._capture.press
         title.show(f"{one_line(press.stroke_id)}   {condition_text(press.condition)}")
         words.show(self._words())
         yield title
         with Horizontal():
-            with Vertical(id="large-pictures"):
-                yield self._names
-                yield self._picture
-            with VerticalScroll(id="large-side", can_focus=False):
+            with TabbedContent(initial=next(reversed(self._images), ""), id="pictures"):
+                for name, image in self._images.items():
+                    picture = picture_widget(f"picture-{name}")
+                    picture.show(image)
+                    yield TabPane(name, picture, id=name)
+            with VerticalScroll(id="side", can_focus=False):
                 yield words
         yield Footer()
-
-    def on_mount(self) -> None:
-        """Show the picture."""
-        self.action_choose(self._at)
-
-    def action_turn(self, by: int) -> None:
-        """Show the next picture, or the one before."""
-        self.action_choose((self._at + by) % max(len(self._images), 1))
-
-    def action_choose(self, at: int) -> None:
-        """Show the picture of this number, if there is one."""
-        if not self._images:
-            self._names.show("no picture: the board is not seen in this photograph")
-        elif at < len(self._images):
-            self._at = at
-            names = (
-                Content.styled(f" {n + 1} {name} ", "bold reverse" if n == at else "dim")
-                for n, name in enumerate(self._images)
-            )
-            self._names.show(Content("  ").join(names))
-            self._picture.show(list(self._images.values())[at])
 
     def _words(self) -> Content:
         """The checks, then what is compared."""
@@ -166,6 +137,8 @@ class CaptureScreen(Screen[None], inherit_bindings=False):
         lines = [checks_content(checks), Content(""), Content.styled(plain(self._model), "bold")]
         if (csim := self._capture.likeness) is not None:
             lines.append(labelled("CSIM", f"{100.0 * csim:.1f} % in mm"))
+        if not self._images:
+            lines.append(Content("no picture: the board is not seen in this photograph"))
         if "difference" in self._images:
             for what, colour in COLOURS.items():
                 lines.append(Content.assemble(("██", "rgb({},{},{})".format(*colour)), f" {what}"))
