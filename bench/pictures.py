@@ -35,7 +35,6 @@ from brushloop.collect.commission.wizard import Wizard
 from brushloop.collect.engine.control import State
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.operator import Prompt
-from brushloop.collect.start import engine_for
 from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.capture_screen import CaptureScreen
 from brushloop.collect.tui.commission_app import CommissionApp
@@ -106,7 +105,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _screens() -> None:
     rig = LoopbackRig(SimConfig(rate=RATE, view=View(fps=3.0)))
     with _serving(rig):
-        browser = SessionBrowser(engine_for)
+        browser = SessionBrowser()
         app = OperatorApp(browser.engine, browser=browser)
         try:
             asyncio.run(_tour(app, rig))

@@ -6,17 +6,13 @@ Imports wait until a command runs, so that `--help` loads nothing heavy.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from brushloop.calibrate.commands import PathOrCommand, command
 from brushloop.collect.engine import PROTOCOL_FILE, RIG_FILE, CollectRequest, Rig
 from brushloop.sessions.terminal import say
-
-if TYPE_CHECKING:
-    from brushloop.collect.engine.engine import Engine
-    from brushloop.collect.engine.open_or_resume import Opening
 
 app = typer.Typer(
     cls=PathOrCommand,
@@ -55,16 +51,9 @@ app.command("strokes")(command(CollectRequest, "collect.start:run", lambda run, 
 def browse() -> None:
     """Open the start screen: `brushloop` without arguments. The screen appears before the engine is imported."""
     from brushloop.collect.tui.app import OperatorApp, run_app
-    from brushloop.collect.tui.pictures import look_for_pixels
     from brushloop.collect.tui.start_screen import SessionBrowser
 
-    def engine_for(opening: Opening) -> Engine:
-        from brushloop.collect import start
-
-        return start.engine_for(opening)
-
-    look_for_pixels()
-    browser = SessionBrowser(engine_for)
+    browser = SessionBrowser()
     run_app(OperatorApp(browser.engine, browser=browser))
 
 

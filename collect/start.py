@@ -118,9 +118,7 @@ def _run(opening: Opening) -> Engine:
         return engine_for(replace(opening, request=replace(opening.request, new=False, resume=session_id)))
 
     from brushloop.collect.tui.app import OperatorApp, run_app
-    from brushloop.collect.tui.pictures import look_for_pixels
 
-    look_for_pixels()
     app = OperatorApp(again, engine)
     run_app(app)
     return app.engine or engine

@@ -12,13 +12,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from textual import events, work
+from textual import work
 from textual.binding import Binding, BindingType
 
 from brushloop.collect.engine.control import FINAL, State
 from brushloop.collect.engine.snapshot import REFRESH_S, Snapshot
 from brushloop.collect.errors import NOT_AT_REST, CollectAborted, ConfigError
 from brushloop.collect.operator import Choice, Prompt, stop_signals
+from brushloop.collect.tui.pictures import look_for_pixels
 from brushloop.collect.tui.run_screen import RunScreen, live_content
 from brushloop.collect.tui.start_screen import SessionBrowser, StartScreen
 from brushloop.collect.tui.terminal import PlainApp
@@ -72,14 +73,8 @@ class OperatorApp(PlainApp):
 
     def on_mount(self) -> None:
         """Show the first screen; then poll the engine at 10 Hz."""
-        if (browser := self._browser) is not None:
-            start = StartScreen(
-                browser,
-                lambda session_id: self._begin(partial(browser.engine, session_id)),
-                lambda session_id: self._review(browser.root / session_id),
-                self.run_command,
-            )
-            self.push_screen(start)
+        if self._browser is not None:
+            self.push_screen(StartScreen(self._browser))
         if self.engine is not None:
             self._show_run(self.engine)
         self.call_after_refresh(self._poll)
@@ -89,10 +84,6 @@ class OperatorApp(PlainApp):
     def at_work(self) -> bool:
         """Whether a run is in progress."""
         return self._now is not None and self._now.state not in FINAL
-
-    def stops(self, event: events.Key) -> bool:
-        """A stop key stops the arm whenever a run is in progress."""
-        return self.at_work
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
         """Disable the keys that would do nothing now."""
@@ -108,24 +99,22 @@ class OperatorApp(PlainApp):
                 return super().check_action(action, parameters)
 
     def action_stop(self) -> None:
-        """Stop the arm at once and show that, even if another screen covers the run."""
+        """Stop the arm at once and show that, whichever screen covers the run."""
         if self.engine is not None:
             self.engine.stop()
-            if self._main is not None and self._main.is_mounted:
-                self._main.stop_sent()
-            if self.screen is not self._main:
-                self.notify("STOP SENT", severity="warning", timeout=2)
+            super().action_stop()
 
     def action_review(self) -> None:
         """Look through the captures of the run that is shown."""
         if self._now is not None and self._now.folder and self.screen is self._main:
-            self._review(Path(self._now.folder))
+            self.review(Path(self._now.folder))
 
-    def _review(self, folder: Path) -> None:
+    def review(self, folder: Path) -> None:
+        """Look through the captures of a session."""
         from brushloop.collect.tui.review_screen import Review, ReviewScreen  # slow to import
 
         try:
-            self.push_screen(ReviewScreen(Review(folder), self._finish, at_work=lambda: self.at_work))
+            self.push_screen(ReviewScreen(Review(folder)))
         except SessionError as error:
             self._complain(error)
 
@@ -135,7 +124,7 @@ class OperatorApp(PlainApp):
     def action_begin_again(self) -> None:
         """Resume the session of a run that ended before its time: the engine asks first."""
         if self._now is not None and self.screen is self._main:
-            self._begin(partial(self._again, Path(self._now.folder).name))
+            self.begin(partial(self._again, Path(self._now.folder).name))
 
     async def action_quit(self) -> None:
         """Leave; ask first if the arm is not parked."""
@@ -176,7 +165,7 @@ class OperatorApp(PlainApp):
         self._leave_when_over = False
 
     @work(exclusive=True, group="begin")
-    async def _begin(self, make: Callable[[], Engine]) -> None:
+    async def begin(self, make: Callable[[], Engine]) -> None:
         """Wait for the end of the run before; read and check the files off the screen's loop; start the run."""
         before = self.engine
 
@@ -229,20 +218,20 @@ class OperatorApp(PlainApp):
                 self.pop_screen()  # what it asks about is over
             busy = self.screen is not self._main or self._leave_when_over
             if self._now.state is State.DONE and self._now.folder and not busy:
-                self._finish(Path(self._now.folder))
+                self.offer_commands(Path(self._now.folder))
         if self._leave_when_over and self._now.state in FINAL:
             if self._now.rest_unknown:
                 self._leave_when_over = False  # the operator has to read that first
             else:
                 self._away()
 
-    def _finish(self, folder: Path) -> None:
+    def offer_commands(self, folder: Path) -> None:
         """Offer the next commands of a session, one after the other."""
 
         def answered(key: str | None) -> None:
             if key in COMMANDS:
                 self.run_command(*COMMANDS[key], str(folder))
-                self._finish(folder)
+                self.offer_commands(folder)
             elif key == LOOK.key:
                 self.call_after_refresh(self.action_review)
 
@@ -280,6 +269,7 @@ def run_app(app: OperatorApp) -> None:
             app.engine.obey(number)
         app.leaving = True
 
+    look_for_pixels()
     intact = False
     with stop_signals(on_signal):
         if app.engine is not None:

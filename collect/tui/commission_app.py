@@ -35,7 +35,9 @@ from brushloop.collect.tui.widgets import (
     STOP,
     YES,
     AskScreen,
+    Bar,
     Line,
+    Newest,
     one_line,
     plain,
     question_content,
@@ -107,8 +109,7 @@ class Steps:
 class CommissionScreen(Screen[None], inherit_bindings=False):
     """Shows what the visit holds; its keys answer the question."""
 
-    AUTO_FOCUS = ""
-    """The hidden field would take the first key, if the screen came to the front after the first question."""
+    AUTO_FOCUS = "#found"
     HELP = f"""
 Everything taught is kept; the same command resumes. Escape takes the answer or touch before the question back.
 Page up and down turn the pages of what was found.
@@ -116,9 +117,6 @@ Page up and down turn the pages of what was found.
 {SOFTWARE_STOP} While you type, s is a letter and ctrl-c the stop.
 """
     DEFAULT_CSS = """
-    CommissionScreen #title {
-        height: 1; padding: 0 1; background: $panel; text-style: bold; text-wrap: nowrap; text-overflow: ellipsis;
-    }
     CommissionScreen #found { width: 1fr; height: 1fr; padding: 0 1; }
     CommissionScreen #picture { width: 36%; height: 100%; padding: 0 1; }
     CommissionScreen.-narrow #picture { display: none; }
@@ -128,14 +126,13 @@ Page up and down turn the pages of what was found.
         height: auto; max-height: 13; padding: 0 1; border: heavy $warning; display: none;
     }
     CommissionScreen.-asking #question-box { display: block; }
-    CommissionScreen #note { height: 1; padding: 0 1; background: $panel; text-wrap: nowrap; text-overflow: ellipsis; }
     CommissionScreen #answer { display: none; height: 1; border: none; padding: 0; background: $boost; }
     CommissionScreen.-typing #answer { display: block; }
     """
     BINDINGS: ClassVar[list[BindingType]] = [
         STOP,
         Binding("escape", "back", "Back"),
-        Binding("q", "app.leave", "Leave, all is kept"),
+        Binding("q", "app.quit", "Leave, all is kept"),
         Binding("tab", "picture", "Picture", priority=True),
         HELP_KEY,
     ]
@@ -145,13 +142,12 @@ Page up and down turn the pages of what was found.
         self._visit = visit
         self.prompt: Prompt | None = None
         """The question on the screen; None while something is at work."""
-        self._title, self._found = Line("title"), Line("found-text")
-        self._asked, self._note = Line("question-text"), Line("note")
+        self._title, self._found = Bar("title"), Line("found-text")
+        self._asked, self._note = Line("question-text"), Bar("note")
         self._picture = picture_widget("picture")
-        self._found_pane = VerticalScroll(id="found", can_focus=False)
+        self._found_pane = Newest(id="found")
         self._input = Input(id="answer", select_on_focus=False)
-        self._found_count = 0
-        self._over = self._stop_sent = False
+        self._over = False
 
     def compose(self) -> ComposeResult:
         """Lay out the parts from top to bottom."""
@@ -169,7 +165,8 @@ Page up and down turn the pages of what was found.
     def action_picture(self) -> None:
         """Show the picture instead of the findings, on a narrow screen."""
         self.toggle_class("-picture")
-        self.call_after_refresh(self._found_pane.scroll_end, animate=False)  # what was hidden could not be scrolled
+        if not self.typing:
+            self.call_after_refresh(self._found_pane.focus)  # what was hidden lost it
 
     @property
     def typing(self) -> bool:
@@ -180,42 +177,32 @@ Page up and down turn the pages of what was found.
         """Whether there is a question to go back from."""
         return self.prompt is not None if action == "back" else super().check_action(action, parameters)
 
-    def stop_sent(self) -> None:
-        """Show at once that a stop key was pressed."""
-        self._note.show(Content.styled(" STOP SENT ", "bold reverse"))
-        self._stop_sent = True
-
     def show(self, *, over: bool) -> None:
         """Draw what differs; `over`: the steps are done."""
-        visit, prompt, findings = self._visit, self._visit.asker.prompt, tuple(self._visit.findings)
+        visit, prompt = self._visit, self._visit.asker.prompt
         self._title.show(f"First day   {one_line(str(visit.rig_path))}   {plain(visit.step)}")
         picture = visit.picture if visit.live is None else visit.live
         self._picture.show(None if picture is None else gray(picture))
-        new_findings, new_prompt = len(findings) != self._found_count, prompt is not self.prompt
-        if new_findings:
-            self._found_count = len(findings)
-            self._found.show(Content("\n").join(_finding(*finding) for finding in findings))
-        if new_prompt or over != self._over:
+        self._found.show(Content("\n").join(_finding(*finding) for finding in tuple(visit.findings)))
+        if prompt is not self.prompt or over != self._over:
             self._over = over
             self._ask(prompt)
-        if new_findings or new_prompt:
-            # Only after the layout is it known where the end is: the question takes its room from the findings.
-            self.call_after_refresh(self._found_pane.scroll_end, animate=False)
-        if prompt is None and not over and not self._stop_sent:
+        if prompt is None and not over:
             # Nothing may look as if it hung; and how to stop it is never cut off.
             doing, since_s = visit.doing
             self._note.show(f"{SHORT_STOP}   {one_line(doing or 'at work')}, {time.monotonic() - since_s:.0f} s")
 
     def _ask(self, prompt: Prompt | None) -> None:
         """Show a question, or that something is at work, or that it is over."""
-        self.prompt, self._stop_sent = prompt, False
+        self.prompt = prompt
         self.set_class(prompt is not None or self._over, "-asking")
         self.set_class(self.typing, "-typing")
         self._asked.show(DONE if prompt is None else question_content(prompt))
         self._note.show(TYPING_STOP if self.typing else "" if self._over else SHORT_STOP)
         self._input.value = ""
         self._input.placeholder = f"Enter: {prompt.default}" if prompt is not None and prompt.default else ""
-        self.set_focus(self._input if self.typing else None)
+        self.set_focus(self._input if self.typing else self._found_pane)
+        self._found_pane.anchor()
         self.refresh_bindings()
 
     def _settle(self, answer: object) -> None:
@@ -223,13 +210,11 @@ Page up and down turn the pages of what was found.
             self._visit.asker.settle(self.prompt.number, answer)
 
     def on_key(self, event: events.Key) -> None:
-        """Answer, if the key is an answer to the question; else page through the findings."""
+        """Answer, if the key is an answer to the question."""
         answer = None if self.prompt is None else self.prompt.answer_to(event.key, event.character or "")
         if answer is not None:
             event.stop()
             self._settle(answer)
-        elif event.key in ("pageup", "pagedown"):
-            (self._found_pane.scroll_page_up if event.key == "pageup" else self._found_pane.scroll_page_down)()
 
     def action_back(self) -> None:
         """Take the answer before this question back."""
@@ -252,8 +237,6 @@ def _finding(tone: Tone, text: str) -> Content:
 class CommissionApp(PlainApp):
     """Shows the steps, and carries the keys to them."""
 
-    BINDINGS: ClassVar[list[BindingType]] = [Binding("ctrl+q", "quit", "Leave", show=False, priority=True)]
-
     def __init__(self, visit: Visit, work: Work) -> None:
         super().__init__()
         self._visit = visit
@@ -269,29 +252,22 @@ class CommissionApp(PlainApp):
     def stops(self, event: events.Key) -> bool:
         """Stop keys stop the steps on every screen; `s` is a letter only while a line is typed."""
         typing = self.first_day.typing and self.screen is self.first_day
-        return not self.steps.finished and not (typing and event.is_printable)
+        return super().stops(event) and not (typing and event.is_printable)
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
         """Disable the keys that would do nothing now."""
         match action:
             case "stop":
-                return not self.steps.finished and not self.first_day.typing
-            case "leave" | "help":
-                return not self.first_day.typing
+                return not self.steps.finished
             case _:
                 return super().check_action(action, parameters)
 
     def action_stop(self) -> None:
         """Stop whatever is under way, and say so at once."""
         self.steps.stop()
-        if self.first_day.is_mounted:
-            self.first_day.stop_sent()
+        super().action_stop()
 
     async def action_quit(self) -> None:
-        """Leave, while a line is typed too."""
-        self.action_leave()
-
-    def action_leave(self) -> None:
         """Leave; where something is at work, ask first."""
         if isinstance(self.screen, AskScreen):
             return

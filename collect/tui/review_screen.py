@@ -6,10 +6,9 @@ import asyncio
 import itertools
 import statistics
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from textual import work
 from textual.app import ComposeResult
@@ -21,10 +20,9 @@ from textual.widgets import Footer, OptionList
 
 from brushloop.calibrate.artefact import FITS, current, load_artefact
 from brushloop.calibrate.board.pix2len import Plane, see_board
-from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.fit import BrushFit
-from brushloop.calibrate.session import rig_of
+from brushloop.calibrate.session import RigView, rig_of
 from brushloop.calibrate.stats import odd_waits, waits_of
 from brushloop.collect.engine.capture import mark_of, pictures_of
 from brushloop.collect.engine.snapshot import LastCapture
@@ -38,6 +36,7 @@ from brushloop.collect.tui.widgets import (
     SOFTWARE_STOP,
     STOP,
     AskScreen,
+    Bar,
     Line,
     Rows,
     app_of,
@@ -56,9 +55,6 @@ from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.messages import decode_gray, decode_still
 from brushloop.sessions.recording import add_remark, merged_file, remarks_of
 from brushloop.sessions.records import Condition, Quality, Stroke, Topic
-
-if TYPE_CHECKING:
-    from brushloop.calibrate.board.lens import Lens
 
 NO_FIT = "no fit yet: run `brushloop fit`"
 
@@ -101,12 +97,10 @@ class Review:
         check_folder(folder)
         self._plane: Plane | None = None
         self._pictures: dict[int, LastCapture] = {}
-        self._board: BoardSpec | None = None
-        self._lens: Lens | None = None
+        self._rig: RigView | None = None
         try:
-            # As the session recorded them: lens files lie beside the rig's own rig.toml, not beside its snapshot here.
-            rig = rig_of(folder)
-            self._lens, self._board = rig.lens, rig.board
+            # As the session recorded it: lens files lie beside the rig's own rig.toml, not beside its snapshot here.
+            self._rig = rig_of(folder)
         except CalibrationError as error:
             self.shown_whole = str(error)
         self.read()
@@ -118,12 +112,10 @@ class Review:
         odd, captures = odd_waits(waits_of(state)), list[ReviewCapture]()
         for step in state.files.values():
             if isinstance(result := step.result, CaptureResult):
-                capture = ReviewCapture(result, step.file, unlike=odd.get(result.still, ""))
-                if (remark := remarks.get(result.still)) is not None:
-                    capture = replace(capture, marked_bad=remark.bad, note=remark.note)
-                captures.append(capture)
-        captures.sort(key=lambda c: (c.press.condition, c.press.stroke_id, c.result.still))
-        self.captures = tuple(captures)
+                remark = remarks.get(result.still)
+                bad, note = (False, "") if remark is None else (remark.bad, remark.note)
+                captures.append(ReviewCapture(result, step.file, bad, note, odd.get(result.still, "")))
+        self.captures = sorted(captures, key=lambda c: (c.press.condition, c.press.stroke_id, c.result.still))
 
     def pictures(self, capture: ReviewCapture) -> LastCapture:
         """A capture with its pictures, made once: the whole photograph where the board is not seen.
@@ -182,14 +174,14 @@ class Review:
         if image is None:
             raise SessionDamaged(path, f"holds no still {result.still}")
         whole = LastCapture(result.press, result.still, result.kept, verdict, image)
-        if stroke is None or stroke.cell_mm is None or self._board is None:
+        if stroke is None or stroke.cell_mm is None or self._rig is None:
             return whole  # a take that does not count has no stroke record
-        if self._lens is not None:
-            if image.shape[::-1] != self._lens.size_px:
+        if (lens := self._rig.lens) is not None:
+            if image.shape[::-1] != lens.size_px:
                 return whole  # the lens was calibrated for another size
-            image = self._lens.undistort(image)
+            image = lens.undistort(image)
         try:
-            self._plane = see_board(image, self._board)
+            self._plane = see_board(image, self._rig.board)
         except CalibrationError:
             if self._plane is None:
                 return whole
@@ -202,7 +194,6 @@ class ReviewScreen(Screen[None]):
 
     AUTO_FOCUS = "#captures"
     DEFAULT_CSS = """
-    ReviewScreen #review-title { height: 1; padding: 0 1; background: $panel; text-style: bold; }
     ReviewScreen #captures { width: 34; height: 100%; border: none; padding: 0; }
     ReviewScreen #shown { width: 1fr; padding: 0 1; border-left: solid $foreground 40%; }
     ReviewScreen #words { height: auto; }
@@ -217,15 +208,12 @@ class ReviewScreen(Screen[None]):
         HELP_KEY,
     ]
 
-    def __init__(self, review: Review, finish: Callable[[Path], None], *, at_work: Callable[[], bool]) -> None:
-        """`finish` offers the next commands. `at_work` says whether a run is in progress: then no text can be typed,
-        because `s` stops the arm."""
+    def __init__(self, review: Review) -> None:
         super().__init__()
         self._review = review
-        self._finish, self._at_work = finish, at_work
         self._capture: ReviewCapture | None = None
         self._alike: dict[Condition, str] = {}
-        self._title, self._words = Line("review-title"), Line("words")
+        self._title, self._words = Bar("title"), Line("words")
         self._options = Rows("captures")
         self._photo, self._binary = picture_widget("review-photo"), picture_widget("review-binary")
 
@@ -246,9 +234,9 @@ class ReviewScreen(Screen[None]):
         self._list(0)
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
-        """Notes and commands wait until no run is in progress."""
+        """Notes and commands wait until no run is in progress: until then `s` stops the arm."""
         if action in ("note", "finish"):
-            return not self._at_work()
+            return not app_of(self).at_work
         return super().check_action(action, parameters)
 
     def on_option_list_option_highlighted(self, event: OptionList.OptionHighlighted) -> None:
@@ -292,7 +280,7 @@ class ReviewScreen(Screen[None]):
 
     def action_finish(self) -> None:
         """Show what can be done with the session."""
-        self._finish(self._review.folder)
+        app_of(self).offer_commands(self._review.folder)
 
     def _remark(self, capture: ReviewCapture, *, bad: bool, note: str) -> None:
         still, stroke_id = capture.result.still, capture.press.stroke_id
@@ -311,7 +299,7 @@ class ReviewScreen(Screen[None]):
     def _list(self, at: int) -> None:
         review, captures = self._review, self._review.captures
         good = sum(capture.counts for capture in captures)
-        state = f"open. {SOFTWARE_STOP}" if self._at_work() else "open" if review.open else "closed"
+        state = f"open. {SOFTWARE_STOP}" if app_of(self).at_work else "open" if review.open else "closed"
         self._title.show(f"{one_line(review.folder.name)}: {good} of {len(captures)} count; {state}")
         self._options.fill(map(_row_content, captures), at)
         if not captures:

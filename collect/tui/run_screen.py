@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, cast
+from typing import TYPE_CHECKING, ClassVar
 
 from rich.text import Text
 from textual.app import ComposeResult
@@ -14,7 +14,6 @@ from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical, VerticalScroll
 from textual.content import Content
 from textual.screen import Screen
-from textual.signal import Signal
 from textual.widgets import DataTable, Footer
 
 from brushloop.collect.engine.control import FINAL, State
@@ -35,14 +34,15 @@ from brushloop.collect.tui.widgets import (
     SHORT_STOP,
     SOFTWARE_STOP,
     STOP,
+    Bar,
     Line,
+    Newest,
     app_of,
     condition_text,
     entitle,
     labelled,
     one_line,
     plain,
-    tip_text,
 )
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.recording import mark_bad_or_good
@@ -55,7 +55,6 @@ if TYPE_CHECKING:
 OVER = "Over: q leaves"
 GOES_ON = "Press enter to resume, or run the same command later."
 COMMAND_GOES_ON = "Run the same command again to continue."
-STOP_SENT = "STOP SENT"
 WARNING = "warning: "
 PANES = ("overview", "capture", "camera")
 GRID_STYLES = {"▶": "bold reverse", "×": "bold red", "!": "bold yellow", "✓": "bold green", "›": "bold", "": "dim"}
@@ -81,21 +80,6 @@ BOUNCE_S = 0.7
 """Time after an answer in which the keys of requests do nothing: pressing an answer's key twice sends no request."""
 
 
-class LogPane(VerticalScroll, inherit_bindings=False):
-    """Scrolls by page, with few keys, so that the help lists those of the run first."""
-
-    BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("pageup", "page_up", "Older lines", show=False),
-        Binding("pagedown", "page_down", "Newer lines", show=False),
-    ]
-
-    def on_mount(self) -> None:
-        """Stay at the newest line until the operator scrolls away; draw the scrollbar, which textual moves undrawn."""
-        self.anchor()
-        laid_out = cast("Signal[object]", self.screen.screen_layout_refresh_signal)  # pyright: ignore[reportUnknownMemberType]
-        laid_out.subscribe(self, lambda _: self.vertical_scrollbar.refresh())
-
-
 class RunScreen(Screen[None], inherit_bindings=False):
     """Draws snapshots; keeps only what is on the screen."""
 
@@ -106,7 +90,6 @@ Grid: ✓ complete, ▶ now, › next, ! bad takes, × left out
 Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
 """
     DEFAULT_CSS = """
-    RunScreen #title { height: 1; background: $panel; text-style: bold; text-wrap: nowrap; text-overflow: ellipsis; }
     RunScreen #band { height: 7; }
     RunScreen #state {
         width: 18; height: 7; margin: 0 1; content-align: center middle; text-align: center; text-style: bold;
@@ -142,7 +125,6 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
     RunScreen.-narrow.-capture #right, RunScreen.-narrow.-camera #right { display: block; width: 1fr; }
     RunScreen.-narrow.-capture #left, RunScreen.-narrow.-camera #left { display: none; }
     RunScreen.-narrow.-capture #camera, RunScreen.-narrow.-camera #capture { display: none; }
-    RunScreen #note { height: 1; padding: 0 1; background: $panel; text-wrap: nowrap; text-overflow: ellipsis; }
     """
     # Most important first: a narrow screen shows only as many as fit.
     BINDINGS: ClassVar[list[BindingType]] = [
@@ -165,27 +147,27 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
     def __init__(self, engine: Engine) -> None:
         super().__init__()
         self.engine = engine
-        self._now = engine.snapshot()
+        self._now = Snapshot()
         # Kept, not queried: a snapshot may come before the parts are mounted or after they are gone.
-        self._title = Line("title", sized=True)
+        self._title = Bar("title")
         self._state, self._figures = Line("state", sized=True), Line("figures", sized=True)
         self._why, self._why_pane = Line("why"), VerticalScroll(id="why-pane")
         self._grid = DataTable[Text](id="grid", classes="pane", show_cursor=False)
         self._grid.can_focus = False
         self._grid.border_title = "Strokes done/planned by depth H and tilt α"
         self._sheet = Line("sheet", classes="pane")
-        self._log, self._log_pane = Line("log"), LogPane(id="log-pane", classes="pane")
+        self._log, self._log_pane = Line("log"), Newest(id="log-pane", classes="pane")
         self._log_pane.border_title = "Log"
         self._capture, self._words = Vertical(id="capture", classes="pane"), Line("capture-words")
+        self._words.show(Content.styled("no photograph yet since this start", "dim"))
         self._capture.border_title = "Last capture: photograph, binarised, CCD-BSM"
         self._pictures = [picture_widget(name) for name in ("photo", "binary", "model")]
         self._camera = picture_widget("camera")
         self._camera.add_class("pane")
         self._camera.border_title = "Camera"
-        self._note = Line("note", sized=True)
-        self._drawn: Snapshot | None = None
+        self._note = Bar("note")
         self._pane = 0
-        self._stop_sent = self._figures_turn = False
+        self._figures_turn = False
         self._deaf_until_s = 0.0
 
     def compose(self) -> ComposeResult:
@@ -267,24 +249,18 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
             model = "CCD-BSM as published" if last.model is not None else "no prediction for this stroke"
             app_of(self).push_screen(CaptureScreen(last, model))
 
-    def stop_sent(self) -> None:
-        """Show at once that a stop key was pressed, before the engine answers."""
-        self._stop_sent = True
-        self._state.show(STOP_SENT)
-        self._state.set_class(True, "-stopping")
-
     def answered(self) -> None:
         """A question was answered: leave the keys of requests without effect for a moment."""
         self._deaf_until_s = time.monotonic() + BOUNCE_S
 
     def show(self, now: Snapshot) -> None:
         """Draw what differs from the previous snapshot."""
-        before, self._now, self._drawn = self._drawn, now, now
+        before, self._now = self._now, now
         source, session = one_line(now.source) or "not known yet", one_line(now.session_id) or "no session yet"
         self._title.show(Content.assemble((f" source: {source} ", "$text on $accent"), f"  {session}"))
         self._show_state(now)
         # Figures and camera take turns: textual visits every widget between two that it draws at the same time.
-        self._figures_turn = not self._figures_turn or before is None or now.state is not before.state
+        self._figures_turn = not self._figures_turn or now.state is not before.state
         if self._figures_turn:
             self._figures.show(figures_content(now))
         elif now.picture is not None and self._camera.display:
@@ -292,30 +268,26 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
         self.set_class(bool(now.error), "-wrong")
         entitle(self._why_pane, "Why it failed" if now.state is State.FAILED else "Why it stopped")
         self._why.show(plain(now.error))
-        if before is None or now.grid != before.grid:
+        if now.grid != before.grid:
             fill_grid(self._grid, now.grid)
         self._sheet.show(sheet_content(now.sheet))
         if now.sheet is not None:
             entitle(self._sheet, f"Sheet {now.sheet.number}: {now.sheet.marks.count(None)} free")
-        if before is None or now.messages != before.messages:
+        if now.messages != before.messages:
             self._log.show(Content("\n").join(_message_content(line) for line in now.messages[-LOG_LINES:]))
-        if before is None or now.last is not before.last:
+        if now.last is not None and now.last is not before.last:
             self._show_capture(now.last)
         self._note.show(_note_content(now))
 
     def _show_state(self, now: Snapshot) -> None:
         state = now.state
-        self._stop_sent = self._stop_sent and state not in FINAL | {State.STOPPING}
         word = f"{state.upper()}\nafter this step" if state is State.PAUSING else state.upper()
-        self._state.show("\n".join(filter(None, (STOP_SENT if self._stop_sent else word, no_pose_text(now)))))
+        self._state.show("\n".join(filter(None, (word, no_pose_text(now)))))
         self._state.set_class(now.no_pose_s is not None, "-silent")
         for known in State:
-            self._state.set_class(known is (State.STOPPING if self._stop_sent else state), f"-{known}")
+            self._state.set_class(known is state, f"-{known}")
 
-    def _show_capture(self, last: LastCapture | None) -> None:
-        if last is None:
-            self._words.show(Content.styled("no photograph yet since this start", "dim"))
-            return
+    def _show_capture(self, last: LastCapture) -> None:
         self._words.show(_capture_words(last))
         pictures = (last.photo, binary_picture(last.binary), binary_picture(last.model))
         for widget, picture in zip(self._pictures, pictures, strict=True):
@@ -355,15 +327,22 @@ def live_content(now: Snapshot) -> Content:
 
 def _live_rows(now: Snapshot) -> list[tuple[str, Content | str]]:
     """Where the tip is, where the arm was sent and how far it still has to go, and what the brush feels."""
-    tip = Content.styled(no_pose_text(now) or tip_text(now.tip_mm), "" if now.tip_mm else "bold $text-warning")
+    tip = Content.styled(no_pose_text(now) or "no pose", "bold $text-warning")
     target, force = "no target yet", "not measured now" if now.state in FINAL else "no force sensor, or silent"
+    if now.tip_mm is not None:
+        tip = Content(_place_text(now.tip_mm))
     if now.target_mm is not None:
         to_go = "" if now.tip_mm is None else f"   {math.dist(now.target_mm, now.tip_mm):.2f} mm to go"
-        target = tip_text(now.target_mm) + to_go
+        target = _place_text(now.target_mm) + to_go
     if now.force_n is not None:
         ceiling = "" if now.force_ceiling_n is None else f" (stops at {now.force_ceiling_n:g} N)"
         force = f"{now.force_n:6.3f} N{ceiling}   trace up to {scale_n(now.trace_n[-TRACE_PEAKS:]):.2g} N"
     return [("Tip", tip), ("Target", target), ("Force", force)]
+
+
+def _place_text(place_mm: tuple[float, float, float]) -> str:
+    x, y, z = place_mm
+    return f"x {x:7.2f}  y {y:7.2f}  z {z:7.2f} mm"
 
 
 def scale_n(values_n: Sequence[float]) -> float:

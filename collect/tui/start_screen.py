@@ -6,8 +6,8 @@ Heavy imports wait until they are needed, so that the screen is up first.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -25,6 +25,7 @@ from brushloop.collect.tui.widgets import (
     HELP_KEY,
     YES,
     AskScreen,
+    Bar,
     Line,
     Rows,
     app_of,
@@ -38,7 +39,6 @@ from brushloop.sessions.terminal import text_of
 
 if TYPE_CHECKING:
     from brushloop.collect.engine.engine import Engine
-    from brushloop.collect.engine.open_or_resume import Opening
     from brushloop.sessions.show import Details, Summary
 
 RECENT = 50
@@ -52,8 +52,6 @@ GOES_ON = "The arm first lifts and parks; then the run continues there. No strok
 class SessionBrowser:
     """Reads sessions and makes engines; connects to no device."""
 
-    engine_for: Callable[[Opening], Engine]
-    """Makes the engine of a run, not yet started; see `collect.start.engine_for`."""
     root: Path = Path("sessions")
     """Folder that holds sessions."""
     config: Path = Path("rig.toml")
@@ -88,6 +86,7 @@ class SessionBrowser:
 
         A session goes on with its own protocol. Connects nothing yet. Raises `ConfigError`.
         """
+        from brushloop.collect import start
         from brushloop.collect.engine import CollectRequest
         from brushloop.collect.engine.open_or_resume import PROTOCOL_EFFECTIVE, Opening
 
@@ -96,7 +95,7 @@ class SessionBrowser:
             request = replace(request, new=True, sheet=1)
         else:
             request = replace(request, protocol=self.root / session_id / PROTOCOL_EFFECTIVE, resume=session_id)
-        return self.engine_for(Opening.load(request))
+        return start.engine_for(Opening.load(request))
 
 
 class StartScreen(Screen[None]):
@@ -104,7 +103,6 @@ class StartScreen(Screen[None]):
 
     AUTO_FOCUS = "#sessions"
     DEFAULT_CSS = """
-    StartScreen #start-title { height: 1; padding: 0 1; background: $panel; text-style: bold; }
     StartScreen #start-body { height: 1fr; }
     StartScreen #sessions { width: 42%; height: 100%; border: none; padding: 0; }
     StartScreen.-empty #sessions { display: none; }
@@ -120,22 +118,11 @@ class StartScreen(Screen[None]):
         HELP_KEY,
     ]
 
-    def __init__(
-        self,
-        browser: SessionBrowser,
-        begin: Callable[[str | None], object],
-        look: Callable[[str], None],
-        run_command: Callable[..., None],
-    ) -> None:
-        """`begin` resumes the named session, or begins a new one (None); `look` opens one for review; `run_command`
-        hands the terminal to a command."""
+    def __init__(self, browser: SessionBrowser) -> None:
         super().__init__()
         self._browser = browser
-        self._begin = begin
-        self._look = look
-        self._run_command = run_command
         self._rows: list[Summary] = []
-        self._title, self._standing = Line("start-title"), Line("standing-text")
+        self._title, self._standing = Bar("title"), Line("standing-text")
         self._files, self._trouble = Line("files"), Line("trouble")
         self._options = Rows("sessions")
 
@@ -185,9 +172,12 @@ class StartScreen(Screen[None]):
 
     def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
         """Resume an open session, or look through a closed one."""
-        row = self._rows[event.option_index]
+        row, browser = self._rows[event.option_index], self._browser
         self.show_trouble("")
-        (self._begin if row.state == "open" else self._look)(row.session_id)
+        if row.state == "open":
+            app_of(self).begin(partial(browser.engine, row.session_id))
+        else:
+            app_of(self).review(browser.root / row.session_id)
 
     def action_file(self, what: str) -> None:
         """Ask for the rig's file, then for the protocol's; an empty name, or escape, keeps a file as it is."""
@@ -220,14 +210,14 @@ class StartScreen(Screen[None]):
 
         def answered(key: str | None) -> None:
             if key == YES:
-                self._begin(None)
+                app_of(self).begin(partial(self._browser.engine, None))
 
         question = yes_or_no(f"A new session: is a blank sheet in as its sheet 1?\n\n{planned}", "it is in", "back")
         app_of(self).push_screen(AskScreen(question), answered)
 
     def action_health(self) -> None:
         """Ask every device for its identity and its faults; powers nothing."""
-        self._run_command("doctor", "--config", str(self._browser.config))
+        app_of(self).run_command("doctor", "--config", str(self._browser.config))
 
 
 def first_steps_content(browser: SessionBrowser) -> Content:

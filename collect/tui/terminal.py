@@ -25,6 +25,7 @@ from textual.widgets import HelpPanel
 from brushloop.sessions.terminal import inert, plain
 
 STOP_KEYS = frozenset({"s", "ctrl+c"})
+STOP_SHOWN_S = 5.0
 
 
 class TerminalDriver(LinuxDriver):
@@ -71,11 +72,11 @@ class PlainApp(App[None]):
 
     def stops(self, event: events.Key) -> bool:
         """Whether this stop key stops the arm now."""
-        raise NotImplementedError
+        return bool(self.check_action("stop", ()))
 
     def action_stop(self) -> None:
-        """Stop the arm at once."""
-        raise NotImplementedError
+        """Show that a stop was sent, on every screen; an app sends it first."""
+        self.notify("Red button if it moves.", title="STOP SENT", severity="warning", timeout=STOP_SHOWN_S)
 
     def action_help(self) -> None:
         """Show or hide textual's list of the keys of this screen."""

@@ -6,12 +6,13 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, ClassVar, cast
 
 from textual import events
-from textual.app import App, ComposeResult
+from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
-from textual.containers import Vertical
+from textual.containers import Vertical, VerticalScroll
 from textual.content import Content
 from textual.dom import DOMNode
 from textual.screen import ModalScreen
+from textual.signal import Signal
 from textual.widget import Widget
 from textual.widgets import Footer, Input, OptionList, Static
 from textual.widgets.option_list import Option
@@ -21,6 +22,7 @@ from brushloop.collect.tui.pictures import picture_widget
 from brushloop.sessions import terminal
 
 if TYPE_CHECKING:
+    from brushloop.collect.tui.app import OperatorApp
     from brushloop.sessions.records import Condition
 
 SOFTWARE_STOP = "s is a software stop. The red button is the emergency stop."
@@ -30,9 +32,9 @@ STOP = Binding("s", "app.stop", "STOP", tooltip="Stop the arm at once, on every 
 HELP_KEY = Binding("question_mark", "app.help", "Help", key_display="?", tooltip="Every key of this screen, on and off")
 
 
-def app_of(node: DOMNode) -> App[None]:
-    """The app that a widget is in, with a type."""
-    return cast("App[None]", node.app)  # pyright: ignore[reportUnknownMemberType]
+def app_of(node: DOMNode) -> OperatorApp:
+    """The app that a screen of a run is in, with its type."""
+    return cast("OperatorApp", node.app)  # pyright: ignore[reportUnknownMemberType]
 
 
 class Line(Static):
@@ -50,6 +52,34 @@ class Line(Static):
         if self._shown is None or not content.is_same(self._shown):
             self._shown = content
             self.update(content, layout=not self._sized)
+
+
+class Bar(Line):
+    """A line across the screen: its title, or what to do now."""
+
+    DEFAULT_CSS = """
+    Bar { height: 1; padding: 0 1; background: $panel; text-wrap: nowrap; text-overflow: ellipsis; }
+    Bar#title { text-style: bold; }
+    """
+
+    def __init__(self, place: str) -> None:
+        super().__init__(place, sized=True)
+
+
+class Newest(VerticalScroll, inherit_bindings=False):
+    """Stays at its newest line until the operator pages back; has few keys, so that the help lists the screen's own."""
+
+    DEFAULT_CSS = "Newest > Line { min-height: 100%; }"
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("pageup", "page_up", "Older lines", show=False),
+        Binding("pagedown", "page_down", "Newer lines", show=False),
+    ]
+
+    def on_mount(self) -> None:
+        """Stay at the end; draw the scrollbar, which textual moves undrawn."""
+        self.anchor()
+        laid_out = cast("Signal[object]", self.screen.screen_layout_refresh_signal)  # pyright: ignore[reportUnknownMemberType]
+        laid_out.subscribe(self, lambda _: self.vertical_scrollbar.refresh())
 
 
 class Rows(OptionList):
@@ -97,14 +127,6 @@ def labelled(name: str, text: Content | str, columns: int = 10) -> Content:
 def condition_text(condition: Condition) -> str:
     """`H 13 mm  α 5°`."""
     return f"H {condition.depth_mm:g} mm  α {condition.tilt_deg:g}°"
-
-
-def tip_text(tip_mm: tuple[float, float, float] | None) -> str:
-    """The tip's position, or `no pose`."""
-    if tip_mm is None:
-        return "no pose"
-    x, y, z = tip_mm
-    return f"x {x:7.2f}  y {y:7.2f}  z {z:7.2f} mm"
 
 
 # Questions to the operator, with their answers on keys or typed; the stop keys work over all of them

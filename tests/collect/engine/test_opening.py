@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from brushloop.collect import start
 from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.open_or_resume import (
     CollectRequest,
@@ -149,7 +150,9 @@ def test_where_hardware_may_move_the_rig_is_checked_first_unless_it_is_switched_
     assert StepKind.SELF_CHECK not in kinds(opening(armed=True))
 
 
-def test_the_start_screen_resumes_each_session_with_its_own_protocol(lab: Path) -> None:
+def test_the_start_screen_resumes_each_session_with_its_own_protocol(
+    lab: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Another protocol lies in the folder, and a newer session is open."""
     begin("grid-02")
     Path("protocol.toml").write_text('kind = "calibration"\n')
@@ -159,7 +162,8 @@ def test_the_start_screen_resumes_each_session_with_its_own_protocol(lab: Path) 
         openings.append(opening)
         return FakeEngine(picture())
 
-    browser = SessionBrowser(engine_for)
+    monkeypatch.setattr(start, "engine_for", engine_for)
+    browser = SessionBrowser()
     for session_id in ("grid-01", "grid-02"):
         browser.engine(session_id)
         assert find_resumable(openings[-1]) == Path("sessions") / session_id

@@ -31,7 +31,7 @@ from brushloop.collect.operator import Choice, OperatorRequest, Prompt
 from brushloop.collect.photograph.checks import Verdict
 from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.commission_app import CommissionApp
-from brushloop.collect.tui.review_screen import Review, ReviewCapture, ReviewScreen
+from brushloop.collect.tui.review_screen import Review, ReviewCapture
 from brushloop.collect.tui.start_screen import SessionBrowser
 from brushloop.drivers.host import HostClock
 from brushloop.model.fitted import FittedPress
@@ -239,7 +239,7 @@ class FakeBrowser(SessionBrowser):
     """Two sessions, one cut in its middle."""
 
     def __init__(self) -> None:
-        super().__init__(engine_for)
+        super().__init__()
         self.asked: list[Any] = []
 
     def recent(self) -> list[Summary]:
@@ -294,10 +294,6 @@ def app_of(engine: Any = None, browser: FakeBrowser | None = None) -> OperatorAp
     return OperatorApp(engine_for, engine, browser=browser)
 
 
-def a_review(folder: Path, app: OperatorApp) -> ReviewScreen:
-    return ReviewScreen(FakeReview(folder), app._finish, at_work=lambda: app.at_work)
-
-
 def has_picture(text: str) -> bool:
     """Whether a picture is among it: braille with dots."""
     return any("\u2801" <= sign <= "\u28ff" for sign in text)
@@ -341,7 +337,7 @@ async def watched(now: Snapshot, size: tuple[int, int] = (80, 24)) -> AsyncGener
     """A run that is shown until the end of the block."""
     engine = FakeEngine(now)
     app = app_of(engine)
-    async with app.run_test(size=size) as pilot:
+    async with app.run_test(size=size, notifications=True) as pilot:
         run = Watched(engine, app, pilot)
         await run.look()
         yield run

@@ -11,6 +11,7 @@ from textual.pilot import Pilot
 
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.snapshot import Snapshot
+from brushloop.collect.tui.review_screen import ReviewScreen
 from tests.collect.tui.fake import (
     FAILED,
     SPLIT,
@@ -18,7 +19,7 @@ from tests.collect.tui.fake import (
     Asking,
     FakeBrowser,
     FakeEngine,
-    a_review,
+    FakeReview,
     app_of,
     capture,
     commission_app_of,
@@ -89,7 +90,7 @@ def test_review(
 
     async def review(pilot: Pilot[None]) -> None:
         await settled(pilot)
-        app.push_screen(a_review(Path(), app))
+        app.push_screen(ReviewScreen(FakeReview(Path())))
         await settled(pilot)
         await pilot.pause(0.2)
         await pressing(*keys)(pilot)

@@ -14,7 +14,6 @@ from textual.pilot import Pilot
 from bench.harness import Process, started
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.snapshot import Snapshot
-from brushloop.collect.start import engine_for
 from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.review_screen import ReviewScreen
 from brushloop.collect.tui.run_screen import RunScreen
@@ -119,7 +118,7 @@ def rig(tmp_path: Path) -> Iterator[Process]:
 
 @pytest.mark.timeout(400)
 async def test_a_day_at_the_rig(rig: Process, tmp_path: Path) -> None:
-    browser = SessionBrowser(engine_for, tmp_path / "sessions", tmp_path / "rig.toml", tmp_path / "protocol.toml")
+    browser = SessionBrowser(tmp_path / "sessions", tmp_path / "rig.toml", tmp_path / "protocol.toml")
     app = OperatorApp(browser.engine, browser=browser)
     async with app.run_test(size=(80, 24)) as pilot:
         operator = Operator(app, pilot)
