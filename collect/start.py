@@ -17,17 +17,14 @@ from typing import Any, NamedTuple
 from brushloop.calibrate.artefact import FITS, current
 from brushloop.calibrate.commands import CalibrateRequest, FitRequest, show_work
 from brushloop.collect.engine import CollectRequest
-from brushloop.collect.engine.engine import Engine
+from brushloop.collect.engine.engine import Engine, engine_for
 from brushloop.collect.engine.live import LiveView
-from brushloop.collect.engine.open_or_resume import Opening, find_resumable
+from brushloop.collect.engine.open_or_resume import Opening
 from brushloop.collect.engine.snapshot import REFRESH_S, eta_text, no_pose_text
 from brushloop.collect.errors import StrokesLeftOut
 from brushloop.collect.operator import stop_signals
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import load_rig
-from brushloop.collect.walk import check_protocol
-from brushloop.drivers.host import HostClock
-from brushloop.sessions.disk import check_writable
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.terminal import plain_console, say
@@ -41,14 +38,6 @@ class Collected(NamedTuple):
 
     folder: Path
     left_out: int
-
-
-def engine_for(opening: Opening) -> Engine:
-    """Make an engine that resumes the open session or begins a new one; connects nothing yet. Raises `ConfigError`."""
-    request, resume = opening.request, find_resumable(opening)
-    check_protocol(request.config, request.protocol, opening.rig, opening.protocol)
-    check_writable(resume or request.out)
-    return Engine(opening, resume, HostClock())
 
 
 def run(request: CollectRequest) -> None:

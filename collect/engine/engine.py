@@ -18,7 +18,7 @@ from pathlib import Path
 
 from brushloop.collect.engine.control import FINAL, RunControl, State
 from brushloop.collect.engine.live import Telemetry, each_frame
-from brushloop.collect.engine.open_or_resume import Opening, open_store
+from brushloop.collect.engine.open_or_resume import Opening, find_resumable, open_store
 from brushloop.collect.engine.policy import resume_question
 from brushloop.collect.engine.recorder import uninterrupted
 from brushloop.collect.engine.run import Run
@@ -33,9 +33,10 @@ from brushloop.collect.errors import (
 )
 from brushloop.collect.operator import Asker, Choice, OperatorRequest, OperatorRequests, Prompt
 from brushloop.collect.rig.devices import Rig, connected
-from brushloop.collect.walk import sheet_of
+from brushloop.collect.walk import check_protocol, sheet_of
 from brushloop.drivers.errors import DeviceError, NotConnected, Stale
-from brushloop.drivers.host import Clock
+from brushloop.drivers.host import Clock, HostClock
+from brushloop.sessions.disk import check_writable
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.store import SessionStore
@@ -308,3 +309,11 @@ class Engine:
         if self._store is not None:
             with contextlib.suppress(SessionError):
                 self._store.ended(describe(error))
+
+
+def engine_for(opening: Opening) -> Engine:
+    """Make an engine that resumes the open session or begins a new one; connects nothing yet. Raises `ConfigError`."""
+    request, resume = opening.request, find_resumable(opening)
+    check_protocol(request.config, request.protocol, opening.rig, opening.protocol)
+    check_writable(resume or request.out)
+    return Engine(opening, resume, HostClock())

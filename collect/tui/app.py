@@ -74,7 +74,7 @@ class OperatorApp(PlainApp):
     def on_mount(self) -> None:
         """Show the first screen; then poll the engine at 10 Hz."""
         if self._browser is not None:
-            self.push_screen(StartScreen(self._browser))
+            self.push_screen(StartScreen(self._browser, self.begin, self.review, self.run_command))
         if self.engine is not None:
             self._show_run(self.engine)
         self.call_after_refresh(self._poll)
@@ -114,7 +114,7 @@ class OperatorApp(PlainApp):
         from brushloop.collect.tui.review_screen import Review, ReviewScreen  # slow to import
 
         try:
-            self.push_screen(ReviewScreen(Review(folder)))
+            self.push_screen(ReviewScreen(Review(folder), self.offer_commands, lambda: self.at_work))
         except SessionError as error:
             self._complain(error)
 

@@ -6,6 +6,7 @@ import asyncio
 import itertools
 import statistics
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
@@ -208,9 +209,10 @@ class ReviewScreen(Screen[None]):
         HELP_KEY,
     ]
 
-    def __init__(self, review: Review) -> None:
+    def __init__(self, review: Review, finish: Callable[[Path], None], at_work: Callable[[], bool]) -> None:
+        """`finish` offers the next commands; `at_work` says whether a run is in progress."""
         super().__init__()
-        self._review = review
+        self._review, self._finish, self._at_work = review, finish, at_work
         self._capture: ReviewCapture | None = None
         self._alike: dict[Condition, str] = {}
         self._title, self._words = Bar("title"), Line("words")
@@ -236,7 +238,7 @@ class ReviewScreen(Screen[None]):
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
         """Notes and commands wait until no run is in progress: until then `s` stops the arm."""
         if action in ("note", "finish"):
-            return not app_of(self).at_work
+            return not self._at_work()
         return super().check_action(action, parameters)
 
     def on_option_list_option_highlighted(self, event: OptionList.OptionHighlighted) -> None:
@@ -280,7 +282,7 @@ class ReviewScreen(Screen[None]):
 
     def action_finish(self) -> None:
         """Show what can be done with the session."""
-        app_of(self).offer_commands(self._review.folder)
+        self._finish(self._review.folder)
 
     def _remark(self, capture: ReviewCapture, *, bad: bool, note: str) -> None:
         still, stroke_id = capture.result.still, capture.press.stroke_id
@@ -299,7 +301,7 @@ class ReviewScreen(Screen[None]):
     def _list(self, at: int) -> None:
         review, captures = self._review, self._review.captures
         good = sum(capture.counts for capture in captures)
-        state = f"open. {SOFTWARE_STOP}" if app_of(self).at_work else "open" if review.open else "closed"
+        state = f"open. {SOFTWARE_STOP}" if self._at_work() else "open" if review.open else "closed"
         self._title.show(f"{one_line(review.folder.name)}: {good} of {len(captures)} count; {state}")
         self._options.fill(map(_row_content, captures), at)
         if not captures:

@@ -6,6 +6,7 @@ Heavy imports wait until they are needed, so that the screen is up first.
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -86,8 +87,8 @@ class SessionBrowser:
 
         A session goes on with its own protocol. Connects nothing yet. Raises `ConfigError`.
         """
-        from brushloop.collect import start
         from brushloop.collect.engine import CollectRequest
+        from brushloop.collect.engine.engine import engine_for
         from brushloop.collect.engine.open_or_resume import PROTOCOL_EFFECTIVE, Opening
 
         request = CollectRequest(self.config, self.protocol, self.root, on_screen=True, guided=True)
@@ -95,7 +96,7 @@ class SessionBrowser:
             request = replace(request, new=True, sheet=1)
         else:
             request = replace(request, protocol=self.root / session_id / PROTOCOL_EFFECTIVE, resume=session_id)
-        return start.engine_for(Opening.load(request))
+        return engine_for(Opening.load(request))
 
 
 class StartScreen(Screen[None]):
@@ -118,9 +119,17 @@ class StartScreen(Screen[None]):
         HELP_KEY,
     ]
 
-    def __init__(self, browser: SessionBrowser) -> None:
+    def __init__(
+        self,
+        browser: SessionBrowser,
+        begin: Callable[[Callable[[], Engine]], object],
+        review: Callable[[Path], None],
+        run_command: Callable[..., None],
+    ) -> None:
+        """What the app does: begin a run with an engine, review a session, hand the terminal to a command."""
         super().__init__()
         self._browser = browser
+        self._begin, self._review, self._run_command = begin, review, run_command
         self._rows: list[Summary] = []
         self._title, self._standing = Bar("title"), Line("standing-text")
         self._files, self._trouble = Line("files"), Line("trouble")
@@ -175,9 +184,9 @@ class StartScreen(Screen[None]):
         row, browser = self._rows[event.option_index], self._browser
         self.show_trouble("")
         if row.state == "open":
-            app_of(self).begin(partial(browser.engine, row.session_id))
+            self._begin(partial(browser.engine, row.session_id))
         else:
-            app_of(self).review(browser.root / row.session_id)
+            self._review(browser.root / row.session_id)
 
     def action_file(self, what: str) -> None:
         """Ask for the rig's file, then for the protocol's; an empty name, or escape, keeps a file as it is."""
@@ -210,14 +219,14 @@ class StartScreen(Screen[None]):
 
         def answered(key: str | None) -> None:
             if key == YES:
-                app_of(self).begin(partial(self._browser.engine, None))
+                self._begin(partial(self._browser.engine, None))
 
         question = yes_or_no(f"A new session: is a blank sheet in as its sheet 1?\n\n{planned}", "it is in", "back")
         app_of(self).push_screen(AskScreen(question), answered)
 
     def action_health(self) -> None:
         """Ask every device for its identity and its faults; powers nothing."""
-        app_of(self).run_command("doctor", "--config", str(self._browser.config))
+        self._run_command("doctor", "--config", str(self._browser.config))
 
 
 def first_steps_content(browser: SessionBrowser) -> Content:

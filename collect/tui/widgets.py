@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, ClassVar, cast
 
 from textual import events
-from textual.app import ComposeResult
+from textual.app import App, ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Vertical, VerticalScroll
 from textual.content import Content
@@ -22,7 +22,6 @@ from brushloop.collect.tui.pictures import picture_widget
 from brushloop.sessions import terminal
 
 if TYPE_CHECKING:
-    from brushloop.collect.tui.app import OperatorApp
     from brushloop.sessions.records import Condition
 
 SOFTWARE_STOP = "s is a software stop. The red button is the emergency stop."
@@ -32,9 +31,9 @@ STOP = Binding("s", "app.stop", "STOP", tooltip="Stop the arm at once, on every 
 HELP_KEY = Binding("question_mark", "app.help", "Help", key_display="?", tooltip="Every key of this screen, on and off")
 
 
-def app_of(node: DOMNode) -> OperatorApp:
-    """The app that a screen of a run is in, with its type."""
-    return cast("OperatorApp", node.app)  # pyright: ignore[reportUnknownMemberType]
+def app_of(node: DOMNode) -> App[None]:
+    """The app that a widget is in, with a type."""
+    return cast("App[None]", node.app)  # pyright: ignore[reportUnknownMemberType]
 
 
 class Line(Static):

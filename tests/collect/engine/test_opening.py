@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-from brushloop.collect import start
-from brushloop.collect.engine.engine import Engine
+from brushloop.collect.engine import engine
 from brushloop.collect.engine.open_or_resume import (
     CollectRequest,
     Opening,
@@ -158,11 +157,11 @@ def test_the_start_screen_resumes_each_session_with_its_own_protocol(
     Path("protocol.toml").write_text('kind = "calibration"\n')
     openings: list[Opening] = []
 
-    def engine_for(opening: Opening) -> Engine:
+    def engine_for(opening: Opening) -> FakeEngine:
         openings.append(opening)
         return FakeEngine(picture())
 
-    monkeypatch.setattr(start, "engine_for", engine_for)
+    monkeypatch.setattr(engine, "engine_for", engine_for)
     browser = SessionBrowser()
     for session_id in ("grid-01", "grid-02"):
         browser.engine(session_id)

@@ -31,7 +31,7 @@ from brushloop.collect.operator import Choice, OperatorRequest, Prompt
 from brushloop.collect.photograph.checks import Verdict
 from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.commission_app import CommissionApp
-from brushloop.collect.tui.review_screen import Review, ReviewCapture
+from brushloop.collect.tui.review_screen import Review, ReviewCapture, ReviewScreen
 from brushloop.collect.tui.start_screen import SessionBrowser
 from brushloop.drivers.host import HostClock
 from brushloop.model.fitted import FittedPress
@@ -292,6 +292,10 @@ class FakeReview(Review):
 def app_of(engine: Any = None, browser: FakeBrowser | None = None) -> OperatorApp:
     """The app of one run, or of a day; neither resumes anything."""
     return OperatorApp(engine_for, engine, browser=browser)
+
+
+def a_review(folder: Path, app: OperatorApp) -> ReviewScreen:
+    return ReviewScreen(FakeReview(folder), app.offer_commands, lambda: app.at_work)
 
 
 def has_picture(text: str) -> bool:

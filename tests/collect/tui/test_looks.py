@@ -11,7 +11,6 @@ from textual.pilot import Pilot
 
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.snapshot import Snapshot
-from brushloop.collect.tui.review_screen import ReviewScreen
 from tests.collect.tui.fake import (
     FAILED,
     SPLIT,
@@ -19,7 +18,7 @@ from tests.collect.tui.fake import (
     Asking,
     FakeBrowser,
     FakeEngine,
-    FakeReview,
+    a_review,
     app_of,
     capture,
     commission_app_of,
@@ -90,7 +89,7 @@ def test_review(
 
     async def review(pilot: Pilot[None]) -> None:
         await settled(pilot)
-        app.push_screen(ReviewScreen(FakeReview(Path())))
+        app.push_screen(a_review(Path(), app))
         await settled(pilot)
         await pilot.pause(0.2)
         await pressing(*keys)(pilot)

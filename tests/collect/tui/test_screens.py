@@ -24,7 +24,6 @@ from brushloop.collect.operator import Choice, Prompt
 from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.capture_screen import COLOURS, CaptureScreen, over_photograph
 from brushloop.collect.tui.pictures import CellPicture, braille, look_for_pixels, picture_widget, strip_of
-from brushloop.collect.tui.review_screen import ReviewScreen
 from brushloop.collect.tui.run_screen import RunScreen, cell_text, spark
 from brushloop.collect.tui.widgets import AskScreen
 from brushloop.sessions.recording import remarks_of
@@ -33,7 +32,7 @@ from tests.collect.tui.fake import (
     PAUSED,
     FakeBrowser,
     FakeEngine,
-    FakeReview,
+    a_review,
     app_of,
     capture,
     full_picture,
@@ -231,7 +230,7 @@ async def test_other_files_can_be_typed_and_letters_of_stop_keys_too() -> None:
 
 async def test_no_note_is_typed_while_a_run_is_in_progress(tmp_path: Path) -> None:
     async with watched(PAUSED, (120, 40)) as run:
-        run.app.push_screen(review := ReviewScreen(FakeReview(tmp_path)))
+        run.app.push_screen(review := a_review(tmp_path, run.app))
         text = await ready(run.app, run.pilot)
         for words in ("red button", "s STOP"):
             assert words in text
@@ -257,7 +256,7 @@ async def test_after_a_session_the_next_commands_run_in_the_terminal(
     monkeypatch.setattr("sys.stdin", io.StringIO())
     async with app.run_test(size=(120, 40)) as pilot:
         await ready(app, pilot)
-        app.push_screen(ReviewScreen(FakeReview(Path())))
+        app.push_screen(a_review(Path(), app))
         await ready(app, pilot)
         await pilot.press("f")
         assert "c  brushloop calibrate" in await ready(app, pilot)
