@@ -187,7 +187,7 @@ def test_the_picture_shows_the_box_and_every_place(rig: Path, tmp_path: Path) ->
 
 
 def test_what_was_taught_says_what_was_never_measured(rig: Path) -> None:
-    mass = Taught(0.0, "as set on the pendant", "kg", known="not weighed")
+    mass = Taught(0.0, "as set on the pendant", known="not weighed")
     Notebook().with_values({"robot.payload_kg": mass}).finished("arm").save(rig)
     said = " ".join(brushloop("rig", "check", rig).stdout.split())
     assert "robot.payload_kg 0.0 kg as set on the pendant, not weighed" in said
