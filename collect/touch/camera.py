@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from brushloop.calibrate.board.lens import apply
 from brushloop.calibrate.board.pix2len import local_scale, see_board
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.stroke import PX_PER_MM, rectify
 from brushloop.collect.errors import StepError
 from brushloop.collect.motion import Dip, Move, Procedures, touching, up
 from brushloop.collect.photograph.frames import Gray, undistorted
@@ -58,21 +57,6 @@ def _darkening(first: NDArray[np.float32], second: NDArray[np.float32]) -> tuple
         return np.zeros_like(first), 1.0
     light = float(np.median(second[clean] / first[clean]))
     return np.asarray(first - second / max(light, 1e-3), np.float32), paper
-
-
-def ink_at(
-    before: Gray, after: Gray, image_to_paper: Floats, spots_mm: list[tuple[float, float]], side_mm: float
-) -> Floats:
-    """New ink in a square around each spot, (n,) in mm2 of paper turned black. Noise averages to 0."""
-    amounts_mm2: list[float] = []
-    for x, y in spots_mm:
-        # Larger by one side all around, so that the median sees paper; at 20 px/mm.
-        window = (x - 1.5 * side_mm, y - 1.5 * side_mm, 3.0 * side_mm, 3.0 * side_mm)
-        first, second = (rectify(image, image_to_paper, window).astype(np.float32) for image in (before, after))
-        darkening, paper = _darkening(first, second)
-        third = darkening.shape[0] // 3
-        amounts_mm2.append(float(darkening[third : 2 * third, third : 2 * third].sum()) / paper / PX_PER_MM**2)
-    return np.array(amounts_mm2, np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,8 +121,8 @@ SLACK_STEPS = 2
 """Fine steps beyond the coarse step, on either side: a coarse touch is accurate only to its step."""
 FINE_COUNT = 1 + 2 * SLACK_STEPS + math.ceil(COARSE_STEP_MM / FINE_STEP_MM)
 """Spots of one fine row."""
-WINDOW_MM = 0.75 * PITCH_MM
-"""Side of the window in which a spot's ink is measured."""
+OFF_MM = 0.375 * PITCH_MM
+"""How far along either axis a spot's mark may lie from it."""
 SPOTS_PER_DIP = 2
 """Touches after which the brush is dipped again: a tip that dries leaves no ink at first."""
 LEAST_INK_MM2 = 0.25
@@ -267,10 +251,12 @@ class FirstInkTouch:
         return self._last
 
     async def _inked(self, before: Frame, touched: list[Spot]) -> NDArray[np.bool_]:
+        """(m,) whether new ink is seen at each spot."""
         after = await self._photograph()
         frames = await asyncio.to_thread(before_and_after, self._rig.config, before, after)
-        places_mm = [(x, y) for x, y, _ in touched]
-        return (await asyncio.to_thread(ink_at, *frames, places_mm, WINDOW_MM)) >= LEAST_INK_MM2
+        marks = await asyncio.to_thread(new_marks, *frames, LEAST_INK_MM2)
+        off_mm = [[max(abs(mark.x_mm - x), abs(mark.y_mm - y)) for mark in marks] for x, y, _ in touched]
+        return np.array([min(off, default=math.inf) <= OFF_MM for off in off_mm])
 
 
 def _plane(touches: list[Touch]) -> PaperPlane:
