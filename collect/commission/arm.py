@@ -35,6 +35,8 @@ FRAMINGS: tuple[Framing, ...] = ("sof", "bare")
 STILL_MM, STILL_DEG = 0.02, 0.01
 """An arm that is held still by hand moves by less than this between two readings."""
 STILL_S, PATIENCE_S = 0.1, 20.0
+HAND_MM = 0.15
+"""Smallest plausible error of a touch by hand, in one axis: a few touches may agree by chance."""
 
 
 def address_of(text: str) -> tuple[str, int]:

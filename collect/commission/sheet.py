@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from brushloop.calibrate.board.spec import BoardSpec, size_mm
-from brushloop.collect.commission.arm import taught_arm, tip_of, touch
+from brushloop.collect.commission.arm import HAND_MM, taught_arm, tip_of, touch
 from brushloop.collect.commission.camera import board_of
 from brushloop.collect.commission.visit import Notebook, Step, Taught, Visit
 from brushloop.collect.errors import NotAccepted
@@ -25,8 +24,8 @@ from brushloop.collect.rig.paper import PaperPlane, fit_plane
 Floats = NDArray[np.float64]
 Point = tuple[float, float, float]
 CORNERS = ("lower left", "lower right", "upper right", "upper left")
-HAND_MM = 0.15
-"""Smallest plausible error of a touch by hand, in one axis."""
+Corners = Sequence[Sequence[Point]]
+"""The touches of each corner, in the order of `CORNERS`."""
 WORST_CORNER_MM = 3.0
 """A corner that is off by more than this was not merely touched inaccurately."""
 WORST_SCALE = 0.004
@@ -116,19 +115,19 @@ def touch_point(fit: SheetFit) -> tuple[float, float]:
     return round(x, 3), round(y, 3)
 
 
-def all_corners(notebook: Notebook, kind: str) -> dict[str, list[Point]]:
+def all_corners(notebook: Notebook, kind: str) -> Corners:
     """The tip at every touch of each corner, in the base frame. Raises `NotAccepted` where a corner was skipped."""
-    offset_mm, corners = notebook.get("robot.tcp_offset_mm"), defaultdict[str, list[Point]](list)
+    offset_mm, corners = notebook.get("robot.tcp_offset_mm"), [list[Point]() for _ in CORNERS]
     for name, flange in notebook.touched(kind).items():
-        corners[name.split(" ", 1)[1]].append(tip_of(flange, offset_mm))
-    if missing := [f"{kind.removesuffix('-corner')} {name}" for name in CORNERS if name not in corners]:
+        corners[CORNERS.index(name.split(" ", 1)[1])].append(tip_of(flange, offset_mm))
+    if missing := [f"{kind.removesuffix('-corner')} {CORNERS[k]}" for k in range(4) if not corners[k]]:
         raise NotAccepted(
             f"not touched: {', '.join(missing)}.",
             "All four corners of both are needed. What the arm does not reach by hand is out of its reach: move the "
             "board with the sheet, so that all corners are 0.25 to 0.7 m from the arm's foot, or turn its wrist the "
             "other way round, and touch all corners again.",
         )
-    return dict(corners)
+    return corners
 
 
 def fitted(notebook: Notebook) -> SheetFit:
@@ -169,13 +168,13 @@ def inside_corners(size_mm: Sequence[float], by_mm: float) -> Floats:
     return middle + (corners_of(*size_mm) - middle) * (1.0 - by_mm / middle)
 
 
-def check_board(board: Mapping[str, Sequence[Point]], spec: BoardSpec) -> None:
+def check_board(board: Corners, spec: BoardSpec) -> None:
     """Raise `NotAccepted` where the touched corners of the board do not form the printed one, and say why.
 
     Names swapped or given as in a mirror, a print of another size, or one corner that was touched badly.
     """
     printed, (size_x_mm, size_y_mm) = corners_of(*size_mm(spec)), size_mm(spec)
-    touched = np.array([np.mean(board[name], axis=0)[:2] for name in CORNERS])
+    touched = np.array([np.mean(touches, axis=0)[:2] for touches in board])
     _, scale, off_mm = _similarity(printed, touched)
     if off_mm.max() > WORST_CORNER_MM:
         # Either pair of opposite corners gives the same shape.
@@ -208,17 +207,19 @@ def check_board(board: Mapping[str, Sequence[Point]], spec: BoardSpec) -> None:
         )
 
 
-def fit_sheet(board: Mapping[str, Sequence[Point]], sheet: Mapping[str, Sequence[Point]], spec: BoardSpec) -> SheetFit:
-    """Least squares over all touches of four board corners and four sheet corners, by name; base frame, in mm.
+def fit_sheet(board: Corners, sheet: Corners, spec: BoardSpec) -> SheetFit:
+    """Least squares over all touches of four board corners and four sheet corners; base frame, in mm.
 
     The board gives most of the turn, the sheet's own corners its origin and its size. Raises `NotAccepted` for a sheet
     that lies askew on its board or whose corners were named otherwise, and `StepError` where it leans too much.
     """
     printed = corners_of(*size_mm(spec))
-    (bk, b), (sk, s) = _stacked(board), _stacked(sheet)
+    (bk, b), (sk, s) = (
+        (np.repeat(range(4), [len(touches) for touches in corners]), np.concatenate(corners))
+        for corners in (board, sheet)
+    )
     yaw0, _, _ = _similarity(printed[bk], b[:, :2])
-    straight = [s[sk == k, :2].mean(axis=0) @ _rotation(yaw0) for k in range(len(CORNERS))]
-    size0 = _size_along_board(straight)
+    _check_straight(np.array([np.mean(touches, axis=0)[:2] for touches in sheet]) @ _rotation(yaw0))
 
     def off(values: Floats) -> Floats:
         yaw, board_mm, sheet_mm, (width, height) = values[0], values[1:3], values[3:5], values[5:]
@@ -226,8 +227,8 @@ def fit_sheet(board: Mapping[str, Sequence[Point]], sheet: Mapping[str, Sequence
         board_at, sheet_at = printed[bk] @ turn.T + board_mm, corners_of(width, height)[sk] @ turn.T + sheet_mm
         return np.concatenate([(b[:, :2] - board_at).ravel(), (s[:, :2] - sheet_at).ravel()])
 
-    board0 = b[:, :2].mean(axis=0) - _rotation(yaw0) @ printed[bk].mean(axis=0)
-    solved = least_squares(off, np.array([yaw0, *board0, *(_rotation(yaw0) @ straight[0]), *size0]))
+    # But for the turn, what is sought has a linear effect: it may begin anywhere.
+    solved = least_squares(off, np.array([yaw0, *b[0, :2], *s[0, :2], *size_mm(spec)]))
     yaw, bx, by, sx, sy, width, height = (float(v) for v in solved.x)
     residuals = np.asarray(solved.fun, np.float64).reshape(-1, 2)
     noise_mm = max(math.sqrt(float((residuals**2).sum()) / max(residuals.size - 7, 1)), HAND_MM)
@@ -251,19 +252,10 @@ def fit_sheet(board: Mapping[str, Sequence[Point]], sheet: Mapping[str, Sequence
     )
 
 
-def _stacked(touched: Mapping[str, Sequence[Point]]) -> tuple[NDArray[np.int64], Floats]:
-    """(n,) numbers of the corners that were touched, and the (n, 3) touches."""
-    pairs = [(CORNERS.index(name), point) for name, points in touched.items() for point in points]
-    return np.array([number for number, _ in pairs]), np.array([point for _, point in pairs])
-
-
-def _size_along_board(corners: Sequence[Floats]) -> tuple[float, float]:
-    """Width and height of a sheet by its corners in the board's directions. Raises `NotAccepted` if it lies askew."""
+def _check_straight(corners: Floats) -> None:
+    """Raise `NotAccepted` if a sheet lies askew or in a mirror by its (4, 2) corners in the board's directions."""
     lower_left, lower_right, upper_right, upper_left = corners
-    along, up = (
-        0.5 * (lower_right - lower_left + upper_right - upper_left),
-        0.5 * (upper_left - lower_left + upper_right - lower_right),
-    )
+    along, up = lower_right - lower_left + upper_right - upper_left, upper_left - lower_left + upper_right - lower_right
     if along[0] * up[1] - along[1] * up[0] <= 0.0:
         raise NotAccepted(
             "the corners of the sheet were named as in a mirror.", "Seen from above they follow counter-clockwise."
@@ -275,7 +267,6 @@ def _size_along_board(corners: Sequence[Floats]) -> tuple[float, float]:
             "Lay its edges along the squares, and touch again; the lower left corner of both is the one beside the "
             "print's name.",
         )
-    return float(np.linalg.norm(along)), float(np.linalg.norm(up))
 
 
 def _rotation(angle: float) -> Floats:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from brushloop.collect.commission.arm import taught_arm, tip_of, touch
+from brushloop.collect.commission.arm import HAND_MM, taught_arm, tip_of, touch
 from brushloop.collect.commission.visit import Notebook, Step, Taught, Visit
 from brushloop.collect.errors import NotAccepted
 from brushloop.collect.rig.check import brush_square
@@ -30,8 +30,6 @@ wrist turns along with the lean, all directions are the same: one side of the fl
 OUTLIER_SHARE = 4.0
 """A touch or hold that is farther from the others than this many of their standard deviations is a stray."""
 LEAST_OUTLIER_MM = 1.0
-HAND_MM = 0.15
-"""Smallest plausible error of a touch by hand, in one axis: a few touches may agree by chance."""
 LEAST_OFF_DEG, LEAST_AGREEING = 1.0, 5
 """A hold that is less than this from the others is no stray, and fewer holds than this do not outvote a stray."""
 
@@ -44,22 +42,12 @@ class TipFit:
     """Flange to tip, along the flange's axes."""
     pin_mm: tuple[float, float, float]
     """The point that was touched, in the base frame."""
-    residuals_mm: tuple[float, ...]
-    """Distance of the tip from the point in each touch."""
-    sigma_mm: tuple[float, float, float]
-    """Standard error of each component of the offset."""
-    freedom: int
-    """Degrees of freedom of the noise's estimate."""
-
-    @property
-    def touch_mm(self) -> float:
-        """Standard deviation of one touch's distance from the point."""
-        return math.sqrt(3.0 * sum(r * r for r in self.residuals_mm) / self.freedom)
-
-    @property
-    def error_mm(self) -> float:
-        """Root mean square of the distance by which the offset may be wrong."""
-        return math.hypot(*self.sigma_mm)
+    worst_mm: float
+    """Largest distance of the tip from the point in a touch."""
+    touch_mm: float
+    """Standard deviation of one touch's distance from the point."""
+    error_mm: float
+    """Root mean square of the distance by which the offset may be wrong."""
 
 
 def find_tip(flanges: Sequence[Pose]) -> TipFit:
@@ -82,15 +70,14 @@ def find_tip(flanges: Sequence[Pose]) -> TipFit:
         )
     solution = np.asarray(np.linalg.lstsq(equations, -places.ravel(), rcond=None)[0], np.float64)
     off = (equations @ solution + places.ravel()).reshape(-1, 3)
-    freedom = 3 * len(flanges) - 6
-    noise_mm = max(math.sqrt(float((off**2).sum()) / freedom), HAND_MM)
-    spread = noise_mm * np.sqrt(np.diag(np.linalg.inv(equations.T @ equations)))
+    seen_mm = math.sqrt(float((off**2).sum()) / (3 * len(flanges) - 6))
+    spread = max(seen_mm, HAND_MM) * np.sqrt(np.diag(np.linalg.inv(equations.T @ equations)))
     return TipFit(
-        _triple(solution[:3]),
-        _triple(solution[3:]),
-        tuple(float(r) for r in np.linalg.norm(off, axis=1)),
-        _triple(spread[:3]),
-        freedom,
+        offset_mm=_triple(solution[:3]),
+        pin_mm=_triple(solution[3:]),
+        worst_mm=float(np.linalg.norm(off, axis=1).max()),
+        touch_mm=math.sqrt(3.0) * seen_mm,
+        error_mm=float(np.linalg.norm(spread[:3])),
     )
 
 
@@ -121,15 +108,11 @@ class AxisFit:
     """As `robot.tcp_rotation_deg`: about x, then y, then z of the flange."""
     sigma_deg: float
     """Standard error of the lean in each direction; infinite for a single hold."""
-    off_deg: tuple[float, ...]
-    """Angle of each hold from the direction in which most of them agree."""
-    strays: tuple[int, ...]
-    """Numbers of the holds that do not agree with the others, and are not part of the fit."""
-
-    @property
-    def holds(self) -> int:
-        """Number of holds that agree."""
-        return len(self.off_deg) - len(self.strays)
+    holds: int
+    """Number of holds that agree."""
+    strays: dict[int, float]
+    """Numbers of the holds that do not agree with them, which are not part of the fit, and how far each is off in
+    deg."""
 
     @property
     def clear(self) -> bool:
@@ -152,12 +135,8 @@ def find_axis(flanges: Sequence[Pose]) -> AxisFit:
     sigma_deg = math.sqrt(squares / (2.0 * (count - 1)) / count) if count > 1 else math.inf
     lean, _ = Rotation.align_vectors(mean[None], [[0.0, 0.0, 1.0]])
     rz, ry, rx = lean.as_euler("ZYX", degrees=True)
-    return AxisFit(
-        (float(rx), float(ry), float(rz)),
-        sigma_deg,
-        tuple(off_deg.tolist()),
-        tuple(np.flatnonzero(~agree).tolist()),
-    )
+    strays = {int(number): float(off_deg[number]) for number in np.flatnonzero(~agree)}
+    return AxisFit((float(rx), float(ry), float(rz)), sigma_deg, count, strays)
 
 
 def _angles_deg(directions: Floats, toward: Floats) -> Floats:
@@ -244,7 +223,7 @@ class TipStep(Step):
         visit.say(
             f"{len(touches)} touches: the tip is at ({x:.2f}, {y:.2f}, {z:.2f}) mm from the flange, with a standard "
             f"error of {fit.error_mm:.3f} mm (goal: {GOOD_MM:g} mm); "
-            f"no touch is more than {max(fit.residuals_mm):.2f} mm off."
+            f"no touch is more than {fit.worst_mm:.2f} mm off."
         )
         return fit.error_mm
 
@@ -274,7 +253,8 @@ class TipStep(Step):
             return False
         names, flanges = list(holds), list(holds.values())
         axis, square = find_axis(flanges), brush_square(find_axis(flanges[-1:]).rotation_deg)
-        wrong, sure = {names[k]: f"is {axis.off_deg[k]:.1f} deg from the others" for k in axis.strays}, axis.clear
+        wrong = {names[k]: f"is {off_deg:.1f} deg from the others" for k, off_deg in axis.strays.items()}
+        sure = axis.clear
         if square.verdict == "contradicts":
             wrong, sure = {names[-1]: f"would make the brush lean by {square.value} ({square.allowed})"}, True
         elif len(holds) > 1 and distance(flanges[-2], flanges[-1])[1] < LEAST_TURN_DEG:
@@ -294,9 +274,8 @@ class TipStep(Step):
         """The offset, and how the brush leans against the flange."""
         touches = list(notebook.touched("pin").values())
         fit = find_tip(touches)
-        known = f"residuals up to {max(fit.residuals_mm):.2f} mm"
         how = f"the same pin touched from {len(touches)} sides by hand"
-        offset = Taught(list(fit.offset_mm), how, fit.error_mm, known)
+        offset = Taught(list(fit.offset_mm), how, fit.error_mm, f"residuals up to {fit.worst_mm:.2f} mm")
         if (axis := measured_axis(notebook)) is None:
             turn = Taught([0.0, 0.0, 0.0], "taken as square to the flange", known="not measured")
         else:
