@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import math
 from collections.abc import Sequence
-from contextlib import AbstractAsyncContextManager
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -54,13 +53,15 @@ ASK_ADDRESS = line_of(
 )
 
 
-async def flange_at_rest(controller: Controller) -> Pose:
-    """Wait until the arm is held still, and return the pose of the flange in the base frame.
+async def taught_flange(notebook: Notebook) -> Pose:
+    """Where the flange of the arm that was taught is at rest, in the base frame. Raises `DeviceError`."""
+    table = notebook.table("robot.")
+    async with only_asking(table["host"], table["port"], table["framing"]) as controller:
+        return await _flange_at_rest(controller)
 
-    Raises `DeviceTimeout` if the arm keeps moving, and other `DeviceError`s.
-    """
-    if controller.connection.lost:
-        await controller.connection.open()
+
+async def _flange_at_rest(controller: Controller) -> Pose:
+    """Wait until the arm is held still. Raises `DeviceTimeout` if it keeps moving."""
     before = await _flange(controller)
     try:
         async with asyncio.timeout(PATIENCE_S):
@@ -92,25 +93,20 @@ def tip_of(flange: Pose, offset_mm: Sequence[float]) -> tuple[float, float, floa
     return x, y, z
 
 
-def taught_arm(notebook: Notebook) -> AbstractAsyncContextManager[Controller]:
-    """The arm that was taught, for reading only."""
-    return only_asking(notebook.get("robot.host"), notebook.get("robot.port"), notebook.get("robot.framing"))
+async def touch(visit: Visit, thing: str, how: str, *, may_skip: bool = False) -> bool:
+    """Ask for the tip to be brought to a thing, and note the flange's pose there; False if the person skips it.
 
-
-async def touch(visit: Visit, arm: Controller, thing: str, how: str, *, may_skip: bool = False) -> Pose | None:
-    """Ask for the tip to be brought to a thing, and note the flange's pose there; None if the person skips it.
-
-    A thing that was touched before is not asked for again.
+    A thing that was touched before is not asked for again. Raises `DeviceError`.
     """
     if thing in visit.notebook.touches:
-        return visit.notebook.touches[thing]
+        return True
     if not await visit.brought(thing, how, may_skip=may_skip):
-        return None
-    flange = await flange_at_rest(arm)
+        return False
+    flange = await taught_flange(visit.notebook)
     visit.save(visit.notebook.with_touch(thing, flange))
     x, y, z = flange.position_mm
     visit.say(f"{thing}: the flange is at ({x:.2f}, {y:.2f}, {z:.2f}) mm")
-    return flange
+    return True
 
 
 async def find_framing(host: str, port: int) -> tuple[Framing, str]:

@@ -100,15 +100,21 @@ class BrushStep(Step):
             await device.close()
 
 
-def _addressed(bus: str) -> dict[str, str | int]:
+LOOPBACK_STALE_MS = 1000.0
+
+
+def _addressed(bus: str) -> dict[str, str | float]:
     """The fields of `[force]` for what was typed; none for an empty text. Raises ValueError."""
     if ":" not in bus:
         return {"kind": "sri-m8123", "interface": "socketcan", "channel": bus} if bus else {}
     parts = urlsplit(f"//{bus}")
     if not parts.hostname or not parts.port:
         raise ValueError(f"{bus!r} is no bus: type can0, or HOST:PORT/can0 of a gateway")
-    at = {"kind": "sri-m8123", "interface": "socketcand", "channel": parts.path.strip("/") or "can0"}
-    return {**at, "host": parts.hostname, "port": parts.port}
+    channel = parts.path.strip("/") or "can0"
+    # Simulated time may run faster than rounds arrive.
+    stale = {"stale_ms": LOOPBACK_STALE_MS} if channel == LOOPBACK_CHANNEL else {}
+    at = {"kind": "sri-m8123", "interface": "socketcand", "channel": channel}
+    return {**at, "host": parts.hostname, "port": parts.port, **stale}
 
 
 def _bus(line: str) -> str:
@@ -126,7 +132,6 @@ STRAIGHT = 0.8
 """Least share of the push along the sensor's z."""
 LEAN_ROOM_DEG = 0.3
 """Room for another sheet on the same table."""
-LOOPBACK_STALE_MS = 1000.0
 INSET_MM = 6.0
 """Distance of the touch points from the sheet's edges: in its margin, where they cost no cell."""
 
@@ -142,12 +147,7 @@ class ForceStep(Step):
     async def carry_out(self, visit: Visit) -> None:
         """Find the sensor and have it pushed. Raises `NotAccepted`, `DeviceError`."""
         bus = await visit.value("aside.bus", ASK_BUS)
-        addressed = _addressed(bus)
-        values = {f"force.{field}": Taught(value, "typed") for field, value in addressed.items()}
-        if addressed.get("channel") == LOOPBACK_CHANNEL:
-            how = "simulated time may run faster than rounds arrive: allowed on the loopback rig's bus alone"
-            values["force.stale_ms"] = Taught(LOOPBACK_STALE_MS, how)
-        visit.keep(values)
+        visit.keep({f"force.{field}": Taught(value, "typed") for field, value in _addressed(bus).items()})
         if not bus:
             visit.say(
                 "Without a force sensor the height of the paper is found by jogging with keys, when a session starts."

@@ -9,28 +9,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from brushloop.calibrate.files import read_gray
-from brushloop.collect.commission.arm import taught_arm, tip_of, touch
+from brushloop.collect.commission.arm import tip_of, touch
 from brushloop.collect.commission.camera import shown_live, still, taught_camera
 from brushloop.collect.commission.sheet import Point, corners_of
-from brushloop.collect.commission.visit import (
-    NO,
-    YES,
-    Notebook,
-    Step,
-    Taught,
-    Value,
-    Visit,
-    choice_of,
-    number_of,
-    rig_of,
-)
+from brushloop.collect.commission.visit import YES, Notebook, Step, Taught, Visit, number_of, rig_of, yes_of
 from brushloop.collect.errors import ConfigError, NotAccepted
 from brushloop.collect.photograph.frames import ARM_SHARE, Thumbnail, changed_share, thumbnail
 from brushloop.collect.rig.check import draw_rig, places_of
 from brushloop.collect.rig.config import TRAVEL_CLEARANCE_MM, PaperConfig, RigConfig
 from brushloop.collect.rig.paper import PaperPlane, to_base, to_paper
 from brushloop.collect.walk import ask_reach
-from brushloop.drivers.arcs.controller import Controller
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose
 
@@ -52,8 +40,8 @@ AWAY = {
 }
 PARKED = "aside.parked"
 INK = ("well-rim", "well", "wash-rim", "wash-pot")
-WIPE = choice_of("Shall each dip end with a wipe across the rim of the well, which takes the drop off?", (YES, NO))
-WASH = choice_of("Is there a pot of water to wash the brush in?", (YES, NO))
+WIPE = yes_of("Shall each dip end with a wipe across the rim of the well, which takes the drop off?")
+WASH = yes_of("Is there a pot of water to wash the brush in?")
 MARGIN_MM = 25.0
 """Room beside what was taught: a brush lifted along a tool axis that leans by 15 deg moves aside by as much."""
 BELOW_MM = 2.0
@@ -81,27 +69,26 @@ class PlacesStep(Step):
 
     async def carry_out(self, visit: Visit) -> None:
         """Have the tip brought to each place; look whether the parked arm is out of the picture."""
-        async with taught_arm(visit.notebook) as arm:
-            await touch(visit, arm, "well-rim 0", "Bring the tip to the rim of the ink well.")
-            how = "Bring the tip into the middle of the well, as deep as a dip should go: a few mm above its bottom."
-            await touch(visit, arm, "well 0", how)
-            with visit.asked_again_if_refused("well-rim", "well"):
-                check_pot(visit.notebook, "well-rim 0", "well 0", "well")
-            if await visit.value("aside.wipe", WIPE) == YES.key:
-                how = "Bring the tip to the rim on the side where the drop shall be wiped off, away from the sheet."
-                await touch(visit, arm, "well-rim 1", how)
-                with visit.asked_again_if_refused("well-rim 1"):
-                    check_wipe(visit.notebook)
-            if await visit.value("aside.wash", WASH) == YES.key:
-                await touch(visit, arm, "wash-rim 0", "Bring the tip to the rim of the pot of water.")
-                how = "Bring the tip into the middle of the pot of water, as deep as a wash should go."
-                await touch(visit, arm, "wash-pot 0", how)
-                with visit.asked_again_if_refused("wash-rim", "wash-pot"):
-                    check_pot(visit.notebook, "wash-rim 0", "wash-pot 0", "pot of water")
-            if PARKED not in visit.notebook.values:
-                await self._park(visit, arm)
+        await touch(visit, "well-rim 0", "Bring the tip to the rim of the ink well.")
+        how = "Bring the tip into the middle of the well, as deep as a dip should go: a few mm above its bottom."
+        await touch(visit, "well 0", how)
+        with visit.asked_again_if_refused("well-rim", "well"):
+            check_pot(visit.notebook, "well-rim 0", "well 0", "well")
+        if await visit.value("aside.wipe", WIPE) == YES.key:
+            how = "Bring the tip to the rim on the side where the drop shall be wiped off, away from the sheet."
+            await touch(visit, "well-rim 1", how)
+            with visit.asked_again_if_refused("well-rim 1"):
+                check_wipe(visit.notebook)
+        if await visit.value("aside.wash", WASH) == YES.key:
+            await touch(visit, "wash-rim 0", "Bring the tip to the rim of the pot of water.")
+            how = "Bring the tip into the middle of the pot of water, as deep as a wash should go."
+            await touch(visit, "wash-pot 0", how)
+            with visit.asked_again_if_refused("wash-rim", "wash-pot"):
+                check_pot(visit.notebook, "wash-rim 0", "wash-pot 0", "pot of water")
+        if PARKED not in visit.notebook.values:
+            await self._park(visit)
 
-    async def _park(self, visit: Visit, arm: Controller) -> None:
+    async def _park(self, visit: Visit) -> None:
         """Have the arm brought out of the picture, to two places.
 
         Raises `NotAccepted` unless the pictures from there show the same.
@@ -112,7 +99,7 @@ class PlacesStep(Step):
         async with taught_camera(visit) as camera:
             for kind, how in AWAY.items():
                 async with shown_live(visit, camera):
-                    await touch(visit, arm, f"{kind} 0", how)
+                    await touch(visit, f"{kind} 0", how)
                 visit.working("waiting for a picture without the arm")
                 pictures.append(thumbnail(await still(camera, visit.clock)))
         places = tips(visit.notebook)
@@ -143,7 +130,7 @@ class PlacesStep(Step):
         park_x, park_y, park_z = places["park 0"]
         by_hand = "the tip was brought there by hand"
 
-        def at(value: Value, how: str = by_hand, known: str = "one touch by hand, within a mm") -> Taught:
+        def at(value: float | list[float], how: str = by_hand, known: str = "one touch by hand, within a mm") -> Taught:
             return Taught(value, how, known=known)
 
         travel = f"the higher of sheet + {TRAVEL_MM:g} mm and highest rim + {RIM_CLEAR_MM:g} mm"

@@ -14,7 +14,7 @@ from brushloop.collect.engine.open_or_resume import Opening
 from brushloop.collect.errors import NotAccepted
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.doctor import examine
-from brushloop.collect.rig.paper import PaperPlane
+from brushloop.collect.touch.heights import plane_of
 from brushloop.collect.walk import check_protocol
 from brushloop.drivers.host import finished
 from brushloop.sessions.events import CaptureResult, SelfCheckResult, ZeroTouchResult
@@ -57,16 +57,15 @@ class ProofStep(Step):
         folder = tempfile.mkdtemp(prefix=f"{visit.rig_path.stem}.proof-", dir=visit.rig_path.parent)
         session = await self._run(visit, Path(folder), protocol, dry=False)
         visit.say(f"Recorded in {session}.")
-        await self._keep(visit, *read_proof(session))
+        self._keep(visit, *read_proof(session))
 
     async def _doctor(self, visit: Visit, rig: RigConfig) -> None:
         visit.working("asking every device")
         findings = await examine(rig, visit.clock)
         for finding in findings:
             visit.say(f"{finding.device}: {finding.identity or finding.address}; {finding.notes}")
-        ill = [finding for finding in findings if not finding.well]
-        if ill:
-            raise NotAccepted(f"{ill[0].device}: {ill[0].problem}.", ill[0].remedy or "Check power, cable and address.")
+        if ill := [finding for finding in findings if not finding.well]:
+            raise NotAccepted(f"{ill[0].device}: {ill[0].problem}.", ill[0].remedy)
 
     async def _run(self, visit: Visit, folder: Path, protocol: str, *, dry: bool) -> Path:
         """Run the protocol slowly on what was taught; returns the session's folder.
@@ -106,10 +105,10 @@ class ProofStep(Step):
                 engine.answer(asked.number, str(await visit.ask(asked, back=False)))
             await asyncio.sleep(POLL_S)
 
-    async def _keep(
+    def _keep(
         self, visit: Visit, touch: ZeroTouchResult, check: SelfCheckResult, captures: list[CaptureResult]
     ) -> None:
-        plane = PaperPlane(touch.touch_z_mm, touch.slope_x, touch.slope_y)
+        plane = plane_of(touch)
         by_hand_mm = visit.notebook.get(HEIGHT)
         x_mm, y_mm = visit.notebook.get("paper.touch_point_mm")
         z_mm, worst_mm = plane.touch_z_mm(x_mm, y_mm), max(map(abs, touch.residuals_mm), default=0.0)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from brushloop.calibrate.board.spec import BoardSpec, size_mm
-from brushloop.collect.commission.arm import HAND_MM, taught_arm, tip_of, touch
+from brushloop.collect.commission.arm import HAND_MM, tip_of, touch
 from brushloop.collect.commission.camera import board_of
 from brushloop.collect.commission.visit import Notebook, Step, Taught, Visit
 from brushloop.collect.errors import NotAccepted
@@ -59,34 +59,33 @@ class SheetStep(Step):
             "along the squares.",
             "Touch each corner with the brush upright (hold a set square beside it), and hold still.",
         )
-        async with taught_arm(visit.notebook) as arm:
-            sigma_mm = math.inf
-            for number in range(MOST_ROUNDS):
-                for kind, thing in THINGS:
-                    if kind == BOARD and number % 2:
-                        continue  # the sheet's own corners give its origin, and need more touches
-                    for corner in CORNERS:
-                        how = f"Bring the tip to the {corner} corner of {thing}" + (" once more." if number else ".")
-                        await touch(visit, arm, f"{kind} {number} {corner}", how, may_skip=True)
-                    if kind == BOARD:
-                        with visit.asked_again_if_refused(BOARD):
-                            check_board(all_corners(visit.notebook, BOARD), board_of(visit.notebook))
-                with visit.asked_again_if_refused(SHEET):
-                    fit = fitted(visit.notebook)
-                (x, y), (width, height) = fit.origin_mm, fit.size_mm
-                visit.say(
-                    f"sheet of {width:.1f} x {height:.1f} mm, origin ({x:.2f}, {y:.2f}) mm, known to "
-                    f"{fit.origin_sigma_mm:.2f} mm (goal {GOOD_MM:g}), turned by {fit.yaw_deg:.2f} deg, leaning by "
-                    f"{fit.plane.slope_deg:.2f} deg; no touch is more than {fit.worst_mm:.2f} mm off."
-                )
-                if (sigma_mm := fit.origin_sigma_mm) <= GOOD_MM:
-                    return
-            if sigma_mm > WORST_MM:
-                visit.forget(BOARD, SHEET)
-                raise NotAccepted(
-                    f"the corner of the sheet is known to {sigma_mm:.2f} mm only.",
-                    "Fix the sheet, hold still while you press Enter, and touch the corners again.",
-                )
+        sigma_mm = math.inf
+        for number in range(MOST_ROUNDS):
+            for kind, thing in THINGS:
+                if kind == BOARD and number % 2:
+                    continue  # the sheet's own corners give its origin, and need more touches
+                for corner in CORNERS:
+                    how = f"Bring the tip to the {corner} corner of {thing}" + (" once more." if number else ".")
+                    await touch(visit, f"{kind} {number} {corner}", how, may_skip=True)
+                if kind == BOARD:
+                    with visit.asked_again_if_refused(BOARD):
+                        check_board(all_corners(visit.notebook, BOARD), board_of(visit.notebook))
+            with visit.asked_again_if_refused(SHEET):
+                fit = fitted(visit.notebook)
+            (x, y), (width, height) = fit.origin_mm, fit.size_mm
+            visit.say(
+                f"sheet of {width:.1f} x {height:.1f} mm, origin ({x:.2f}, {y:.2f}) mm, known to "
+                f"{fit.origin_sigma_mm:.2f} mm (goal {GOOD_MM:g}), turned by {fit.yaw_deg:.2f} deg, leaning by "
+                f"{fit.plane.slope_deg:.2f} deg; no touch is more than {fit.worst_mm:.2f} mm off."
+            )
+            if (sigma_mm := fit.origin_sigma_mm) <= GOOD_MM:
+                return
+        if sigma_mm > WORST_MM:
+            visit.forget(BOARD, SHEET)
+            raise NotAccepted(
+                f"the corner of the sheet is known to {sigma_mm:.2f} mm only.",
+                "Fix the sheet, hold still while you press Enter, and touch the corners again.",
+            )
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """Everything that follows from the touched corners and the tip."""

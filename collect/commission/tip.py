@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from brushloop.collect.commission.arm import HAND_MM, taught_arm, tip_of, touch
+from brushloop.collect.commission.arm import HAND_MM, tip_of, touch
 from brushloop.collect.commission.visit import Notebook, Step, Taught, Visit
 from brushloop.collect.errors import NotAccepted
 from brushloop.collect.rig.check import brush_square
-from brushloop.drivers.arcs.controller import Controller
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import distance
 
@@ -180,12 +179,11 @@ class TipStep(Step):
             "Fix a pin upright where all sides of it can be reached; put the pendant into hand guiding.",
             "Touch its point with the tip of the dry brush, each time leaning to another side, and hold still.",
         )
-        async with taught_arm(visit.notebook) as arm:
-            await self._pin(visit, arm)
-            visit.say("Now the direction of the brush: hold it upright, a set square on the table beside it.")
-            await self._uprights(visit, arm)
+        await self._pin(visit)
+        visit.say("Now the direction of the brush: hold it upright, a set square on the table beside it.")
+        await self._uprights(visit)
 
-    async def _pin(self, visit: Visit, arm: Controller) -> None:
+    async def _pin(self, visit: Visit) -> None:
         """Have the pin touched until the tip is known well enough. Raises `NotAccepted`."""
         for index in range(MOST_TOUCHES):
             if f"pin {index}" in visit.notebook.touches:
@@ -196,7 +194,7 @@ class TipStep(Step):
                 f"Touch {index + 1}: bring the tip to the pin, the brush leaning by 30 deg or more "
                 f"{SIDES[index % 4]}; lean it without turning the wrist with it."
             )
-            await touch(visit, arm, f"pin {index}", how, may_skip=True)
+            await touch(visit, f"pin {index}", how, may_skip=True)
         if (error_mm := self._tip_error_mm(visit)) > WORST_MM:
             visit.forget("pin")
             raise NotAccepted(
@@ -227,7 +225,7 @@ class TipStep(Step):
         )
         return fit.error_mm
 
-    async def _uprights(self, visit: Visit, arm: Controller) -> None:
+    async def _uprights(self, visit: Visit) -> None:
         """Have the brush held upright until its direction is known well enough. Raises `NotAccepted`."""
         while not self._direction_known(visit):
             free = (n for n in range(MOST_UPRIGHTS) if f"upright {n}" not in visit.notebook.touches)
@@ -241,7 +239,7 @@ class TipStep(Step):
                 f"Upright {index + 1} of {UPRIGHTS}: the brush upright along the set square, the wrist turned "
                 "differently each time, anywhere over the table."
             )
-            if await touch(visit, arm, f"upright {index}", how, may_skip=True) is None:
+            if not await touch(visit, f"upright {index}", how, may_skip=True):
                 if measured_axis(visit.notebook) is None:
                     visit.say("The direction of the brush is not measured.", tone="warning")
                 return

@@ -25,7 +25,7 @@ import pydantic.dataclasses
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
-from brushloop.calibrate.files import replacing, write_whole
+from brushloop.calibrate.files import replacing
 from brushloop.collect.errors import ConfigError, NotAccepted, StepError
 from brushloop.collect.operator import Asker, Choice, Prompt
 from brushloop.collect.rig.check import Check, unmeasured
@@ -33,7 +33,7 @@ from brushloop.collect.rig.config import RigConfig, with_optics
 from brushloop.collect.rig.config_file import Config, Finite, read_text, refusal
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.host import Clock
-from brushloop.sessions.disk import fsync_folder, number, set_aside, sync
+from brushloop.sessions.disk import fsync_folder, number, sync
 
 MAX_BYTES = 1024 * 1024
 ENDING, ASIDE = ".taught.json", "aside."
@@ -114,7 +114,7 @@ class Notebook(Config):
         known = self.values.get(field)
         return None if known is None else known.value
 
-    def table(self, beginning: str) -> dict[str, Value]:
+    def table(self, beginning: str) -> dict[str, Any]:
         """The values whose paths begin like this, by the rest of their paths."""
         return {name.removeprefix(beginning): t.value for name, t in self.values.items() if name.startswith(beginning)}
 
@@ -198,16 +198,6 @@ def unit_of(field: str) -> str:
     return field.rpartition("_")[2]
 
 
-def write_rig(rig_path: Path, notebook: Notebook) -> Path | None:
-    """Write `rig.toml`; returns where an older file with another text is kept. Raises `ConfigError`, OSError."""
-    rig_of(notebook, rig_path)
-    text = rig_text(notebook, rig_path)
-    changed = rig_path.exists() and rig_path.read_text(encoding="utf-8") != text
-    kept = set_aside(rig_path, "bak") if changed else None
-    write_whole(rig_path, text)
-    return kept
-
-
 def toml_value(value: Value) -> str:
     """A value as `rig.toml` has it, rounded: none is known better than 0.001 mm or 0.0001 deg."""
     match value:
@@ -244,6 +234,11 @@ class WentBack(Exception):
 def choice_of(question: str, choices: tuple[Choice, ...], default: str = "") -> Prompt:
     """A question with answers on keys; Enter stands for the default, or for nothing if there is none."""
     return Prompt(question, choices, default, answers={"enter": default} if default else {})
+
+
+def yes_of(question: str) -> Prompt:
+    """A question for yes or no; Enter is neither."""
+    return choice_of(question, (YES, NO))
 
 
 def line_of(question: str, default: str = "", read: Callable[[str], Value] = str) -> Prompt:
@@ -354,7 +349,7 @@ class Visit:
 
     async def yes(self, question: str) -> bool:
         """Ask for yes or no; Enter is neither."""
-        return await self.ask(choice_of(question, (YES, NO))) == YES.key
+        return await self.ask(yes_of(question)) == YES.key
 
     async def brought(self, thing: str, how: str, *, may_skip: bool = False) -> bool:
         """Ask the person to bring a thing somewhere; False if it is skipped, where it `may_skip`."""

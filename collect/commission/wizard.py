@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import write_whole
 from brushloop.collect.commission.arm import ArmStep
 from brushloop.collect.commission.brush import BrushStep, ForceStep
 from brushloop.collect.commission.camera import CameraStep
@@ -13,10 +14,11 @@ from brushloop.collect.commission.places import LimitsStep, PlacesStep
 from brushloop.collect.commission.proof import ProofStep
 from brushloop.collect.commission.sheet import SheetStep
 from brushloop.collect.commission.tip import TipStep
-from brushloop.collect.commission.visit import LeftOff, Step, Visit, WentBack, choice_of, toml_value, write_rig
+from brushloop.collect.commission.visit import LeftOff, Step, Visit, WentBack, choice_of, rig_of, rig_text, toml_value
 from brushloop.collect.errors import CollectAborted, ConfigError, NotAccepted, StepError, describe
 from brushloop.collect.operator import Choice
 from brushloop.drivers.errors import DeviceError
+from brushloop.sessions.disk import set_aside
 
 STEPS = (
     ArmStep(),
@@ -114,9 +116,15 @@ class Wizard:
         self._visit.say(f"{step.title}: done")
 
     def _written(self) -> Path:
-        """Write `rig.toml`, which says whether it is proven."""
-        path = self._visit.rig_path
-        kept = write_rig(path, self._visit.notebook)
-        before = "" if kept is None else f"; as it was before: {kept}"
+        """Write `rig.toml`, which says whether it is proven; an older file with another text is kept.
+
+        Raises `ConfigError` for values that cannot be used together, and OSError.
+        """
+        path, notebook, before = self._visit.rig_path, self._visit.notebook, ""
+        rig_of(notebook, path)
+        text = rig_text(notebook, path)
+        if path.exists() and path.read_text(encoding="utf-8") != text:
+            before = f"; as it was before: {set_aside(path, 'bak')}"
+        write_whole(path, text)
         self._visit.say(f"{path}: written, with how each value was obtained{before}")
         return path

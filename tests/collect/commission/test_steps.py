@@ -213,9 +213,9 @@ def parked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Vis
         visit, neither = Parking().visit(tmp_path / "rig.toml"), Taught("n", "answered")
         visit.save(touched().without("park").with_values({"aside.wipe": neither, "aside.wash": neither}))
         flanges = [brush_pose(*away_mm), brush_pose(*PARK_MM)]
-        monkeypatch.setattr(arm, "flange_at_rest", AsyncMock(side_effect=flanges))
+        monkeypatch.setattr(arm, "taught_flange", AsyncMock(side_effect=flanges))
         monkeypatch.setattr(places, "still", AsyncMock(side_effect=[away, parked]))
-        for context in ("taught_arm", "taught_camera", "shown_live"):
+        for context in ("taught_camera", "shown_live"):
             monkeypatch.setattr(places, context, lambda *_: contextlib.nullcontext())
         return visit
 
