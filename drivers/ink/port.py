@@ -31,11 +31,7 @@ from brushloop.drivers.host import Clock, finished
 
 
 class InkRefused(DeviceError):
-    """The device understood the request and refused it; `code` is the device's number for the reason."""
-
-    def __init__(self, device: str, op: str, code: int, text: str, *, condition: str = "", remedy: str = "") -> None:
-        self.code = code
-        super().__init__(device, op, f"refused with {code} ({text})", condition=condition, remedy=remedy)
+    """The device understood the request and refused it; the message has its number for the reason."""
 
 
 class DoseLost(DeviceError):
@@ -161,10 +157,18 @@ class SerialPort:
             raise
 
     async def exchange(
-        self, op: str, request: bytes, find: Callable[[bytes], T | None], *, timeout_s: float, condition: str = ""
+        self,
+        op: str,
+        request: bytes,
+        find: Callable[[bytes], T | None],
+        *,
+        timeout_s: float,
+        attempts: int = 1,
+        condition: str = "",
     ) -> T:
         """Send `request`, then pass all bytes received so far to `find` until it returns a reply.
 
+        Where none comes in `timeout_s`, the same request is sent again, up to so many `attempts` in all.
         Raises `DeviceTimeout` if nothing arrived, `ProtocolViolation` if something else arrived, `ConnectionLost`,
         `NotConnected`, each with `condition`.
         """
@@ -175,13 +179,15 @@ class SerialPort:
             async with self._turn:
                 return await asyncio.to_thread(self._ask, op, request, find, timeout_s)
 
-        try:
-            received, reply = await asyncio.shield(in_turn())
-        except OSError as error:  # pyserial's own error is an OSError
-            what = f"{self._path}: {error.strerror or error}"
-            raise ConnectionLost(self._device, op, what, condition=condition, remedy=REPLUG) from None
-        if reply is not None:
-            return reply
+        received = b""
+        for _ in range(attempts):
+            try:
+                received, reply = await asyncio.shield(in_turn())
+            except OSError as error:  # pyserial's own error is an OSError
+                what = f"{self._path}: {error.strerror or error}"
+                raise ConnectionLost(self._device, op, what, condition=condition, remedy=REPLUG) from None
+            if reply is not None:
+                return reply
         if received:
             start = f"{received[:48]!r}{'...' if len(received) > 48 else ''}"
             what = f"no reply among {start} in {timeout_s:g} s"

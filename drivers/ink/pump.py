@@ -196,8 +196,8 @@ class ModbusPump(InkDevice):
             op, request, lambda received: find_reply(received, request), timeout_s=REPLY_S, condition=condition
         )
         if code:
-            text = EXCEPTIONS.get(code, "unknown")
-            raise InkRefused(DEVICE, op, code, text, condition=condition, remedy="Is this the pump's register map?")
+            what = f"refused with {code} ({EXCEPTIONS.get(code, 'unknown')})"
+            raise InkRefused(DEVICE, op, what, condition=condition, remedy="Is this the pump's register map?")
 
     async def _refuse_echo(self) -> None:
         """Send a stop with a wrong CRC, which no device answers, and raise if the adapter returns it.

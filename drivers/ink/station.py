@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from brushloop.drivers.devices import Identity, Well
-from brushloop.drivers.errors import DeviceError, DeviceTimeout, ProtocolViolation
+from brushloop.drivers.errors import DeviceError, ProtocolViolation
 from brushloop.drivers.host import Clock
 from brushloop.drivers.ink.port import DoseLost, InkDevice, InkRefused, InkTable, SerialPort, crc16
 
@@ -166,24 +166,19 @@ class InkStation(InkDevice):
     async def _ask(self, words: str, *, takes_s: float = 0.0, attempts: int = ATTEMPTS, condition: str = "") -> str:
         """What follows `ok` in the reply. Raises `InkRefused` for `err`, and what `SerialPort.exchange` raises."""
         number, self._number = self._number, (self._number + 1) % NUMBERS
-        op, request, text = words.partition(" ")[0], seal(number, words), None
-        while text is None:
-            attempts -= 1
-            try:
-                text = await self._port.exchange(
-                    op,
-                    request,
-                    lambda received: find_reply(received, number),
-                    timeout_s=REPLY_S + takes_s,
-                    condition=condition,
-                )
-            except (DeviceTimeout, ProtocolViolation):
-                if not attempts:
-                    raise
+        op = words.partition(" ")[0]
+        text = await self._port.exchange(
+            op,
+            seal(number, words),
+            lambda received: find_reply(received, number),
+            timeout_s=REPLY_S + takes_s,
+            attempts=attempts,
+            condition=condition,
+        )
         first, _, values = text.partition(" ")
         if first == "ok":
             return values
-        code_text, _, reason = values.partition(" ")
-        code = int(code_text)
-        condition = condition if code == FAILED else "Nothing was done."
-        raise InkRefused(DEVICE, op, code, reason, condition=condition, remedy=REMEDIES.get(code, ""))
+        code, _, reason = values.partition(" ")
+        condition = condition if int(code) == FAILED else "Nothing was done."
+        what = f"refused with {code} ({reason})"
+        raise InkRefused(DEVICE, op, what, condition=condition, remedy=REMEDIES.get(int(code), ""))
