@@ -30,9 +30,8 @@ from brushloop.drivers.arcs.wire import (
     numbers,
 )
 from brushloop.drivers.errors import DeviceError, ProtocolViolation
-from brushloop.drivers.force.sri_m8123 import COMMAND_ID, Wrench, encode_round
-from brushloop.drivers.force.sri_m8123 import START as START_BOARD
-from brushloop.drivers.force.sri_m8123 import STOP as STOP_BOARD
+from brushloop.drivers.force import sri_m8123
+from brushloop.drivers.force.sri_m8123 import COMMAND_ID, RoundAssembler, Wrench, encode_round
 from brushloop.drivers.ink import pump, station
 from brushloop.drivers.ink.port import crc16
 from brushloop.drivers.ink.simulator import PumpFirmware, StationFirmware
@@ -48,6 +47,7 @@ REPLIES = [
 ]
 START = pump.write_register(1, 4, 1)
 WRENCH: Wrench = (1.0, -2.0, 3.5, 0.25, -0.5, 0.125)
+ROUND = b"".join(can_id.to_bytes(2) + data for can_id, data in encode_round(WRENCH))
 
 _NASTY = (
     *(b"\xff\xff\xff\xff", b"\x7f\xff\xff\xff", b"\xff\xff", b"\x9b" + b"\xff" * 8, b"\x5b" + b"\x7f" * 8),
@@ -116,11 +116,8 @@ PUBLISHED: list[tuple[bytes, bytes]] = [
         b'{"jsonrpc":"2.0","method":"rob1.MotionControl.moveLine",'
         b'"params":[[0.4,-0.13,0.2,3.14,0.0,1.57],1.2,0.25,0.0,0.0],"id":7}',
     ),
-    (
-        b"".join(can_id.to_bytes(2) + data for can_id, data in encode_round(WRENCH)),
-        bytes.fromhex("0291 0000803f 000000c0  0292 00006040 0000803e  0293 000000bf 0000003e"),
-    ),
-    (COMMAND_ID.to_bytes(2) + START_BOARD + STOP_BOARD, bytes.fromhex("0080 02 00")),
+    (ROUND, bytes.fromhex("0291 0000803f 000000c0  0292 00006040 0000803e  0293 000000bf 0000003e")),
+    (COMMAND_ID.to_bytes(2) + sri_m8123.START + sri_m8123.STOP, bytes.fromhex("0080 02 00")),
     (
         b"".join(FrameDecoder().feed(bytes.fromhex("53 4f 46 01 00 00 00 02 4f 4b") + b"SOF\x00\x00\x05hello")),
         b"OKhello",
@@ -195,6 +192,16 @@ async def obeyed(data: bytes) -> object:
     return True
 
 
+async def joined(data: bytes) -> object:
+    """The wrenches in a row of frames, each an id of two bytes and what it holds; then a sound round."""
+    parts = RoundAssembler()
+    frames = [(int.from_bytes(data[at : at + 2]), data[at + 2 : at + 10]) for at in range(0, len(data), 10)]
+    wrenches = [wrench for frame in frames if (wrench := parts.feed(*frame, 0.0)) is not None]
+    assert all(math.isfinite(value) and abs(value) <= 1000.0 for wrench in wrenches for value in wrench)
+    assert [parts.feed(*frame, 7.0) for frame in encode_round(WRENCH)] == [None, None, WRENCH]
+    return wrenches or None
+
+
 LINES = [
     station.seal(5, text) for text in ("ok", "ok 0.730 1.250", "err 4 reservoir is empty", "ok nan inf 1e999", "hello")
 ]
@@ -224,6 +231,7 @@ READERS: dict[str, tuple[Read, list[bytes], int]] = {
     "a push": (pushed, PUSHES, 10_000),
     "a greeting": (greeted, [GREETING, b'{"protocol":"rtde","output":{}}\n\n'], 8000),
     "a stream of pushes": (streamed, [encode_short(PUSHES[0]) * 3, encode_short(PUSHES[4])], 2000),
+    "rounds of the force board": (joined, [ROUND * 3], 2000),
     "a request to an instrument": (obeyed, LINES + FRAMES, 1000),
 }
 
