@@ -65,22 +65,11 @@ def hostile(valid: Sequence[bytes], count: int) -> Iterator[bytes]:
         data = bytearray(rng.choice(valid))
         for _ in range(rng.randint(1, 4)):
             at = rng.randint(0, len(data))
-            end = min(len(data), at + rng.randint(1, 8))
-            match rng.randrange(7):
-                case 0 if data:
-                    data[min(at, len(data) - 1)] ^= 1 << rng.randrange(8)
-                case 1:
-                    data[at:end] = b""
-                case 2:
-                    data[at:at] = data[at:end] * rng.randint(1, 3)
-                case 3:
-                    data[at:at] = rng.randbytes(rng.randint(1, 8))
-                case 4:
-                    data[at:] = rng.choice(valid)[rng.randint(0, at) :]
-                case 5:
-                    data[at:end] = rng.choice(_NASTY)
-                case _:
-                    data[at:at] = rng.choice(_NASTY)
+            end = at + rng.randint(1, 8)
+            flipped = bytes(byte ^ 1 << rng.randrange(8) for byte in data[at : at + 1])
+            other, noise, nasty = rng.choice(valid)[rng.randint(0, at) :], rng.randbytes(4), rng.choice(_NASTY)
+            piece = rng.choice((b"", flipped, data[at:end] * rng.randint(1, 3), other, noise, nasty))
+            data[at : rng.choice((at, at + len(flipped), end))] = piece
         yield bytes(data)
     yield from (rng.randbytes(rng.randint(0, 80)) for _ in range(count // 10))
 
