@@ -80,11 +80,10 @@ INVALID_REQUEST, METHOD_NOT_FOUND, INVALID_PARAMS = -32600, -32601, -32602
 class ArcsServer(LoopbackServer):
     """One controller for any number of clients."""
 
-    def __init__(self, world: World, faults: FaultBoard | None = None) -> None:
-        """`faults` is the board of the whole rig; alone, the server has one of its own."""
+    def __init__(self, world: World) -> None:
         super().__init__()
         self.cabinet = Cabinet(world)
-        self.faults = faults or FaultBoard(world)
+        self.faults = FaultBoard(world)
         self._methods = methods(self.cabinet)
 
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -159,13 +158,12 @@ BACKLOG_BYTES = 32 * 1024
 
 
 class RtdeServer(LoopbackServer):
-    """One RTDE port for any number of clients."""
+    """The RTDE port of a controller for any number of clients."""
 
-    def __init__(self, cabinet: Cabinet, faults: FaultBoard | None = None) -> None:
-        """`faults` is the board of the whole rig; alone, the server has one of its own."""
+    def __init__(self, arcs: ArcsServer) -> None:
         super().__init__()
-        self.faults = faults or FaultBoard(cabinet.world)
-        self._cabinet = cabinet
+        self.faults = arcs.faults
+        self._cabinet = arcs.cabinet
         self.pings = 0
         """Keep-alives seen, for tests."""
 

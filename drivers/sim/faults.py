@@ -145,10 +145,6 @@ class Fault(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
         """True if it begins without a request."""
         return self.device is Device.INK or (self.kind in STOPS and self.on is None)
 
-    def matches(self, op: str) -> bool:
-        """Whether the fault waits for `op`, a method's full name."""
-        return self.on is None or op == self.on or op.endswith(f".{self.on}")
-
 
 def fault_of(values: dict[str, Any]) -> Fault:
     """One fault from a client's request. Raises ValueError with one line that names the field."""
@@ -229,7 +225,8 @@ class FaultBoard:
         """
         for hung in self.hanging:
             fault = hung.fault
-            if fault.device is not device or not fault.matches(op) or fault.kind not in (kinds or KINDS[device]):
+            waits = fault.on is not None and fault.on != op and not op.endswith(f".{fault.on}")
+            if fault.device is not device or waits or fault.kind not in (kinds or KINDS[device]):
                 continue
             if hung.until_s is None and not fault.by_itself and self._holds(fault):
                 hung.seen += 1

@@ -22,14 +22,14 @@ from brushloop.drivers.arcs.controller import MOVING_ALLOWED, RobotMode
 from brushloop.drivers.arcs.wire import AUBOPE_PORT
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL
-from brushloop.drivers.geometry import of_vector, product, turned, unit, vector
+from brushloop.drivers.geometry import of_vector, product, turned, unit
 from brushloop.drivers.loopback import LoopbackServer
 from brushloop.drivers.sim.config import View
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 from brushloop.drivers.sim.kinematics import Joints, inverse, inverted, matrix_of
 from brushloop.drivers.sim.lab_facts import CAMERA_PORTS, LIFT_MM, PICTURE_PX, PIN_TILT_DEG, Trap, draw, held, trapped
 from brushloop.drivers.sim.rig import LoopbackRig
-from brushloop.drivers.sim.scene import Held, MjpegServer
+from brushloop.drivers.sim.scene import MjpegServer
 
 HAND_MM, BY_EYE_MM = 0.3, 1.0
 """Standard deviation of a tip that touches a thing, and of one that is brought near it by eye, along each axis."""
@@ -205,7 +205,7 @@ class UnknownLab(LoopbackRig):
         about_x, about_y = np.radians(rng.normal(0.0, upright_deg, 2)).tolist()
         return Pose(x, y, z, *product(of_vector((about_x, about_y, 0.0)), aimed.quaternion))
 
-    def _grip(self, index: int) -> Held:
+    def _grip(self, index: int) -> Pose:
         """How the board is held before the camera: each time at another slant and in another part of the picture."""
         rng = self._luck("hold-board", index, "")
         view, table = self.facts.config.view, self.facts.config.table
@@ -218,8 +218,8 @@ class UnknownLab(LoopbackRig):
         slant = math.radians(slant_deg + float(rng.uniform(-3, 3)))
         turn = math.radians(turn_deg + float(rng.normal(0.0, 4.0)))
         slanted = of_vector((slant * math.cos(toward), slant * math.sin(toward), 0.0))
-        rx, ry, rz = (math.degrees(v) for v in vector(product(slanted, of_vector((0.0, 0.0, turn)))))
-        return Held((rx, ry, rz), (x * across_mm, y * across_mm * high, view.focal * across_mm))
+        turned_too = product(slanted, of_vector((0.0, 0.0, turn)))
+        return Pose(x * across_mm, y * across_mm * high, view.focal * across_mm, *turned_too)
 
     def _measured(self, what: str) -> str:
         """A length as the person writes it down. Raises ValueError for one that nobody can measure."""

@@ -20,7 +20,7 @@ from brushloop.drivers.loopback import LoopbackServer
 from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.brush.spec import SimFileError
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.faults import Device, FaultBoard, fault_of
+from brushloop.drivers.sim.faults import Device, fault_of
 from brushloop.drivers.sim.scene import MjpegServer, Scene
 from brushloop.drivers.sim.world import World
 
@@ -71,13 +71,13 @@ class LoopbackRig:
             self.ink = PtyLine(StationFirmware(self.world.well))
         elif config.ink_device == "pump":
             self.ink = PtyLine(PumpFirmware(self.world.well, ml_per_revolution=PUMP_ML))
-        self.faults = FaultBoard(self.world)
+        self.arcs = ArcsServer(self.world)
+        self.rtde = RtdeServer(self.arcs)
+        self.faults = self.arcs.faults
         """One board for all servers."""
-        self.arcs = ArcsServer(self.world, self.faults)
-        self.rtde = RtdeServer(self.arcs.cabinet, self.faults)
         self.scene = Scene(self.world)
         """What the camera looks at."""
-        self.camera = MjpegServer(self.world, self.scene.render, config.view, self.faults)
+        self.camera = MjpegServer(self.world, lambda tool: self.scene.render(tool), config.view, self.faults)
         self.servers: dict[LoopbackServer, int] = {
             self.arcs: config.arcs_port,
             self.rtde: config.rtde_port,
@@ -143,7 +143,7 @@ class LoopbackRig:
         """Change table, view or sensor while serving, as a person in the lab would; tool and brush stay."""
         self.config = self.world.config = config
         self.scene = Scene(self.world)
-        self.camera.show(self.scene.render, config.view)
+        self.camera.view = config.view
 
     async def hand(self, act: str = "", to: str = "", index: int = 0, corner: str = "") -> dict[str, Any]:
         """Ask the person in the lab for something. Raises ValueError, with one line, for what nobody can do."""

@@ -13,7 +13,6 @@ import random
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import cast
 
 import cv2
@@ -23,7 +22,6 @@ from numpy.typing import NDArray
 from brushloop.drivers.camera.source import LOOPBACK_SERVER
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import columns as axes
-from brushloop.drivers.geometry import of_vector
 from brushloop.drivers.loopback import LoopbackServer
 from brushloop.drivers.sim.brush.paper import PX_PER_MM
 from brushloop.drivers.sim.config import Table, View
@@ -116,17 +114,6 @@ EDGE_MM, TRIMMED_EDGE_MM = 5.0, 3.0
 WHITE, BLACK, BEHIND = 245, 20, 110
 FINGER_MM = 9.0
 """Radius of the thumb that covers a little of the print at either side."""
-
-
-@dataclass(frozen=True, slots=True)
-class Held:
-    """How a board is held, in the camera's frame: x right, y down, z ahead."""
-
-    turn_deg: tuple[float, float, float]
-    """Rotation vector from the camera's axes to the board's; zero is face on and upright."""
-    centre_mm: tuple[float, float, float]
-
-
 TABLE_GRAY = 120
 PAPER_GRAY = 228
 INK_REFLECTANCE = 0.06
@@ -155,15 +142,15 @@ class Scene:
         table, view = world.config.table, world.config.view
         self._blank, self._noise = _draw(table, world.config.seed, view.noise, (view.height_px, view.width_px))
         self.optics = Optics(view, world.config.seed)
-        self._shown: tuple[int, Held | None] = (-1, None)
+        self._shown: tuple[int, Pose | None] = (-1, None)
         self._lit: NDArray[np.float32] = np.zeros(0, np.float32)
         """The picture without noise and tool, of the sheet and the held board in `_shown`."""
         self._frames: dict[int, NDArray[np.uint8]] = {}
         """`_lit` with each field of noise: a moving tool only hides a part of it."""
         self._fields = itertools.cycle(range(NOISE_FIELDS))
         self._disc_radius_px = round(TOOL_CLEAR_MM * view.px_per_mm)
-        self.held: Held | None = None
-        """The board that a person holds before the camera; it hides everything else."""
+        self.held: Pose | None = None
+        """The board before the camera, which hides the rest, in the frame of the camera: x right, y down, z ahead."""
 
     def render(self, tool: Pose | None = None) -> NDArray[np.uint8]:
         """A (height, width) gray image of the world now.
@@ -205,7 +192,7 @@ class Scene:
         to_mm = np.array([[s, 0, left_mm + 0.5 * s], [0, -s, top_mm - 0.5 * s], [0, 0, 1]])
         return self._photograph(raster, self.optics.homography @ to_mm, TABLE_GRAY)
 
-    def _light_board(self, held: Held) -> NDArray[np.float32]:
+    def _light_board(self, held: Pose) -> NDArray[np.float32]:
         """The print in hand, under the light of the table."""
         paper = _print(self._world.config.table, PRINT_PX_PER_MM, EDGE_MM)
         rows, columns = paper.shape
@@ -214,9 +201,8 @@ class Scene:
         # raster pixel centres -> mm from the middle of the board -> image
         s = 1.0 / PRINT_PX_PER_MM
         to_mm = np.array([[s, 0.0, -0.5 * s * (columns - 1)], [0.0, s, -0.5 * s * (rows - 1)], [0.0, 0.0, 1.0]])
-        rx, ry, rz = (math.radians(turn_deg) for turn_deg in held.turn_deg)
-        right, down, _ = axes(of_vector((rx, ry, rz)))
-        plane = np.column_stack([right, down, held.centre_mm])
+        right, down, _ = axes(held.quaternion)
+        plane = np.column_stack([right, down, held.position_mm])
         return self._photograph(paper, self.optics.camera_matrix @ plane @ to_mm, BEHIND)
 
     def _photograph(self, raster: NDArray[np.uint8], to_image: Floats, around_gray: int) -> NDArray[np.float32]:
@@ -316,17 +302,11 @@ class MjpegServer(LoopbackServer):
         super().__init__()
         self._world = world
         self._render = render
-        self._view = view
+        self.view = view
         self._rendering = asyncio.Lock()
         self._coded: deque[tuple[NDArray[np.uint8], bytes]] = deque(maxlen=NOISE_FIELDS)
         """The newest images and their JPEGs, reused while nothing changes."""
         self._faults = faults
-
-    def show(self, render: Render, view: View) -> None:
-        """Look at something else, with other settings. Every stream begins again, as when a camera is set up again."""
-        self._render, self._view = render, view
-        self._coded.clear()
-        self.drop_clients()
 
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer any request with the stream."""
@@ -355,14 +335,14 @@ class MjpegServer(LoopbackServer):
                 shown = image
             held.append(image)
             # The delay includes the time to draw, and no picture overtakes another.
-            delay_s = self._view.delay_s + random.uniform(0.0, self._view.delay_jitter_s)
+            delay_s = self.view.delay_s + random.uniform(0.0, self.view.delay_jitter_s)
             while held and kind != "stale":
                 jpeg = held.popleft()
                 head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
                 sent_s = max(sent_s + 1e-6, exposed_s + delay_s)  # timers with the same time run in any order
                 loop.call_at(sent_s, _write, writer, head.encode() + jpeg + b"\r\n")
             await writer.drain()  # of earlier pictures: else a slow client would fall farther and farther behind
-            due_s = max(due_s + 1.0 / self._view.fps, loop.time())
+            due_s = max(due_s + 1.0 / self.view.fps, loop.time())
             await asyncio.sleep(due_s - loop.time())
 
     async def _exposed(self) -> tuple[float, bytes]:

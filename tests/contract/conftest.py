@@ -91,7 +91,7 @@ async def rig(request: pytest.FixtureRequest) -> AsyncIterator[RigConfig]:
     config = SimConfig(rate=RATE, force_sensor=False, ink_device="none")
     server = ArcsServer(World(config, SimClock(RATE, asyncio.get_running_loop().time)))
     await server.start(HOST, 0)
-    pushing = RtdeServer(server.cabinet)
+    pushing = RtdeServer(server)
     await pushing.start(HOST, 0)
     try:
         path = request.getfixturevalue("tmp_path") / "rig.toml"

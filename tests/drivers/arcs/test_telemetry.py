@@ -117,7 +117,7 @@ async def test_the_newest_sample_is_handed_over(frames: bytes, sample: object):
 
 @pytest.fixture
 async def rtde(cabinet: Cabinet) -> AsyncIterator[RtdeServer]:
-    server = RtdeServer(cabinet.cabinet)
+    server = RtdeServer(cabinet)
     await server.start(HOST, 0)
     yield server
     await server.stop()
