@@ -112,16 +112,11 @@ def current(session: Path, folder: str = FOLDER) -> Path | None:
         if any(pointer.parent.glob("*.json")):
             raise CalibrationError(str(pointer), f"is missing: calibrate or fit {session} again")
         return None
-    name = pointed(read_bounded(pointer, MAX_POINTER_BYTES), str(pointer))
-    path = pointer.with_name(name)
-    if not path.is_file():
-        raise CalibrationError(str(pointer), f"names {name}, which is not there: calibrate or fit {session} again")
-    return path
-
-
-def pointed(data: bytes, where: str) -> str:
-    """The file name that a pointer holds. Raises `CalibrationError`."""
-    name = NAME.fullmatch(data)
+    name = NAME.fullmatch(read_bounded(pointer, MAX_POINTER_BYTES))
     if name is None:
-        raise CalibrationError(where, f"holds no name of an artefact ({HASH_CHARS} hexadecimal digits and .json)")
-    return name[1].decode()
+        what = f"holds no name of an artefact ({HASH_CHARS} hexadecimal digits and .json)"
+        raise CalibrationError(str(pointer), what)
+    path = pointer.with_name(name[1].decode())
+    if not path.is_file():
+        raise CalibrationError(str(pointer), f"names {path.name}, which is not there: calibrate or fit {session} again")
+    return path

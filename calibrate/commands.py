@@ -143,10 +143,7 @@ class FitRequest:
 class ValidateRequest:
     """Compare every model with every captured stroke; run the same command again to resume."""
 
-    places: Annotated[
-        tuple[str, ...],
-        Argument(metavar="SESSION", help="Sessions: folders, .mcap files, or URLs with a checksum."),
-    ]
+    places: Annotated[tuple[Path, ...], Argument(metavar="SESSION", help="Sessions: folders or .mcap files.")]
     models: Annotated[tuple[str, ...], Option("--model", help="Only these models; all by default.")] = ()
     generators: Annotated[tuple[Path, ...], Option("--generator", help="A trained generator.safetensors.")] = ()
     fit: Annotated[Path | None, Option(help="Brush fit, the one in use by default; of drags, a dragfit.")] = None
@@ -331,7 +328,7 @@ class TuneRequest:
     """Fine-tune a generator on captured presses; a share of their conditions is held out to validate on."""
 
     generator: Annotated[Path, Argument(help="The generator.safetensors to start from.")]
-    sessions: Annotated[tuple[str, ...], Argument(metavar="SESSION", help="Sessions of presses.")]
+    sessions: Annotated[tuple[Path, ...], Argument(metavar="SESSION", help="Sessions of presses.")]
     out: Annotated[Path, Option(help="Folder of this training.")] = Path("generator-tuned")
     steps: Annotated[int, Option(min=1, help="Number of steps.")] = 300
     learning_rate: Annotated[float, Option(min=0, max=1, help="Peak learning rate.")] = 3e-4

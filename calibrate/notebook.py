@@ -29,7 +29,7 @@ from brushloop.calibrate.commands import (
 from brushloop.calibrate.compare import GRAY_MM, brush_of, simulated
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.presses import Refused, read_presses, rectified
-from brushloop.calibrate.session import Calibration, OpenSession, local_path, open_session
+from brushloop.calibrate.session import Calibration, OpenSession, open_session
 from brushloop.calibrate.stroke import Prepared
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.generator import SHIPPED_GENERATOR
@@ -129,13 +129,10 @@ class RecordedPress:
 
 
 class Session:
-    """A finished session: a folder, an MCAP file, or a URL with a checksum.
-
-    Raises `SessionError`, and `CalibrationError` for a URL that cannot be read.
-    """
+    """A finished session: its folder or MCAP file. Raises `SessionError`."""
 
     def __init__(self, place: str | os.PathLike[str]) -> None:
-        self.recording = Recording(local_path(str(place)))
+        self.recording = Recording(Path(place))
 
     @property
     def header(self) -> Header:
@@ -265,8 +262,9 @@ def validate(*sessions: Place, **options: Any) -> ValidationOutput:
     """
     from brushloop.calibrate.validate import command
 
-    places = tuple(str(place.recording.path) if isinstance(place, Session) else str(place) for place in sessions)
-    output = command.validate(ValidateRequest(places, command=f"brushloop.validate{places}", **options))
+    paths = tuple(_path(session) for session in sessions)
+    words = ", ".join(repr(str(path)) for path in paths)
+    output = command.validate(ValidateRequest(paths, command=f"brushloop.validate({words})", **options))
     output.check()
     return output
 
@@ -296,7 +294,7 @@ def analyse(request: AnalyseRequest, progress: Progress = unseen) -> Analysed:
     if not Recording(session).header.source.imported:
         known = calibrated.calibrate_session(CalibrateRequest(session), progress)
     fitted = fit_strokes(FitRequest(session), progress)
-    wanted = ValidateRequest((str(session),), generators=(SHIPPED_GENERATOR,))
+    wanted = ValidateRequest((session,), generators=(SHIPPED_GENERATOR,))
     return Analysed(known, fitted, compare_models(wanted, progress))
 
 

@@ -36,7 +36,7 @@ typer.testing._get_command = typer.main.get_command  # pyright: ignore[reportPri
 # What comes late names the load of the computer; the words that tests compare must not depend on it.
 os.getloadavg = lambda: (0.0, 0.0, 0.0)
 
-TOLERATED = ("asyncio_", "pytest_timeout", "ThreadPoolExecutor", "tqdm", "fsspecIO")
+TOLERATED = ("asyncio_", "pytest_timeout", "ThreadPoolExecutor", "tqdm")
 """Pools that live as long as their loop or process; nothing of ours is called that."""
 
 FIRST = (

@@ -1,4 +1,4 @@
-"""`brushloop validate`: from the locations of sessions to the files of a report; and `diff`, two reports compared.
+"""`brushloop validate`: from sessions to the files of a report; and `diff`, two reports compared.
 
 A difference is tested in pairs. These are, in order of preference: the same stroke of the same recording (two software
 versions, or two sets of options); the averages of the same condition in two sessions.
@@ -30,7 +30,6 @@ from brushloop.calibrate.loop import FILE as LOOP_FILE
 from brushloop.calibrate.loop import LoopRecord, read_loop
 from brushloop.calibrate.report import data_uri, framed, write_files
 from brushloop.calibrate.scores import MEASURES, scores_csv, write_parquet
-from brushloop.calibrate.session import URL, local_path
 from brushloop.calibrate.session import open_session as open_recording
 from brushloop.calibrate.stats import Paired, holm, paired
 from brushloop.calibrate.validate.page import Curve, page_of, read_curve, terminal_lines
@@ -137,9 +136,9 @@ def validate(request: ValidateRequest, progress: Progress = unseen) -> Validatio
         raise CalibrationError(str(folder), "another validation is writing there") from None
 
 
-def open_session(place: str, fit: Path | None = None) -> FittedSession:
-    """Open a session by path or URL. Raises `CalibrationError`, `InputError` or `SessionDamaged`, each naming it."""
-    session = open_recording(local_path(place))
+def open_session(place: Path, fit: Path | None = None) -> FittedSession:
+    """Open a session. Raises `CalibrationError`, `InputError` or `SessionDamaged`, each naming it."""
+    session = open_recording(place)
     path = session.recording.path
     closed = replay(path.parent / JOURNAL_NAME).closed if (path.parent / JOURNAL_NAME).is_file() else None
     sha256 = session.sha256
@@ -232,10 +231,10 @@ def _drags(
 def _folder(request: ValidateRequest) -> Path:
     if request.out is not None:
         return request.out
-    if len(request.places) == 1 and not URL.match(request.places[0]):
-        path = Path(request.places[0])
-        return (path if path.is_dir() else path.parent) / FOLDER
-    return Path(FOLDER)
+    path, *others = request.places
+    if others:
+        return Path(FOLDER)
+    return (path if path.is_dir() else path.parent) / FOLDER
 
 
 @dataclass(frozen=True, slots=True)

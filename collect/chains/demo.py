@@ -176,7 +176,7 @@ class Demo:
 
         command = f"brushloop validate {self._session} --generator {SHIPPED_GENERATOR}"
         say(f"$ {command}")
-        request = ValidateRequest((str(self._session),), command=command, generators=(SHIPPED_GENERATOR,))
+        request = ValidateRequest((self._session,), command=command, generators=(SHIPPED_GENERATOR,))
         self._validated, self.report = show_work(validate, request), _report(self._session)
 
     def _blank_sheet(self, protocol: Path) -> None:

@@ -78,7 +78,7 @@ def same(one: Press, other: Press) -> bool:
 
 
 def test_fit_and_validate_do_no_work_twice(session: Path, tmp_path: Path, calls: Counter[str]) -> None:
-    request = ValidateRequest(places=(str(session),), out=tmp_path / "report")
+    request = ValidateRequest(places=(session,), out=tmp_path / "report")
     fit_presses(FitRequest(session))
     validate(request)
     assert (calls["prepare_job"], calls["refit"], calls["score_job"]) == (3, 3, 3)

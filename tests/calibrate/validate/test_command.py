@@ -78,7 +78,7 @@ def test_a_recording_that_is_not_the_one_its_journal_closed_is_damaged(session: 
         journal.append(event)
     journal.close()
     with pytest.raises(SessionDamaged, match="SHA-256 differs"):
-        open_session(str(folder))
+        open_session(folder)
 
 
 needs_dask = pytest.mark.skipif(find_spec("distributed") is None, reason="needs the extra [cluster]")

@@ -76,7 +76,7 @@ def test_every_model_is_scored_in_both_alignments_and_tones(report: Report) -> N
 def test_fit_and_validate_print_the_same_held_out_scores(session: Path, tmp_path: Path) -> None:
     copied = Path(shutil.copytree(session, tmp_path / session.name))
     fitted = fit_presses(FitRequest(copied))
-    report = validate(ValidateRequest(places=(str(copied),), fit=fitted.path, out=tmp_path / "report")).report
+    report = validate(ValidateRequest(places=(copied,), fit=fitted.path, out=tmp_path / "report")).report
     assert report is not None
     rows = {row.model: row for row in fitted.held_out}
     for name, validated in {CEILING: CEILING, FITTED: FITTED_HELD_OUT, BEZIER: BEZIER_REFITTED}.items():
@@ -132,7 +132,7 @@ def test_a_gate_that_holds_passes_and_one_that_is_missed_says_by_how_much_and_ex
 )
 def test_what_is_no_gate_is_refused_before_any_work(text: str) -> None:
     with pytest.raises(CalibrationError, match=r"expected \[MODEL:\]\[ALIGNMENT:\]"):
-        validate(ValidateRequest(places=("nowhere",), gates=(text,)))
+        validate(ValidateRequest(places=(Path("nowhere"),), gates=(text,)))
 
 
 def test_only_the_models_asked_for_and_an_unknown_one_is_refused(session: Path, tmp_path: Path) -> None:
