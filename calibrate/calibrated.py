@@ -21,7 +21,7 @@ from brushloop.calibrate.board.spec import BoardView, describe, named_board
 from brushloop.calibrate.commands import CalibrateRequest, LensRequest
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written, read_gray
-from brushloop.calibrate.report import Point, about, framed, photograph_uri, round_values, source_point, write_page
+from brushloop.calibrate.report import Point, about, framed, photograph_uri, source_point, write_page
 from brushloop.calibrate.session import Calibration, rig_of
 from brushloop.sessions.disk import file_sha256
 from brushloop.sessions.messages import decode_gray
@@ -38,6 +38,7 @@ ARROW_TIMES = 100
 """How much longer than its residual each arrow is drawn, on every page, so that pages can be compared."""
 SIDE_POINTS = 9
 SCALE_GRID = (17, 13)
+MOST_CONTOURS = 7
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,12 +199,13 @@ def _trust(calibration: Calibration, moved: Sequence[str]) -> Iterator[Point]:
 def _contours(calibration: Calibration, width: int, height: int) -> list[tuple[str, list[list[float]]]]:
     """Contours of mm per pixel across a photograph: the value and the (n, 2) points, in pixels, of each line."""
     from contourpy import contour_generator
+    from matplotlib.ticker import MaxNLocator  # slow to import
 
     across, down = (np.linspace(0.0, side - 1.0, n) for side, n in zip((width, height), SCALE_GRID, strict=True))
     scale = np.array([[local_scale(calibration.to_paper, np.array([x, y])) for x in across] for y in down])
     generator = contour_generator(across, down, scale)
     contours: list[tuple[str, list[list[float]]]] = []
-    for value, text in round_values(float(scale.min()), float(scale.max())).items():
+    for value in MaxNLocator(MOST_CONTOURS).tick_values(float(scale.min()), float(scale.max())):
         lines = cast("list[Floats]", generator.lines(value))
-        contours += ((text, line.round(1).tolist()) for line in lines)
+        contours += ((f"{value:.6g}", line.round(1).tolist()) for line in lines)
     return contours

@@ -6,17 +6,16 @@ import base64
 import functools
 import hashlib
 import html
+import io
 import json
-import math
 import re
-import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from brushloop.calibrate.artefact import Frozen
@@ -25,13 +24,12 @@ from brushloop.calibrate.files import read_bounded, write_whole
 from brushloop.sessions.records import Header, Source
 
 Image = NDArray[np.float32]
-Floats = NDArray[np.float64]
 PAPER = "#fbf9f4"
-"""Background of picture files."""
+"""Background of charts and picture files."""
 COLOURS = BLUE, ORANGE, *_ = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00"
 """Colours of Okabe and Ito for a chart's lines and points."""
-LINE_PX, CHAR_PX, PADDING = 16, 7, 0.04
-"""Height of a line of a chart's text, about the width of a character, and the margin of an axis as a share of it."""
+CHART_DPI = 160
+"""Resolution of charts in pages, which are also printed."""
 PHOTOGRAPH_PX, JPEG_QUALITY = 1600, 80
 """Longest side and quality of a photograph in a page: about 500 kB at most."""
 MAX_SEALED_BYTES = 256 * 1024 * 1024
@@ -170,113 +168,41 @@ def overlay(first: Image, second: Image) -> Image:
     return np.clip(1.0 - darker, 0.0, 1.0).astype(np.float32)
 
 
-@dataclass(frozen=True, slots=True)
-class Marks:
-    """Points of a chart, (n,) x and y, as dots, joined by a line, or both; a point that is not finite is left out."""
+@functools.cache
+def _glyphs() -> frozenset[int]:
+    """Code points that the font of charts and picture files draws."""
+    from matplotlib import font_manager
 
-    x: ArrayLike
-    y: ArrayLike
-    colour: str = BLUE
-    name: str = ""
-    """In the legend, if there is one."""
-    dot_px: float = 0.0
-    line_px: float = 0.0
-    """Diameter of the dots and width of the line; 0 for none."""
-
-
-@dataclass(frozen=True, slots=True)
-class Axis:
-    """An axis of a chart; without `ticks` (value -> text) up to seven round values are chosen."""
-
-    name: str = ""
-    ticks: Mapping[float, str] | None = None
-    log: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Panel:
-    """One pair of axes of a chart."""
-
-    title: str
-    x: Axis
-    y: Axis
-    marks: Sequence[Marks]
-
-
-def chart_uri(panels: Sequence[Panel], size_px: tuple[int, int], title: str = "") -> str:
-    """Panels side by side below a title, as an SVG data URI; the same panels give the same bytes."""
-    width, height = size_px
-    side, head = width // len(panels), _lines(title, width)
-    above, heads = LINE_PX * (1 + len(head)), [_lines(panel.title, side) for panel in panels]
-    legends = [[(mark.colour, printable(mark.name)) for mark in panel.marks if mark.name] for panel in panels]
-    top = above + LINE_PX * (max(map(len, heads)) + any(legends)) - 4
-    bottom = height - 3 * LINE_PX
-    drawn: list[dict[str, Any]] = []
-    for k, panel in enumerate(panels):
-        y_of, y_ticks = _scale(panel.y, [mark.y for mark in panel.marks], bottom, top)
-        beside = CHAR_PX * max(len(text) for _, text in y_ticks) + (2 if panel.y.name else 1) * LINE_PX
-        frame = {"edge": k * side, "left": k * side + beside, "right": (k + 1) * side - LINE_PX}
-        x_of, x_ticks = _scale(panel.x, [mark.x for mark in panel.marks], frame["left"], frame["right"])
-        marks: list[tuple[Marks, list[tuple[float, float]]]] = []
-        for mark in panel.marks:
-            places = np.stack([x_of(np.asarray(mark.x)), y_of(np.asarray(mark.y))], axis=-1)
-            marks.append((mark, places[np.isfinite(places).all(axis=1)].tolist()))
-        axes = {"x": panel.x, "y": panel.y, "x_ticks": x_ticks, "y_ticks": y_ticks}
-        drawn.append({"title": heads[k], "marks": marks, "legend": legends[k], **axes, **frame})
-    about = {"width": width, "height": height, "title": head, "above": above, "top": top, "bottom": bottom}
-    return data_uri(render("chart.svg.j2", panels=drawn, **about).encode(), "svg+xml")
-
-
-def _scale(
-    axis: Axis, values: Sequence[ArrayLike], start_px: float, end_px: float
-) -> tuple[Callable[[Floats], Floats], list[tuple[float, str]]]:
-    """Where values lie along an axis, in pixels, and its ticks with their texts."""
-    known = np.concatenate([np.asarray(part, np.float64) for part in values]) if values else np.ones(1)
-    known = known[np.isfinite(known)] if np.isfinite(known).any() else np.ones(1)
-    ticks = axis.ticks or round_values(float(known.min()), float(known.max()), log=axis.log)
-    shape = np.log10 if axis.log else np.positive
-    ends = shape(np.array([*known, *ticks], np.float64))
-    low, range_of = float(ends.min()), float(np.ptp(ends)) or 1.0
-    step_px = (end_px - start_px) / (1.0 + 2.0 * PADDING) / range_of
-
-    def place(at: Floats) -> Floats:
-        return np.round(start_px + (shape(at) - low + PADDING * range_of) * step_px, 1)
-
-    return place, list(zip(place(np.array([*ticks], np.float64)).tolist(), ticks.values(), strict=True))
-
-
-def round_values(low: float, high: float, *, log: bool = False) -> dict[float, str]:
-    """Up to seven round values between two: powers of ten on a logarithmic axis that holds two of them."""
-    if log and (powers := range(math.ceil(math.log10(low)), math.floor(math.log10(high)) + 1))[1:]:
-        return {10.0**power: f"{10.0**power:g}" for power in powers}
-    if low == high:
-        return {low: f"{low:.6g}"}
-    rough = (high - low) / 7.0
-    power = 10.0 ** math.floor(math.log10(rough))
-    step = power * next(unit for unit in (1, 2, 5, 10) if unit * power >= rough)
-    return {k * step: f"{k * step:.6g}" for k in range(math.ceil(low / step), math.floor(high / step) + 1)}
-
-
-def _lines(text: str, width_px: int) -> list[str]:
-    """The text in lines of at most about this width."""
-    return textwrap.wrap(printable(text), max(1, width_px // CHAR_PX))
+    untyped: Any = font_manager
+    return frozenset(untyped.get_font(untyped.findfont("DejaVu Sans")).get_charmap())
 
 
 def printable(text: str) -> str:
-    """A name or label for the text of a plot, with `?` for every character that no font draws."""
-    return "".join(c if c.isprintable() else "?" for c in text)
+    """A name or label for the text of a picture, with `?` for every character that its font does not draw."""
+    drawn = "".join(c if c.isprintable() and ord(c) in _glyphs() else "?" for c in text)
+    return drawn.replace("$", r"\$")  # otherwise it begins a formula
 
 
 def picture_grid(rows: int, columns: int, size: tuple[float, float], title: str = "") -> tuple[Any, Any]:
-    """A figure for a picture file and its (rows, columns) axes; size in inches at 100 dpi."""
+    """A figure for a chart or a picture file and its (rows, columns) axes; size in inches at 100 dpi."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure: Any = Figure(size, dpi=100, facecolor=PAPER, layout="constrained")
     FigureCanvasAgg(figure)
     if title:
-        figure.suptitle(title, fontsize=10)
+        figure.suptitle(printable(title), fontsize=10)
     return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def chart_uri(figure: Any) -> str:
+    """A figure of `picture_grid` as a PNG data URI; the same figure gives the same bytes."""
+    for axis in figure.axes:
+        axis.grid(color="#ddd8ce", linewidth=0.6)
+    figure.set_dpi(CHART_DPI)
+    picture = io.BytesIO()
+    figure.canvas.print_png(picture, metadata={"Software": None})
+    return data_uri(picture.getvalue())
 
 
 def save_picture(figure: Any, path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Statistics: lines, summaries with intervals, paired tests, the ceiling, the order of a design, and odd waits.
+"""Statistics: summaries with intervals, paired tests, the ceiling, the order of a design, and odd waits.
 
 Equal scores give equal numbers.
 
@@ -50,32 +50,6 @@ def student_95(freedom: int) -> float:
     from scipy.special import stdtrit  # slow to import
 
     return float(stdtrit(freedom, 0.975))
-
-
-@dataclass(frozen=True, slots=True)
-class Line:
-    """A fitted line, with the standard error of its slope."""
-
-    slope: float
-    intercept: float
-    slope_se: float
-    r: float
-    n: int
-
-    @property
-    def interval(self) -> Interval:
-        """95 % interval of the slope (Student's t with n - 2 degrees of freedom)."""
-        reach = student_95(self.n - 2) * self.slope_se
-        return self.slope - reach, self.slope + reach
-
-
-def fit_line(x: Sequence[float], y: Sequence[float]) -> Line | None:
-    """y = slope x + intercept; None with fewer than 3 points or no spread in x or y."""
-    if len(x) < 3 or np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
-        return None
-    (slope, intercept), covariance = np.polyfit(x, y, 1, cov=True)
-    slope_se = float(np.sqrt(covariance[0, 0]))
-    return Line(float(slope), float(intercept), slope_se, float(np.corrcoef(x, y)[0, 1]), len(x))
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,13 +21,11 @@ from brushloop.calibrate.presses import Refused, prepare_press
 from brushloop.calibrate.report import (
     BLUE,
     ORANGE,
-    Axis,
-    Marks,
-    Panel,
     Point,
     chart_uri,
     ink_uri,
     overlay_uri,
+    picture_grid,
     source_label,
     write_page,
 )
@@ -167,13 +165,16 @@ def _losses(losses: NDArray[np.float64], checks: NDArray[np.float64], label: str
     """Training loss of the steps with its running mean, and the validation losses: the paper's figure 9."""
     steps, losses = losses.T
     every = slice(None, None, max(1, -(-len(losses) // MAX_POINTS)))
-    marks = [Marks(steps[every], losses[every], "#bfbfbf", "training, Eq. 6, each step", line_px=0.7)]
+    figure, [[axis]] = picture_grid(1, 1, (10.6, 4.0), f"losses ({label})")
+    axis.plot(steps[every], losses[every], color="#bfbfbf", linewidth=0.7, label="training, Eq. 6, each step")
     if len(losses) > 10 * SMOOTH_STEPS:
         mean = np.convolve(losses, np.full(SMOOTH_STEPS, 1.0 / SMOOTH_STEPS), "valid")
-        name = f"mean of {SMOOTH_STEPS} steps"
-        marks.append(Marks(steps[SMOOTH_STEPS - 1 :][every], mean[every], BLUE, name, line_px=1.2))
-    marks.append(Marks(checks[:, 0], checks[:, 1], ORANGE, "validation, MSE", dot_px=5.0, line_px=1.2))
-    return chart_uri([Panel(f"losses ({label})", Axis("step"), Axis("loss", log=True), marks)], (1060, 400))
+        smooth = f"mean of {SMOOTH_STEPS} steps"
+        axis.plot(steps[SMOOTH_STEPS - 1 :][every], mean[every], color=BLUE, linewidth=1.2, label=smooth)
+    axis.plot(*checks.T, "o-", color=ORANGE, markersize=4, linewidth=1.2, label="validation, MSE")
+    axis.set(xlabel="step", ylabel="loss", yscale="log")
+    axis.legend()
+    return chart_uri(figure)
 
 
 def _facts(file: GeneratorFile, path: Path) -> Iterator[tuple[str, str]]:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.board.lens import Floats, Gray, apply, homography
+from brushloop.calibrate.board.lens import Floats, Gray, apply
 from brushloop.calibrate.board.spec import Board, BoardSpec, BoardView, Checkerboard, charuco_board
 from brushloop.calibrate.errors import CalibrationError
 
@@ -30,8 +30,6 @@ CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 
 LEAST_CONTRAST = 30.0
 BLANK = "is blank: nothing in it is darker than the rest"
-GOES_ON = 0.75
-"""Contrast at which squares continue, as a share of that at the board's own corners; its outer edge has half."""
 GRID_ERROR = 0.25
 """Largest distance of a corner from a regular grid, in squares: a strong lens displaces corners by less."""
 ALONG_SHARE = 0.45
@@ -120,18 +118,6 @@ def _checkerboard(image: Gray, board: Checkerboard, name: str) -> tuple[Floats, 
     pixels = _squares(image, board.inner_corners)
     if pixels is None:
         raise CalibrationError(name, _why_no_board(image, board.inner_corners))
-    if (more := _goes_on(image, pixels, board.inner_corners)) is not None:
-        raise CalibrationError(
-            name, f"shows more than {columns} x {rows} inner corners: at least {more[0]} x {more[1]}"
-        )
-    rest = image.copy()
-    hull = cv2.convexHull(pixels.astype(np.float32))
-    centre = pixels.mean(axis=0)
-    # One more square on every side, so that no part of this board is found again.
-    wider = centre + (hull.reshape(-1, 2) - centre) * (max(columns, rows) + 3) / (max(columns, rows) - 1)
-    cv2.fillConvexPoly(rest, np.rint(wider).astype(np.int32), int(np.median(image)))
-    if _squares(rest, board.inner_corners, quick=True) is not None:
-        raise CalibrationError(name, "shows two boards")
     ids = np.arange(columns * rows, dtype=np.int64)
     board_mm = (_grid(board.inner_corners) + 1.0) * board.square_mm
     return _refined(image, pixels, board_mm, board.square_mm, board.square_mm), ids, board_mm, columns * rows
@@ -140,30 +126,6 @@ def _checkerboard(image: Gray, board: Checkerboard, name: str) -> tuple[Floats, 
 def _grid(inner: tuple[int, int]) -> Floats:
     """(n, 2) column and row of each inner corner."""
     return np.stack(np.meshgrid(*map(np.arange, inner)), axis=-1).reshape(-1, 2).astype(np.float64)
-
-
-def _goes_on(image: Gray, pixels: Floats, inner: tuple[int, int]) -> tuple[int, int] | None:
-    """Return the larger size if squares continue beyond the outermost corners, None if the board ends there."""
-    columns, rows = inner
-    grid = _grid(inner)
-    matrix = homography(grid, pixels, "board")
-
-    def response(places: Floats) -> Floats:
-        # Light minus dark across both diagonals: large only where four squares meet.
-        around = places[:, None] + 0.3 * np.array([[-1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [1.0, -1.0]])
-        at = apply(matrix, around.reshape(-1, 2)).astype(np.float32).reshape(-1, 4, 2)
-        levels = np.asarray(cv2.remap(image, at, np.empty(0), cv2.INTER_LINEAR, borderValue=128), np.float64)
-        return np.abs(levels[:, 0] + levels[:, 1] - levels[:, 2] - levels[:, 3])
-
-    own = float(np.median(response(grid)))
-    beyond = {
-        (columns + 1, rows): [np.array([(c, r) for r in range(rows)], np.float64) for c in (-1, columns)],
-        (columns, rows + 1): [np.array([(c, r) for c in range(columns)], np.float64) for r in (-1, rows)],
-    }
-    for size, sides in beyond.items():
-        if any(float(np.median(response(side))) > GOES_ON * own for side in sides):
-            return size
-    return None
 
 
 def _squares(image: Gray, inner: tuple[int, int], *, quick: bool = False) -> Floats | None:

@@ -23,19 +23,18 @@ from brushloop.calibrate.drags.fit import FOLDER, LAG, PREDICTED, DragArtefact, 
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written
 from brushloop.calibrate.report import (
+    BLUE,
     ORANGE,
-    Axis,
-    Marks,
-    Panel,
     chart_uri,
     image_uri,
     overlay_uri,
+    picture_grid,
     render,
     source_label,
     source_note,
     write_files,
 )
-from brushloop.calibrate.stats import CEILING, ceiling_values, fit_line, pair_means
+from brushloop.calibrate.stats import CEILING, ceiling_values, pair_means, student_95
 from brushloop.model.drag import Floats
 from brushloop.model.similarity import binary_scores, inked_window
 from brushloop.sessions.disk import csv_text
@@ -207,26 +206,35 @@ def _worst(validation: DragValidation) -> Iterator[tuple[Predicted, str]]:
 
 def width_sentence(drags: Drags) -> str:
     """The line through the widths of a session, and how well it is known."""
-    line = fit_line(*drags.widths().T.tolist())
+    line = _line(drags)
     if line is None:
         return "Width against depth: no fit (fewer than 3 whole strokes, or one depth only)."
-    low, high = line.interval
+    count = len(drags.widths())
+    reach = student_95(count - 2) * line.stderr
     return (
-        f"Width at the middle against commanded depth: {line.slope:.3f} mm/mm (95 % {low:.3f} to {high:.3f}), "
-        f"{line.intercept:+.2f} mm at depth 0, r = {line.r:.2f}, n = {line.n}."
+        f"Width at the middle against commanded depth: {line.slope:.3f} mm/mm (95 % {line.slope - reach:.3f} to "
+        f"{line.slope + reach:.3f}), {line.intercept:+.2f} mm at depth 0, r = {line.rvalue:.2f}, n = {count}."
     )
+
+
+def _line(drags: Drags) -> Any:
+    """The regression of width on depth; None with fewer than 3 strokes, or no spread in depth or width."""
+    from scipy.stats import linregress  # slow to import
+
+    widths = drags.widths()
+    return linregress(*widths.T) if len(widths) >= 3 and np.ptp(widths, axis=0).all() else None
 
 
 def _plot(drags: Drags) -> str:
     """Width against depth, with the fitted line."""
     depth_mm, width_mm = drags.widths().T
-    line = fit_line(depth_mm.tolist(), width_mm.tolist())
-    marks = [Marks(depth_mm, width_mm, dot_px=5.0)]
-    if line is not None:
+    figure, [[axis]] = picture_grid(1, 1, (7.2, 4.0), str(drags.session.header.source))
+    axis.plot(depth_mm, width_mm, "o", color=BLUE, alpha=0.6, markersize=4)
+    if (line := _line(drags)) is not None:
         ends = np.array([depth_mm.min(), depth_mm.max()])
-        marks.append(Marks(ends, line.slope * ends + line.intercept, ORANGE, line_px=1.5))
-    across, up = Axis("commanded depth, mm"), Axis("measured width at the middle, mm")
-    return chart_uri([Panel(str(drags.session.header.source), across, up, marks)], (720, 400))
+        axis.plot(ends, line.slope * ends + line.intercept, color=ORANGE, linewidth=1.5)
+    axis.set(xlabel="commanded depth, mm", ylabel="measured width at the middle, mm")
+    return chart_uri(figure)
 
 
 def summary(validation: DragValidation) -> Iterator[Table | str]:

@@ -28,14 +28,12 @@ from brushloop.calibrate.fit.heldout import FITTED, HeldOut, leave_condition_out
 from brushloop.calibrate.presses import Refused, read_for_fit
 from brushloop.calibrate.report import (
     COLOURS,
-    Axis,
-    Marks,
-    Panel,
     Point,
     about,
     chart_uri,
     framed,
     ink_uri,
+    picture_grid,
     source_label,
     source_note,
     source_point,
@@ -333,14 +331,16 @@ def _chart(presses: Presses, press: FittedPress, header: Header) -> str:
     smooth = np.linspace(float(depths.min()), float(depths.max()), SMOOTH_POINTS).tolist()
     sizes = np.array([measure(ink, presses.grid) for ink in presses.ink])
     drawn = {tilt: np.array([_fitted(press, depth, tilt, presses.grid.x_mm) for depth in smooth]) for tilt in shown}
-    panels: list[Panel] = []
-    for column, (what, seen) in enumerate((("length", sizes[:, 0] + sizes[:, 1]), ("width", sizes[:, 2]))):
-        marks: list[Marks] = []
+    figure, [axes] = picture_grid(1, 2, (9.6, 3.6), source_label(header.source, [header.brush]))
+    seen = {"length": sizes[:, 0] + sizes[:, 1], "width": sizes[:, 2]}
+    for column, (axis, (what, measured)) in enumerate(zip(axes, seen.items(), strict=True)):
         for tilt, colour in zip(shown, COLOURS, strict=False):
-            marks.append(Marks(depths[tilts == tilt], seen[tilts == tilt], colour, f"α {tilt:g}°", dot_px=6.0))
-            marks.append(Marks(smooth, drawn[tilt][:, column], colour, line_px=1.5))
-        panels.append(Panel(what, Axis("commanded depth H, mm"), Axis(f"{what} of the mark, mm"), marks))
-    return chart_uri(panels, (960, 320), source_label(header.source, [header.brush]))
+            at = tilts == tilt
+            axis.plot(depths[at], measured[at], "o", color=colour, alpha=0.6, markersize=4, label=f"α {tilt:g}°")
+            axis.plot(smooth, drawn[tilt][:, column], color=colour, linewidth=1.5)
+        axis.set(title=what, xlabel="commanded depth H, mm", ylabel=f"{what} of the mark, mm")
+        axis.legend()
+    return chart_uri(figure)
 
 
 def _fitted(press: FittedPress, depth_mm: float, tilt_deg: float, x_mm: Floats) -> tuple[float, float]:

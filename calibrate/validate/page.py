@@ -21,14 +21,13 @@ from brushloop.calibrate.report import (
     BLUE,
     COLOURS,
     ORANGE,
-    Axis,
-    Marks,
-    Panel,
     Point,
     brush_and_size,
     chart_uri,
     ink_uri,
     overlay_uri,
+    picture_grid,
+    printable,
     render,
     source_note,
     source_point,
@@ -218,50 +217,51 @@ def first_of_conditions(outcome: Outcome, most: int) -> list[int]:
 def distributions(outcome: Outcome, report: Report) -> str:
     """CSIM of every stroke by model in both alignments, with the average and its interval."""
     models = [model for name in outcome.scores.models if (model := report.model(name)) is not None][::-1]
-    panels: list[Panel] = []
-    for key in (STRICT, NORMAL):
+    figure, [axes] = picture_grid(1, 2, (10.6, 1.2 + 0.32 * len(models)), report.label)
+    for axis, key in zip(axes, (STRICT, NORMAL), strict=True):
         rng = np.random.default_rng(0)  # jitter only, so that points do not hide each other
-        marks: list[Marks] = []
         for place, model in enumerate(models):
             stat = report.stat(model.name, key)
             if stat is None:
                 continue
             csim = 100.0 * outcome.scores.of_key(model.name, key)[:, 0]
             csim = csim[np.isfinite(csim)][:: max(1, -(-len(csim) // MAX_POINTS))]
-            marks.append(Marks(csim, place + 0.14 * rng.uniform(-1, 1, len(csim)), dot_px=3.0))
+            jitter = place + 0.14 * rng.uniform(-1, 1, len(csim))
+            axis.plot(csim, jitter, "o", color=BLUE, alpha=0.6, markersize=2, markeredgewidth=0)
             if stat.csim.avg_interval is not None:
-                marks.append(Marks(stat.csim.avg_interval, [place] * 2, ORANGE, line_px=3.0))
-            marks.append(Marks([stat.csim.avg] * 2, [place - 0.3, place + 0.3], ORANGE, line_px=3.0))
-        labels = {float(place): model.label for place, model in enumerate(models)}
-        panels.append(Panel(f"{key[0]}, binary", Axis("CSIM, %"), Axis(ticks=labels), marks))
-    return chart_uri(panels, (1060, 120 + 32 * len(models)), report.label)
+                axis.plot(stat.csim.avg_interval, [place] * 2, color=ORANGE, linewidth=2.0)
+            axis.plot([stat.csim.avg] * 2, [place - 0.3, place + 0.3], color=ORANGE, linewidth=2.0)
+        axis.set_yticks(range(len(models)), [printable(model.label) for model in models])
+        axis.set(title=f"{key[0]}, binary", xlabel="CSIM, %")
+    return chart_uri(figure)
 
 
 def by_strokes(report: Report) -> str:
     """CSIM on presses that were not fitted, against the number of presses that were."""
-    marks: list[Marks] = []
+    figure, [[axis]] = picture_grid(1, 1, (7.2, 3.6), report.label)
     for name, colour in (("CCD-BSM", ORANGE), ("Bézier", BLUE)):
         csim: dict[int, list[float]] = {}
         for step in report.by_strokes:
             if step.model == name:
                 csim.setdefault(step.strokes, []).append(step.csim)
         counts = sorted(csim)
-        means = [np.mean(csim[count]) for count in counts]
-        marks.append(Marks(counts, means, colour, f"{name} fitted", dot_px=6.0, line_px=1.5))
-    ticks = {float(step.strokes): str(step.strokes) for step in report.by_strokes}
-    across, up = Axis("presses that were fitted", ticks, log=True), Axis("CSIM on all others, %")
-    return chart_uri([Panel("mm, binary", across, up, marks)], (720, 340), report.label)
+        axis.plot(counts, [np.mean(csim[count]) for count in counts], "o-", color=colour, label=f"{name} fitted")
+    axis.set(title="mm, binary", xlabel="presses that were fitted", ylabel="CSIM on all others, %", xscale="log")
+    counts = sorted({step.strokes for step in report.by_strokes})
+    axis.set_xticks(counts, map(str, counts))
+    axis.set_xticks([], minor=True)
+    axis.legend()
+    return chart_uri(figure)
 
 
 def losses(curves: Sequence[Curve]) -> str:
     """Validation losses of generators side by side: the paper's figure 9, also for the strokes of figure 12."""
-    colours = itertools.cycle(COLOURS)
-    marks = [
-        Marks(steps, losses, colour, name, dot_px=4.0, line_px=1.5)
-        for (name, steps, losses), colour in zip(curves, colours, strict=False)
-    ]
-    title, up = "networks trained on exact images of stroke models", Axis("validation loss (MSE)", log=True)
-    return chart_uri([Panel(title, Axis("step"), up, marks)], (720, 340))
+    figure, [[axis]] = picture_grid(1, 1, (7.2, 3.6), "networks trained on exact images of stroke models")
+    for (name, steps, mse), colour in zip(curves, itertools.cycle(COLOURS), strict=False):
+        axis.plot(steps, mse, "o-", color=colour, markersize=3, label=printable(name))
+    axis.set(xlabel="step", ylabel="validation loss (MSE)", yscale="log")
+    axis.legend()
+    return chart_uri(figure)
 
 
 def measured(report: Report) -> str:

@@ -155,16 +155,15 @@ def test_too_few_photographs_or_mixed_sizes_are_refused() -> None:
     [
         (np.full((480, 640), 235, np.uint8), CHECKERS, "is blank"),
         (np.full((480, 640), 255, np.uint8), CHARUCO, "is blank"),
-        (checkers(), Checkerboard(inner_corners=(8, 6), square_mm=25.0), "9 x 6 .*, not 8 x 6|more than 8 x 6"),
+        (checkers(), Checkerboard(inner_corners=(8, 6), square_mm=25.0), "shows .*9 x 6 inner corners, not 8 x 6"),
         (checkers(), Checkerboard(inner_corners=(9, 7), square_mm=25.0), "shows .*9 x 6 inner corners, not 9 x 7"),
-        (np.hstack([checkers(30), checkers(30)]), CHECKERS, "two boards"),
         (np.hstack([charuco(), charuco()]), CHARUCO, "two boards"),
         (np.ascontiguousarray(charuco()[:, ::-1]), CHARUCO, "mirrored"),
         (charuco(), CHARUCO.model_copy(update={"squares": (4, 5)}), "another board"),
         (charuco(), CHARUCO.model_copy(update={"squares": (6, 7)}), "are not arranged as on this board"),
         (np.where(np.arange(520) > 240, 128, checkers()), CHECKERS, "no complete board"),
     ],
-    ids=["blank", "blank charuco", "smaller", "larger", "two", "two charuco", "mirrored", "few", "many", "hidden"],
+    ids=["blank", "blank charuco", "smaller", "larger", "two charuco", "mirrored", "few", "many", "hidden"],
 )
 def test_a_photograph_of_no_use_is_refused_with_the_reason(image: np.ndarray, board: object, message: str) -> None:
     with pytest.raises(CalibrationError, match=message):
