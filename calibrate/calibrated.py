@@ -68,12 +68,15 @@ class Calibrated:
         return framed(self.page)
 
 
-def calibrate_session(request: CalibrateRequest, progress: Progress = unseen) -> Calibrated:
+def calibrate_session(
+    request: CalibrateRequest, progress: Progress = unseen, opened: Recording | None = None
+) -> Calibrated:
     """Calibrate a session by its last view of the board, use the result from now on, and write its page.
 
-    Raises `CalibrationError`, also for an unknown lens that visibly distorts.
+    `opened` is its recording, where it is open already. Raises `CalibrationError`, also for an unknown lens that
+    visibly distorts.
     """
-    recording = Recording(request.session)
+    recording = opened or Recording(request.session)
     where = str(recording.path)
     if recording.header.source.imported:
         raise CalibrationError(where, "is an import and has its own scale: continue with `validate`")

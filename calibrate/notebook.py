@@ -290,12 +290,12 @@ def analyse(request: AnalyseRequest, progress: Progress = unseen) -> Analysed:
     from brushloop.calibrate.fit.fit import fit as fit_strokes
     from brushloop.calibrate.validate.command import validate as compare_models
 
-    session, known = request.session, None
-    if not Recording(session).header.source.imported:
-        known = calibrated.calibrate_session(CalibrateRequest(session), progress)
-    fitted = fit_strokes(FitRequest(session), progress)
+    session, recording, known = request.session, Recording(request.session), None
+    if not recording.header.source.imported:
+        known = calibrated.calibrate_session(CalibrateRequest(session), progress, recording)
+    fitted = fit_strokes(FitRequest(session), progress, recording)
     wanted = ValidateRequest((session,), generators=(SHIPPED_GENERATOR,))
-    return Analysed(known, fitted, compare_models(wanted, progress))
+    return Analysed(known, fitted, compare_models(wanted, progress, [recording]))
 
 
 def _path(session: Place) -> Path:

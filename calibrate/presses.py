@@ -45,7 +45,7 @@ from brushloop.calibrate.stroke import (
 from brushloop.calibrate.work import Arrays, Scheduler, key_of, threads
 from brushloop.model.presses import Presses
 from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.recording import Capture, bad_stills
+from brushloop.sessions.recording import Capture, Recording, bad_stills
 from brushloop.sessions.records import Condition, Header, Stroke
 from brushloop.sessions.terminal import Progress, counted, unseen
 
@@ -134,12 +134,12 @@ def read_presses(
             yield press
 
 
-def read_for_fit(path: Path, progress: Progress = unseen) -> tuple[OpenSession, Presses, list[Refused]]:
+def read_for_fit(place: Path | Recording, progress: Progress = unseen) -> tuple[OpenSession, Presses, list[Refused]]:
     """Read every whole press of a session, and name the others.
 
     Raises `CalibrationError` where it holds none, or was not calibrated.
     """
-    session, refused = open_session(path, "press"), list[Refused]()
+    session, refused = open_session(place, "press"), list[Refused]()
     usable = list(read_presses(session, refused, uncommanded, cut, progress=progress))
     if not usable:
         raise CalibrationError(str(session.recording.path), "holds no press that can be used for a fit")

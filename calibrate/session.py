@@ -75,13 +75,13 @@ class OpenSession:
         return origin | {"calibration": self.calibration_digest, "software": made_by()}
 
 
-def open_session(path: Path, kind: Kind | None = None) -> OpenSession:
-    """Open a session by its folder or MCAP file, with the calibration in use.
+def open_session(place: Path | Recording, kind: Kind | None = None) -> OpenSession:
+    """Open a session by its folder, MCAP file or opened recording, with the calibration in use.
 
     Raises `InputError`, and `CalibrationError` for a session without strokes, with some of another kind, without a
     calibration, or with that of another recording.
     """
-    recording = Recording(path)
+    recording = place if isinstance(place, Recording) else Recording(place)
     sha256, strokes = recording.sha256, tuple(recording.stroke_records())
     if not strokes:
         raise CalibrationError(str(recording.path), "holds no strokes")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import struct
+import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -62,10 +63,12 @@ def encode_png(image: NDArray[np.uint8]) -> bytes:
 
 
 def _chunks(png: bytes) -> set[bytes]:
-    """Names of the chunks of a PNG."""
-    names, at = set[bytes](), len(PNG_START)
-    while at + 8 <= len(png):
+    """Names of the chunks of a PNG. Raises ValueError for a wrong CRC, struct.error where it is cut."""
+    names, at, whole = set[bytes](), len(PNG_START), memoryview(png)
+    while b"IEND" not in names:
         length, name = struct.unpack_from(">I4s", png, at)
+        if struct.unpack_from(">I", png, at + 8 + length)[0] != zlib.crc32(whole[at + 4 : at + 8 + length]):
+            raise ValueError("a chunk does not match its CRC")
         names.add(name)
         at += 12 + length
     return names
@@ -85,13 +88,12 @@ def decode_gray(data: bytes, where: str) -> NDArray[np.uint8]:
     if not data.startswith(PNG_START) and data.count(b"\xff\xda") > MAX_JPEG_SCANS:
         raise SessionDamaged(where, f"JPEG image in more than {MAX_JPEG_SCANS} scans")
     try:
+        plain = data.startswith(PNG_START) and _chunks(data) == PIXELS_ONLY
         with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
-            image.verify()  # the CRCs of a PNG, before anything is unpacked
-        with Image.open(io.BytesIO(data)) as image:
             if image.width * image.height > MAX_IMAGE_PIXELS:
                 what = f"image of {image.width} x {image.height} pixels exceeds {MAX_IMAGE_PIXELS}"
                 raise SessionDamaged(where, what)
-            if image.mode == "L" and data.startswith(PNG_START) and _chunks(data) == PIXELS_ONLY:
+            if image.mode == "L" and plain:
                 # OpenCV lets other threads decode meanwhile. It refuses some damaged images that Pillow reads, and says
                 # on stderr what stands in a profile.
                 gray = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -63,9 +64,9 @@ class Recording:
         self._file = McapFile(self.path).sound()
         self.header = parse_header(self._file)
 
-    @property
+    @cached_property
     def sha256(self) -> str:
-        """Digest of the MCAP file, for provenance."""
+        """Digest of the MCAP file, for provenance; read once."""
         return file_sha256(self.path)
 
     @property

@@ -207,24 +207,25 @@ class FitResult:
         return framed(self.page)
 
 
-def fit(request: FitRequest, progress: Progress = unseen) -> FitResult | Written:
-    """Fit what the session holds, presses or drags. Raises `CalibrationError`."""
+def fit(request: FitRequest, progress: Progress = unseen, opened: Recording | None = None) -> FitResult | Written:
+    """Fit what the session holds, presses or drags; `opened` is its recording. Raises `CalibrationError`."""
     from brushloop.calibrate.drags.report import fit_session
 
-    first = next(Recording(request.session).stroke_records(), None)
+    recording = opened or Recording(request.session)
+    first = next(recording.stroke_records(), None)
     if first is not None and first.kind == "drag":
         return fit_session(request, progress)
-    return fit_presses(request, progress)
+    return fit_presses(request, progress, recording)
 
 
-def fit_presses(request: FitRequest, progress: Progress = unseen) -> FitResult:
+def fit_presses(request: FitRequest, progress: Progress = unseen, opened: Recording | None = None) -> FitResult:
     """Fit the brush to the presses of a session, leave each condition out in turn, and measure the marks.
 
     The session uses the fit from now on, and its page is written. Raises `CalibrationError`.
     """
     if request.prior is not None:
         raise CalibrationError("--prior", "adapts a fit of drags, and this session holds presses")
-    session, presses, refused = read_for_fit(request.session, progress)
+    session, presses, refused = read_for_fit(opened or request.session, progress)
     press = fit_parameters(presses)
     held_out = leave_condition_out(presses, press, progress=progress, store=session.store)
     fit = BrushFit(

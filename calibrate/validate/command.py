@@ -41,6 +41,7 @@ from brushloop.calibrate.writing.compare import PICTURE, WrittenRecord, read_wri
 from brushloop.sessions.disk import as_text, check_writable, csv_text, file_sha256
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.journal import JOURNAL_NAME, replay
+from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Source
 from brushloop.sessions.terminal import Progress, unseen
 
@@ -104,18 +105,20 @@ class Beside:
     notes: list[str] = field(default_factory=list[str])
 
 
-def validate(request: ValidateRequest, progress: Progress = unseen) -> ValidationOutput:
+def validate(
+    request: ValidateRequest, progress: Progress = unseen, opened: Sequence[Recording] = ()
+) -> ValidationOutput:
     """Validate and write every file of the report; its gates are checked afterwards, by `ValidationOutput.check`.
 
     Raises `CalibrationError`, and what reading a recording raises. Finished work is kept in the folders
-    of the sessions, so that the same command resumes.
+    of the sessions, so that the same command resumes. `opened` are their recordings, where these are open already.
     """
     for text in request.gates:
         parse_gate(text)
     curves = [read_curve(text) for text in request.curves]
     folder = _folder(request)
     check_writable(folder)
-    sessions = [open_session(place, request.fit) for place in request.places]
+    sessions = [open_session(place, request.fit) for place in opened or request.places]
     one_source(sessions)
     kinds = {session.strokes[0].kind for session in sessions}
     if len(kinds) > 1:
@@ -136,7 +139,7 @@ def validate(request: ValidateRequest, progress: Progress = unseen) -> Validatio
         raise CalibrationError(str(folder), "another validation is writing there") from None
 
 
-def open_session(place: Path, fit: Path | None = None) -> FittedSession:
+def open_session(place: Path | Recording, fit: Path | None = None) -> FittedSession:
     """Open a session. Raises `CalibrationError`, `InputError` or `SessionDamaged`, each naming it."""
     session = open_recording(place)
     path = session.recording.path
