@@ -131,10 +131,15 @@ class Lab:
             self.engines.append(start.engine_for(Opening.load(request)))
         return self.engines[-1]
 
-    def run(self, **options: Any) -> Engine:
-        """An engine at its end. Raises what ended it."""
+    def started(self, **options: Any) -> Engine:
+        """An engine on its way."""
         engine = self.engine(**options)
         engine.start()
+        return engine
+
+    def run(self, **options: Any) -> Engine:
+        """An engine at its end. Raises what ended it."""
+        engine = self.started(**options)
         wait_for_end(engine)
         return engine
 

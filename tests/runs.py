@@ -25,6 +25,7 @@ LOOK_S = 0.05
 """Real time between two looks at whether a run is over that no longer takes turns."""
 
 _R = TypeVar("_R")
+_E = TypeVar("_E", bound=Exception)
 
 
 class Turns:
@@ -119,6 +120,13 @@ def wait_for_end(engine: Engine) -> None:
         end(engine)
         pytest.fail(f"a test waited in vain for the end of the run; it is: {now}")
     engine.join()
+
+
+def ended_by(engine: Engine, error: type[_E], says: str | None = None) -> _E:
+    """The error that ends the run, which must be of this kind and hold these words (a pattern)."""
+    with pytest.raises(error, match=says) as caught:
+        wait_for_end(engine)
+    return caught.value
 
 
 def question(engine: Engine, words: str = "") -> Prompt:

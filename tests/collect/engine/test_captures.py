@@ -26,19 +26,13 @@ from brushloop.collect.tui.review_screen import Review
 from brushloop.drivers.sim.brush.footprint import Flaw
 from brushloop.model.fitted import FittedPress
 from brushloop.model.strokes import stroke_model
-from brushloop.sessions.events import Press, PressResult
-from brushloop.sessions.journal import JOURNAL_NAME, replay
+from brushloop.sessions.events import Press, PressResult, SelfCheckResult
 from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Condition, Topic
 from tests.calibrate.given import kept_lens
-from tests.journal_lines import read_lines
 from tests.rigs import Lab
-from tests.runs import answered_alike, question, until, wait_for_end
-
-
-def used(lab: Lab) -> int:
-    return len(lab.state.used_patches)
+from tests.runs import answer, answered_alike, ended_by, until, wait_for_end
 
 
 def test_a_split_stroke_is_pressed_again_on_a_new_cell_and_only_the_sound_one_counts(sharp_lab: Lab) -> None:
@@ -48,13 +42,10 @@ def test_a_split_stroke_is_pressed_again_on_a_new_cell_and_only_the_sound_one_co
     now = engine.snapshot()
     assert (now.state, now.strokes_done, now.given_up) == (State.DONE, 1, 0)
     assert any("split" in line.lower() for line in now.messages), now.messages
-    assert used(sharp_lab) == 2 + now.voids
-    folder = sharp_lab.session
-    [capture] = Recording(folder).captures()
-    assert capture.stroke.stroke_id == "H13-a0-r01"
-    assert capture.stroke.anchor_mm == pytest.approx(
-        (sharp_lab.rig.world.presses[-1].x_mm, sharp_lab.rig.world.presses[-1].y_mm), abs=0.1
-    )
+    assert len(sharp_lab.state.used_patches) == 2 + now.voids
+    [stroke], last = Recording(sharp_lab.session).stroke_records(), sharp_lab.rig.world.presses[-1]
+    assert stroke.stroke_id == "H13-a0-r01"
+    assert stroke.anchor_mm == pytest.approx((last.x_mm, last.y_mm), abs=0.1)
 
 
 def test_a_stroke_that_fails_every_time_is_given_up_where_nobody_watches(sharp_lab: Lab) -> None:
@@ -63,17 +54,15 @@ def test_a_stroke_that_fails_every_time_is_given_up_where_nobody_watches(sharp_l
     now = engine.snapshot()
     assert (now.state, now.strokes_done, now.given_up) == (State.DONE, 0, 1)
     assert now.eta_s == 0.0, "a stroke that was left out takes no more time"
-    assert used(sharp_lab) == 3 + now.voids
+    assert len(sharp_lab.state.used_patches) == 3 + now.voids
 
 
 def test_a_question_that_nobody_answered_is_asked_again_on_resume(sharp_lab: Lab) -> None:
     sharp_lab.rig.world.flaws.update(dict.fromkeys(range(20), (Flaw.SPLIT, 1.0)))
-    left = sharp_lab.engine(on_screen=True)
-    left.start()
+    left = sharp_lab.started(on_screen=True)
     assert until(left, lambda now: now.prompt is not None).state is State.ASKING
     left.park()  # as `q` does, and a lost connection
-    with pytest.raises(Parked):
-        wait_for_end(left)
+    ended_by(left, Parked)
     assert left.snapshot().given_up == 0
 
     resumed = sharp_lab.engine(on_screen=True)
@@ -97,12 +86,10 @@ def test_ink_on_a_cell_that_should_be_blank_is_seen_before_the_brush_is_dipped(s
 def test_a_full_sheet_is_changed_on_the_screen_and_the_run_goes_on(sharp_lab: Lab) -> None:
     sharp_lab.edit_rig("cell_mm = [40.0, 24.0]", "cell_mm = [100.0, 60.0]")
     sharp_lab.write_protocol("[13.0, 15.0]", "[0.0]")
-    engine = sharp_lab.engine(on_screen=True)
-    engine.start()
-    prompt = question(engine)
-    assert "Sheet 1 is full" in prompt.question
+    engine = sharp_lab.started(on_screen=True)
+    until(engine, lambda now: now.prompt is not None)
     sharp_lab.rig.world.fresh_sheet()
-    assert engine.answer(prompt.number, "g")
+    answer(engine, "Sheet 1 is full", "g")
     wait_for_end(engine)
     assert engine.snapshot().strokes_done == 2
 
@@ -122,8 +109,7 @@ points = [[12.0, 26.0, 1.0, 0.0, 0.0], [37.0, 26.0, 1.0, 0.0, 0.0]]
 def test_the_peak_force_of_a_figure_is_that_of_its_deepest_stroke(sharp_lab: Lab) -> None:
     (sharp_lab.folder / "protocol.toml").write_text(FIGURE + SHALLOW, encoding="utf-8")
     sharp_lab.run()
-    folder = sharp_lab.session
-    [drawn] = replay(folder / JOURNAL_NAME).results(PressResult)
+    [drawn] = sharp_lab.state.results(PressResult)
     assert (drawn.peak_force_n or 0.0) > 0.02, "the shallow stroke comes last and reaches 0.007 N"
     assert drawn.depths_mm == pytest.approx((5.0, 1.0), abs=0.1)
 
@@ -133,25 +119,17 @@ def test_the_peak_force_of_a_figure_is_that_of_its_deepest_stroke(sharp_lab: Lab
 K1 = -0.08
 
 
-def lens_file(folder: Path, k1: float = K1) -> Path:
-    return kept_lens(folder, (1024, 768), k1)
-
-
-def named(lab: Lab, path: Path, also: str = "") -> Path:
-    """Name the lens file in rig.toml, as an operator does."""
+def with_lens_file(lab: Lab) -> Path:
+    """A lens file beside rig.toml, which names it."""
+    path = kept_lens(lab.folder / "camera", (1024, 768), K1)
     lab.edit_rig("[camera]", f'[camera]\nlens_file = "{path.relative_to(lab.folder)}"')
-    lab.edit_rig("", also)
-    return lab.folder / "rig.toml"
+    return path
 
 
 def test_a_session_is_collected_straight_and_holds_its_lens(bent_lab: Lab) -> None:
-    lens = lens_file(bent_lab.folder / "camera")
-    named(bent_lab, lens, "\n[self_check]\nenabled = true\n")
-    engine = bent_lab.engine()
-    engine.start()
-    wait_for_end(engine)
-    assert engine.snapshot().state is State.DONE, engine.snapshot().messages
-
+    lens = with_lens_file(bent_lab)
+    bent_lab.edit_rig("", "\n[self_check]\nenabled = true\n")
+    bent_lab.run()
     folder = bent_lab.session
     [(schema, _, message)] = McapFile(Recording(folder).path).messages([str(Topic.CALIBRATION)])
     recorded = CameraCalibration.FromString(message.data)
@@ -170,11 +148,10 @@ def test_a_session_is_collected_straight_and_holds_its_lens(bent_lab: Lab) -> No
     assert made.lens.source == f"lens file {lens.stem}"
 
     # The self-check spent three patches far apart, and the press lies on a fourth.
-    lines = read_lines(folder / "journal.jsonl")
-    [check] = [line for line in lines if line["event"] == "done" and line["result"]["kind"] == "self_check"]
-    assert check["result"]["patches"] == [0, 5, 36]
-    assert max(abs(scale - 1.0) for scale in check["result"]["scale"]) < 0.005
-    state = replay(folder / "journal.jsonl")
+    state = bent_lab.state
+    [check] = state.results(SelfCheckResult)
+    assert check.patches == (0, 5, 36)
+    assert check.scale == pytest.approx((1.0, 1.0), abs=0.005)
     assert {(0, 0), (0, 5), (0, 36), (0, 1)} <= state.used_patches
     assert len(state.used_patches) == 4 + 3 * len(state.cut)
 
@@ -182,16 +159,11 @@ def test_a_session_is_collected_straight_and_holds_its_lens(bent_lab: Lab) -> No
 def test_without_the_lens_file_the_run_ends_before_ink_and_names_the_remedy(bent_lab: Lab) -> None:
     with pytest.raises(StepError, match=r"the lens bends straight lines: .*camera\.lens_file"):
         bent_lab.run()
-    folder = bent_lab.session
-    assert replay(folder / "journal.jsonl").used_patches == set()
+    assert not bent_lab.state.used_patches
 
 
 def test_what_is_no_lens_file_is_refused_in_one_line(bent_lab: Lab) -> None:
-    lens = lens_file(bent_lab.folder)
-    rig = named(bent_lab, lens)
-    optics = load_rig(rig).camera.optics
-    assert optics is not None
-    assert optics.distortion[0] == K1
+    lens, rig = with_lens_file(bent_lab), bent_lab.folder / "rig.toml"
     lens.write_text(lens.read_text().replace("a board", "another"))
     with pytest.raises(ConfigError, match=r"rig.toml: camera.lens_file: .*was edited"):
         load_rig(rig)
@@ -225,11 +197,7 @@ def test_the_mark_is_the_one_of_the_closed_form(depth_mm: float, tilt_deg: float
     assert mark is not None
     assert exact.sum() > 100
     assert np.logical_xor(mark, exact).sum() <= 0.01 * exact.sum()
-
-
-def test_beyond_the_domain_there_is_none() -> None:
-    assert mark_of(BRUSH, Condition(0.0, 0.0)) is None
-    assert mark_of(BRUSH, Condition(11.0, 85.0)) is None
+    assert mark_of(BRUSH, Condition(depth_mm, 85.0)) is None, "beyond the domain"
 
 
 def test_likeness_is_a_cosine_and_needs_ink_on_both() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,16 +19,12 @@ from brushloop.collect.motion import Procedures, dip_moves, wash_moves
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.tui.review_screen import Review
 from brushloop.drivers.devices import Pose
+from brushloop.sessions.events import PressResult
 from brushloop.sessions.recording import Recording
 from tests.collect.sent import noting
 from tests.journal_lines import read_lines
 from tests.rigs import Lab
-from tests.runs import until, wait_for_end
-
-
-def results(folder: Path, kind: str) -> list[dict[str, Any]]:
-    done = [line for line in read_lines(folder / "journal.jsonl") if line["event"] == "done"]
-    return [line["result"] for line in done if line["result"]["kind"] == kind]
+from tests.runs import ended_by, until, wait_for_end
 
 
 @pytest.fixture
@@ -67,15 +62,14 @@ def targets(request: pytest.FixtureRequest) -> list[str]:
 
 def test_nobody_looks_at_the_paper_between_dip_and_press(sharp_lab: Lab, targets: list[str], screen: list[str]) -> None:
     sharp_lab.run()
-    folder = sharp_lab.session
     assert targets[targets.index("ink") :][:3] == ["ink", "paper", "park"]
     assert screen[screen.index("dip") :][:4] == ["dip", "check that the sheet is blank", "dip", "press H13-a0-r01"]
-    presses = results(folder, "press")  # more than one where a photograph was late and the stroke was made again
-    waits = [result["press"]["dip_to_touch_s"] for result in presses]
-    assert min(waits) > 0.0
-    [capture] = Recording(folder).captures()
-    assert capture.stroke.dip_to_touch_s == waits[-1]
-    assert [seen.press.dip_to_touch_s for seen in Review(folder).captures] == waits
+    [wait_s] = [made.press.dip_to_touch_s for made in sharp_lab.state.results(PressResult)]
+    assert wait_s is not None
+    assert wait_s > 0.0
+    [stroke] = Recording(sharp_lab.session).stroke_records()
+    assert stroke.dip_to_touch_s == wait_s
+    assert [seen.press.dip_to_touch_s for seen in Review(sharp_lab.session).captures] == [wait_s]
 
 
 def test_a_brush_that_waited_with_its_ink_dips_again(
@@ -151,12 +145,10 @@ def test_a_stop_while_a_capture_is_judged_costs_a_photograph_and_no_press(
 
     with monkeypatch.context() as patch:
         patch.setattr(capturing, "_looked_at", for_ever)
-        engine = lab.engine()
-        engine.start()
+        engine = lab.started()
         until(engine, lambda _: judging.is_set())
         engine.stop()
-        with pytest.raises(CollectAborted):
-            wait_for_end(engine)
+        ended_by(engine, CollectAborted)
     assert events(lab)[-2:] == [("begin", "capture"), ("void", "capture")]
 
     again = lab.run()
@@ -164,26 +156,19 @@ def test_a_stop_while_a_capture_is_judged_costs_a_photograph_and_no_press(
     assert len([press for press in lab.rig.world.presses if press.depth_mm > 1.0]) == 2
 
 
-async def test_a_photograph_at_fault_does_not_stop_the_arm_on_its_way() -> None:
-    arrived = False
+async def test_a_photograph_at_fault_does_not_stop_the_arm_on_its_way_and_a_failed_motion_is_reported_first() -> None:
+    arrived: list[bool] = []
 
     async def moving() -> None:
-        nonlocal arrived
         await asyncio.sleep(0.01)
-        arrived = True
+        arrived.append(True)
 
-    async def judging() -> None:
-        raise BadPicture("too dark")
-
-    with pytest.raises(BadPicture):
-        await meanwhile(moving(), judging())
-    assert arrived
-
-
-async def test_of_a_failed_motion_and_a_failed_photograph_the_motion_is_reported() -> None:
     async def failing(error: Exception) -> None:
         raise error
 
+    with pytest.raises(BadPicture):
+        await meanwhile(moving(), failing(BadPicture("too dark")))
+    assert arrived
     with pytest.raises(RuntimeError, match="protective stop"):
         await meanwhile(failing(RuntimeError("protective stop")), failing(BadPicture("too dark")))
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from brushloop.collect.engine.control import State
-from brushloop.collect.engine.engine import UNCHECKED, Engine
-from brushloop.collect.engine.snapshot import Snapshot
+from brushloop.collect.engine.engine import UNCHECKED
 from brushloop.collect.errors import CollectAborted, ConfigError, NeedsOperator, Parked, SheetFull
 from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.devices import Identity
@@ -21,100 +19,66 @@ from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.store import SessionStore
 from tests.collect.conftest import Collected
-from tests.journal_lines import read_lines
 from tests.rigs import SMALL_VIEW, Lab
-from tests.runs import answered_alike, question, until, wait_for_end
+from tests.runs import answered_alike, ended_by, question, until, wait_for_end
 
 ELSEWHERE = replace(SMALL_VIEW, centre_mm=(SMALL_VIEW.centre_mm[0] + 3.0, SMALL_VIEW.centre_mm[1]))
 
 
-def run_and_stop(engine: Engine, when: Callable[[Snapshot], bool]) -> None:
-    engine.start()
-    until(engine, when)
-    engine.stop()
-    with pytest.raises(CollectAborted):
-        wait_for_end(engine)
-    assert engine.snapshot().state == State.STOPPED
-
-
-def slowly(lab: Lab) -> None:
-    lab.edit_rig("press_speed_mm_s = 20.0", "press_speed_mm_s = 2.0")
-    lab.write_protocol("[11.0]", "[0.0]")
-
-
 @pytest.mark.xdist_group("collected")
-def test_a_whole_session_is_collected_merged_and_reported(collected: Collected) -> None:
-    now = collected.engine.snapshot()
+def test_a_whole_session_is_collected_as_the_protocol_says_and_merged(collected: Collected) -> None:
+    now, recording = collected.engine.snapshot(), Recording(collected.folder)
     assert (now.state, now.strokes_done, now.strokes_planned) == (State.DONE, 4, 4)
-    assert now.source == "loopback rig"
-    recording = Recording(collected.folder)
-    assert recording.header.source == "loopback rig"
-    captures = list(recording.captures())
-    assert sorted((c.stroke.depth_mm, c.stroke.tilt_deg) for c in captures) == [(11, 0), (11, 10), (15, 0), (15, 10)]
-    assert all(c.image().shape == (384, 512) for c in captures)
-
-
-@pytest.mark.xdist_group("collected")
-def test_the_arm_presses_what_the_protocol_says_where_the_cell_lies(collected: Collected) -> None:
+    assert now.source == recording.header.source == "loopback rig"
+    captures = sorted(recording.captures(), key=lambda capture: capture.stroke.still)
+    assert all(capture.image().shape == (384, 512) for capture in captures)
+    assert {(c.stroke.depth_mm, c.stroke.tilt_deg) for c in captures} == {(11, 0), (11, 10), (15, 0), (15, 10)}
     # World's own answer sheet; the operator taught the touch height .03 mm too high. The first contact is zero touch.
-    strokes = {c.stroke.still: c.stroke for c in Recording(collected.folder).captures()}
     pressed = [p for p in collected.lab.rig.world.presses if p.depth_mm > 1.0]
-    for press, stroke in zip(pressed, (strokes[k] for k in sorted(strokes)), strict=True):
+    for press, stroke in zip(pressed, (capture.stroke for capture in captures), strict=True):
         assert stroke.depth_mm == pytest.approx(press.depth_mm + 0.03, abs=0.01)
-        assert stroke.tilt_deg == pytest.approx(press.tilt_deg, abs=0.01)
+        assert (stroke.tilt_deg, 0.0) == pytest.approx((press.tilt_deg, press.heading_deg), abs=0.01)
         assert stroke.anchor_mm == pytest.approx((press.x_mm, press.y_mm), abs=0.05)
-        assert press.heading_deg == pytest.approx(0.0, abs=0.01)
         assert press.ink_load == 1.0
-
-
-@pytest.mark.xdist_group("collected")
-def test_a_finished_session_is_not_followed_by_another_on_the_same_sheet(collected: Collected) -> None:
     with pytest.raises(ConfigError, match="Put a fresh sheet in, then confirm it with --sheet 1"):
         collected.lab.engine()
-    assert len(list(collected.lab.sessions.iterdir())) == 1
 
 
 @pytest.mark.parametrize("parked_before", [False, True])
 def test_stop_in_mid_press_voids_the_cell_and_the_same_command_goes_on(lab: Lab, parked_before: bool) -> None:
     """Who has asked to park does not have to wait for the end of the press."""
-    engine = lab.engine()
-    engine.start()
+    engine = lab.started()
     until(engine, lambda now: now.strokes_done == 1)
     until(engine, lambda now: now.step.startswith("press") and now.tip_mm is not None and now.tip_mm[2] < 125.0)
     if parked_before:
         engine.park()
     engine.stop()
     engine.stop()
-    with pytest.raises(CollectAborted):
-        wait_for_end(engine)
+    ended_by(engine, CollectAborted)
     assert engine.snapshot().state == State.STOPPED
     assert lab.at_rest
 
     lab.run()
     state = lab.state
     assert state.cut
-    ids = [c.stroke.stroke_id for c in Recording(lab.session).captures()]
-    assert len(ids) == len(set(ids)) == 2
     # The cut press burnt its patch: three presses (one of them cut) touched three places.
     assert len(state.used_patches) == 3
     strokes = list(Recording(lab.session).stroke_records())
-    pressed = [capture.press for capture in state.results(CaptureResult)]
-    assert [stroke.reached_mm for stroke in strokes] == [press.reached_mm for press in pressed]
-    assert all(abs((stroke.reached_mm or 0.0) - (stroke.depth_mm or 0.0)) < 0.2 for stroke in strokes)
+    assert len({stroke.stroke_id for stroke in strokes}) == len(strokes) == 2
+    assert [s.reached_mm for s in strokes] == [capture.press.reached_mm for capture in state.results(CaptureResult)]
+    assert [s.reached_mm for s in strokes] == pytest.approx([s.depth_mm for s in strokes], abs=0.2)
 
 
 def test_stop_before_anything_has_moved(lab: Lab) -> None:
     engine = lab.engine()
     engine.stop()
     engine.start()
-    with pytest.raises(CollectAborted):
-        wait_for_end(engine)
+    ended_by(engine, CollectAborted)
     assert engine.snapshot().state == State.STOPPED
 
 
 def test_pause_waits_between_steps_and_resume_or_stop_ends_it(lab: Lab) -> None:
-    engine = lab.engine()
-    engine.start()
+    engine = lab.started()
     until(engine, lambda now: now.strokes_done == 1)
     engine.pause()
     paused = until(engine, lambda now: now.state == State.PAUSED)
@@ -126,8 +90,7 @@ def test_pause_waits_between_steps_and_resume_or_stop_ends_it(lab: Lab) -> None:
     engine.pause()
     until(engine, lambda now: now.state == State.PAUSED)
     engine.stop()
-    with pytest.raises(CollectAborted):
-        wait_for_end(engine)
+    ended_by(engine, CollectAborted)
 
 
 def test_a_full_sheet_asks_for_a_fresh_one_and_goes_on_with_it(lab: Lab) -> None:
@@ -135,17 +98,19 @@ def test_a_full_sheet_asks_for_a_fresh_one_and_goes_on_with_it(lab: Lab) -> None
     lab.write_protocol("[11.0, 13.0, 15.0]", "[0.0, 10.0]")  # 6 presses, 4 patches
     with pytest.raises(SheetFull, match="--sheet 2"):
         lab.run()
-    begun = [line["kind"] for line in read_lines(lab.session / JOURNAL_NAME) if line["event"] == "begin"]
-    assert begun[-1] == "capture", "no brush was dipped for a sheet that was full"
-    run_and_stop(lab.engine(sheet=2), lambda now: now.strokes_done == 5)
+    assert [*lab.state.files.values()][-1].kind == "capture", "no brush was dipped for a sheet that was full"
+    assert not [begin.kind for begin, _ in lab.state.cut if begin.kind == "dip"]
+    engine = lab.started(sheet=2)
+    until(engine, lambda now: now.strokes_done == 5)
+    engine.stop()
+    ended_by(engine, CollectAborted)
     with pytest.raises(ConfigError, match="only 2 or 3"):
         lab.run(sheet=5)
     lab.run(sheet=2)  # the same command again: the sheet is not changed twice
     assert sum(1 for _ in Recording(lab.session).captures()) == 6
-    lines = [line for line in read_lines(lab.session / JOURNAL_NAME) if line["event"] == "begin"]
-    pressed = [(line["sheet"], patch) for line in lines for patch in line.get("patches", [])]
-    assert len(pressed) == len(set(pressed))
-    assert {sheet for sheet, _ in pressed} == {0, 1}
+    presses = sum(lab.state.attempts[step.key] for step in lab.state.files.values() if step.kind == "press")
+    assert len(lab.state.used_patches) == presses, "no patch is used twice"
+    assert {sheet for sheet, _ in lab.state.used_patches} == {0, 1}
 
 
 def test_real_hardware_is_not_moved_unless_armed_or_allowed_on_the_screen(
@@ -173,12 +138,10 @@ def test_an_armed_run_without_its_self_check_says_so(lab: Lab) -> None:
 
 def begun(lab: Lab) -> Path:
     """The folder of a session that was parked after its first stroke."""
-    engine = lab.engine()
-    engine.start()
+    engine = lab.started()
     until(engine, lambda now: now.strokes_done == 1)
     engine.park()
-    with pytest.raises(Parked):
-        wait_for_end(engine)
+    ended_by(engine, Parked)
     return lab.session
 
 
@@ -186,14 +149,12 @@ def test_who_resumes_on_a_screen_is_asked_before_anything_moves(lab: Lab) -> Non
     folder = begun(lab)
     before = lab.rig.world.tool(), (folder / JOURNAL_NAME).read_bytes()
     for leaves in (False, True):
-        engine = lab.engine(on_screen=True)
-        engine.start()
+        engine = lab.started(on_screen=True)
         prompt = question(engine, "parked on request")
         assert engine.snapshot().state is State.ASKING
         assert folder.name in prompt.question
         engine.park() if leaves else engine.answer(prompt.number, "x")
-        with pytest.raises(CollectAborted, match="nothing moved"):
-            wait_for_end(engine)
+        ended_by(engine, CollectAborted, "nothing moved")
         assert (lab.rig.world.tool(), (folder / JOURNAL_NAME).read_bytes()) == before
 
     SessionStore(folder, lambda: 1).release()  # as a process that is killed
@@ -227,10 +188,8 @@ def test_a_session_is_not_resumed_on_another_robot(lab: Lab, monkeypatch: pytest
 def test_a_resume_that_fails_while_connecting_still_names_its_session(lab: Lab) -> None:
     folder = begun(lab)
     lab.edit_rig(f"port = {lab.rig.arcs.port}", "port = 1")
-    engine = lab.engine(on_screen=True)
-    engine.start()
-    with pytest.raises(DeviceError):
-        wait_for_end(engine)
+    engine = lab.started(on_screen=True)
+    ended_by(engine, DeviceError)
     now = engine.snapshot()
     assert (now.state, now.session_id, now.folder) == (State.FAILED, folder.name, str(folder))
 
@@ -243,7 +202,8 @@ def test_a_resume_that_fails_while_connecting_still_names_its_session(lab: Lab) 
 )
 def test_a_safety_stop_holds_the_session_until_a_person_has_released_it(lab: Lab, mode: SafetyMode) -> None:
     """An answer before that is asked again and moves nothing."""
-    slowly(lab)
+    lab.edit_rig("press_speed_mm_s = 20.0", "press_speed_mm_s = 2.0")
+    lab.write_protocol("[11.0]", "[0.0]")
     engine, power = lab.engine(on_screen=True), lab.rig.arcs.cabinet.power
     engine.start()
     until(engine, lambda _: lab.rig.world.tool().z_mm <= 117.0)

@@ -26,7 +26,7 @@ from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.records import Topic
 from tests.collect.conftest import Collected
 from tests.rigs import Lab
-from tests.runs import question, until, wait_for_end
+from tests.runs import ended_by, question, until, wait_for_end
 
 
 def slowly(lab: Lab) -> None:
@@ -84,8 +84,7 @@ def test_a_sensor_that_goes_silent_in_mid_press_stops_the_arm_and_the_press_is_d
     in_mid_press(lab, monkeypatch, Fault(device=Device.FORCE, kind="silence", for_s=20.0))
     lab.edit_rig("stale_ms = 1000.0", "stale_ms = 600.0")
     slowly(lab)
-    engine = lab.engine()
-    engine.start()
+    engine = lab.started()
     until(engine, lambda now: now.voids > 0)
     lab.rig.faults.clear()
     wait_for_end(engine)
@@ -129,8 +128,7 @@ def test_an_empty_reservoir_holds_the_run_before_a_dry_press_until_it_is_refille
     firmware: Any = lab.rig.ink.instrument
     lab.write_protocol("[11.0]", "[0.0]")
     lab.rig.world.well.ml, firmware.reservoir_ml = 4.0, 0.2
-    engine = lab.engine(on_screen=watched)
-    engine.start()
+    engine = lab.started(on_screen=watched)
     if watched:
         prompt = question(engine, "Refill the reservoir")
         assert lab.rig.world.tool().z_mm > 170.0, "a person is about to reach under the arm"
@@ -138,8 +136,7 @@ def test_an_empty_reservoir_holds_the_run_before_a_dry_press_until_it_is_refille
         assert engine.answer(prompt.number, "g")
         wait_for_end(engine)
     else:
-        with pytest.raises(InkRefused, match="Refill the reservoir"):
-            wait_for_end(engine)
+        ended_by(engine, InkRefused, "Refill the reservoir")
         assert lab.at_rest
         assert lab.rig.world.tool().z_mm > 170.0
     assert presses(lab) == watched

@@ -15,7 +15,13 @@ from brushloop.sessions.events import BoardResult, StepResult, ZeroTouchResult
 from brushloop.sessions.recording import Recording, mark_bad_or_good
 from tests.journal_lines import read_lines
 from tests.rigs import Lab
-from tests.runs import answer, until, wait_for_end
+from tests.runs import answer, ended_by, until, wait_for_end
+
+
+@pytest.fixture
+def lab(lab: Lab) -> Lab:
+    lab.write_protocol("[11.0]", "[0.0]")
+    return lab
 
 
 def test_a_request_made_twice_is_withdrawn_and_retake_and_skip_exclude_each_other() -> None:
@@ -30,21 +36,20 @@ def test_a_request_made_twice_is_withdrawn_and_retake_and_skip_exclude_each_othe
     assert requests.open == ()
 
 
-def test_a_stroke_is_pressed_again_on_a_new_cell_because_the_operator_asked(lab: Lab) -> None:
-    lab.write_protocol("[11.0]", "[0.0]")
+def test_the_operator_asks_for_a_new_sheet_and_for_another_take_of_the_first_stroke_on_it(lab: Lab) -> None:
     engine = lab.engine(on_screen=True)
     engine.request(OperatorRequest.RETAKE)
     engine.request(OperatorRequest.NEW_SHEET)
-    engine.request(OperatorRequest.NEW_SHEET)
     engine.start()
+    answer(engine, "Replace sheet 1 by a blank one", "g")
     wait_for_end(engine)
     now = engine.snapshot()
     assert (now.state, now.strokes_done, now.given_up, now.requests) == (State.DONE, 1, 0, ())
     assert now.sheet is not None
+    assert now.sheet.number == 2
     assert [mark for mark in now.sheet.marks if mark] == [Mark.BAD, Mark.KEPT]
     assert now.grid[0].bad == 1
-    folder = lab.session
-    assert len(list(Recording(folder).captures())) == 1
+    assert len(list(Recording(lab.session).captures())) == 1
 
 
 def test_a_stroke_is_left_out_before_it_is_pressed_and_stays_left_out_after_a_resume(lab: Lab) -> None:
@@ -54,8 +59,7 @@ def test_a_stroke_is_left_out_before_it_is_pressed_and_stays_left_out_after_a_re
     first.start()
     until(first, lambda now: now.given_up == 1)
     first.park()
-    with pytest.raises(Parked):
-        wait_for_end(first)
+    ended_by(first, Parked)
     assert first.snapshot().strokes_done + first.snapshot().given_up < 3
     again = lab.run()
     now = again.snapshot()
@@ -66,8 +70,7 @@ def test_a_stroke_is_left_out_before_it_is_pressed_and_stays_left_out_after_a_re
 
 def test_what_is_marked_bad_meanwhile_is_pressed_again_at_the_end_exactly_once(lab: Lab) -> None:
     lab.write_protocol("[11.0, 15.0]", "[0.0]")
-    first = lab.engine(on_screen=True)
-    first.start()
+    first = lab.started(on_screen=True)
     last = until(first, lambda now: now.strokes_done == 1 and now.last is not None).last
     assert last is not None
     folder = lab.session
@@ -75,8 +78,7 @@ def test_what_is_marked_bad_meanwhile_is_pressed_again_at_the_end_exactly_once(l
     assert [mark_bad_or_good(folder, last.still, last.press.stroke_id, n) for n in range(3)] == [True, False, True]
     until(first, lambda now: any(cell.now and cell.bad for cell in now.grid))
     first.park()
-    with pytest.raises(Parked):
-        wait_for_end(first)
+    ended_by(first, Parked)
     again = lab.run()
 
     now = again.snapshot()
@@ -89,21 +91,7 @@ def test_what_is_marked_bad_meanwhile_is_pressed_again_at_the_end_exactly_once(l
     assert f"{last.press.stroke_id}-again" in captures
 
 
-def test_a_new_sheet_is_asked_for_and_the_next_stroke_lies_on_it(lab: Lab) -> None:
-    lab.write_protocol("[11.0]", "[0.0]")
-    engine = lab.engine(on_screen=True)
-    engine.request(OperatorRequest.NEW_SHEET)
-    engine.start()
-    answer(engine, "Replace sheet 1 by a blank one", "g")
-    wait_for_end(engine)
-    now = engine.snapshot()
-    assert now.sheet is not None
-    assert now.sheet.number == 2
-    assert now.sheet.marks[0] is Mark.KEPT
-
-
 def test_the_paper_is_found_again_by_jog_between_two_strokes(lab: Lab) -> None:
-    lab.write_protocol("[11.0]", "[0.0]")
     engine = lab.engine(on_screen=True)
     engine.request(OperatorRequest.JOG)
     engine.start()
@@ -140,7 +128,6 @@ def failing(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
 def test_a_jog_between_strokes_that_fails_leaves_the_paper_where_it_was(
     lab: Lab, monkeypatch: pytest.MonkeyPatch, error: Exception, asks: str
 ) -> None:
-    lab.write_protocol("[11.0]", "[0.0]")
     failing(monkeypatch, error)
     engine = lab.engine(on_screen=True)
     engine.request(OperatorRequest.JOG)
@@ -174,10 +161,8 @@ def test_a_height_that_is_not_taken_and_a_jog_that_is_given_up_leave_the_paper_w
 
 
 def test_who_gives_the_jog_of_the_set_up_up_is_asked_and_may_jog_again(lab: Lab) -> None:
-    lab.write_protocol("[11.0]", "[0.0]")
     lab.edit_rig("[paper]", '[touch]\nmethod = "jog"\ntouches = 1\n\n[paper]')
-    engine = lab.engine(on_screen=True)
-    engine.start()
+    engine = lab.started(on_screen=True)
     answer(engine, "Touch 1 of 1.", "x")
     answer(engine, "the operator gave up at touch 1 of 1", "g")
     answer(engine, "Touch 1 of 1.", "t")
@@ -200,23 +185,13 @@ def test_park_while_the_run_waits_parks_and_asks_nobody_any_more(lab: Lab, state
     assert engine.snapshot().parked
 
 
-def test_who_accepted_the_set_up_is_not_asked_at_later_views_of_the_board(lab: Lab) -> None:
+def test_a_guided_set_up_measures_again_when_it_is_asked_to_and_later_views_of_the_board_are_not_asked_about(
+    lab: Lab,
+) -> None:
     lab.write_protocol("[11.0, 15.0]")
     with (lab.folder / "protocol.toml").open("a") as protocol:
         protocol.write("board_every = 1\n")
-    engine = lab.engine(on_screen=True, guided=True)
-    engine.start()
-    answer(engine, "Camera, board, scale", "g")
-    answer(engine, "Zero touch and plane", "g")
-    wait_for_end(engine)
-    assert engine.snapshot().strokes_done == 2
-    assert len(lab.state.results(BoardResult)) == 2
-
-
-def test_a_guided_set_up_measures_again_when_it_is_asked_to_and_shows_the_camera(lab: Lab) -> None:
-    lab.write_protocol("[11.0]", "[0.0]")
-    engine = lab.engine(on_screen=True, guided=True)
-    engine.start()
+    engine = lab.started(on_screen=True, guided=True)
     answer(engine, "Camera, board, scale", "a")
     now = until(engine, lambda now: now.prompt is not None and now.prompt.number == 2)
     assert now.prompt is not None
@@ -229,8 +204,8 @@ def test_a_guided_set_up_measures_again_when_it_is_asked_to_and_shows_the_camera
     answer(engine, "Zero touch and plane", "g")
     wait_for_end(engine)
     now = engine.snapshot()
-    assert (now.state, now.strokes_done) == (State.DONE, 1)
-    assert len(lab.state.results(BoardResult)) == 2
+    assert (now.state, now.strokes_done) == (State.DONE, 2)
+    assert len(lab.state.results(BoardResult)) == 3
     assert now.last is not None
     assert now.last.binary is not None
     assert now.last.binary.shape == (128, 128)

@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from brushloop.collect.engine.control import State
+from brushloop.collect.errors import CollectAborted
 from brushloop.drivers.arcs.controller import Controller
 from brushloop.drivers.arcs.motion import until_settled
 from brushloop.drivers.arcs.wire import RpcConnection
 from brushloop.drivers.errors import MotionFailed, PathDisturbed, SettingsChanged
 from brushloop.drivers.geometry import brush_pose, from_wire, lean, to_wire
-from tests.journal_lines import read_lines
-from tests.runs import question, until, wait_for_end
+from brushloop.sessions.events import PressResult
+from tests.collect.sent import noting
+from tests.runs import ended_by, question, until, wait_for_end
 
 if TYPE_CHECKING:
     from brushloop.collect.engine.engine import Engine
@@ -61,16 +63,9 @@ def second_client(lab: Lab, engine: Engine, target: Pose | None = None, **calls:
 
 
 def lines_sent(lab: Lab) -> list[Pose]:
-    """Every line from here on, as it is asked for."""
+    """Every line from here on that reaches the arm."""
     sent: list[Pose] = []
-    methods = lab.rig.arcs._methods
-    move_line = methods["rob1.MotionControl.moveLine"]
-
-    def seen(params: dict[str, Any]) -> Any:
-        sent.append(from_wire(params["pose"]))
-        return move_line(params)
-
-    methods["rob1.MotionControl.moveLine"] = seen
+    noting(lab.rig.world.motion, sent.append)
     return sent
 
 
@@ -99,10 +94,8 @@ def test_an_arm_that_was_put_under_the_paper_in_a_pause_first_goes_up_along_its_
 
 def test_an_arm_that_was_moved_at_a_question_first_goes_up_along_its_tool(lab: Lab) -> None:
     """A jog asks at every step, with the brush near the paper."""
-    text = (lab.folder / "rig.toml").read_text()
-    (lab.folder / "rig.toml").write_text(text + '\n[touch]\nmethod = "jog"\ntouches = 1\n')
-    engine = lab.engine(on_screen=True)
-    engine.start()
+    lab.edit_rig("", '\n[touch]\nmethod = "jog"\ntouches = 1\n')
+    engine = lab.started(on_screen=True)
     jog = question(engine, "Jog until")
     second_client(lab, engine, UNDER)
     sent = lines_sent(lab)
@@ -115,8 +108,7 @@ def test_an_arm_that_was_moved_at_a_question_first_goes_up_along_its_tool(lab: L
     until(engine, lambda now: now.prompt is not None and now.prompt.number not in (jog.number, moved.number))
     assert_up_along_the_tool_first(sent)
     engine.stop()
-    with pytest.raises(Exception, match="stopped"):
-        wait_for_end(engine)
+    ended_by(engine, CollectAborted)
 
 
 SHORTER = {"RobotConfig_setTcpOffset": {"offset": [0.0, 0.0, 0.17, 0.0, 0.0, 0.0]}}
@@ -179,8 +171,7 @@ def test_with_another_tool_offset_nothing_is_pressed(lab: Lab) -> None:
     second_client(lab, engine, **SHORTER)
     pressed = len(lab.rig.world.presses)
     engine.resume()
-    with pytest.raises(SettingsChanged, match=r"tool offset is \(0, 0, 170\) mm, \(0, 0, 0\) deg, not \(0, 0, 180\)"):
-        wait_for_end(engine)
+    ended_by(engine, SettingsChanged, r"tool offset is \(0, 0, 170\) mm, \(0, 0, 0\) deg, not \(0, 0, 180\)")
     assert len(lab.rig.world.presses) == pressed
     now = engine.snapshot()
     assert (now.state, now.strokes_done, now.rest_unknown) == (State.FAILED, 1, False)
@@ -200,12 +191,8 @@ def test_a_tool_offset_that_changes_after_the_last_look_leaves_a_void_and_no_str
     methods["rob1.MotionControl.moveLine"] = tampered
     with pytest.raises((SettingsChanged, MotionFailed)):
         lab.run()
-    folder = lab.session
-    lines = list(read_lines(folder / "journal.jsonl"))
-    pressed = {line["key"] for line in lines if line["event"] == "begin" and line["kind"] == "press"}
-    assert pressed
-    assert not [line for line in lines if line["event"] == "done" and line["key"] in pressed]
-    assert [line for line in lines if line["event"] == "void" and line["key"] in pressed]
+    assert "press" in {begin.kind for begin, _ in lab.state.cut}
+    assert not lab.state.results(PressResult)
     assert lab.engines[-1].snapshot().strokes_done == 0
 
 
@@ -224,10 +211,8 @@ def test_a_press_with_another_clients_line_is_void_lifted_and_made_again_on_a_ne
         return carry_out(params)
 
     methods[method] = tampered
-    engine = lab.engine()
-    engine.start()
-    with pytest.raises(PathDisturbed, match="nother client"):
-        wait_for_end(engine)
+    engine = lab.started()
+    ended_by(engine, PathDisturbed, "nother client")
     now = engine.snapshot()
     assert sent == [True]
     assert (now.state, now.strokes_done, now.rest_unknown, now.parked) == (State.FAILED, 0, False, True)
@@ -236,9 +221,6 @@ def test_a_press_with_another_clients_line_is_void_lifted_and_made_again_on_a_ne
 
     methods[method] = carry_out
     again = lab.run()
-    folder = lab.session
-    lines = list(read_lines(folder / "journal.jsonl"))
-    begun = [line["patches"][0] for line in lines if line["event"] == "begin" and line["kind"] == "press"]
-    assert len(set(begun)) == 2
-    assert any("nother client" in line["why"] for line in lines if line["event"] == "void")
+    assert len(lab.state.used_patches) == 2
+    assert any("nother client" in why for _, why in lab.state.cut)
     assert again.snapshot().strokes_done == 1

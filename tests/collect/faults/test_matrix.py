@@ -328,8 +328,7 @@ def test_once_the_cause_is_mended_the_same_command_goes_on(lab: Lab, name: str, 
     lab.rig.arcs.cabinet.release()
     lab.rig.clock.shift(FAST)
 
-    again = lab.engine()
-    again.start()
+    again = lab.started()
     assert end_of(again) is None
     state = lab.state
     assert len(state.used_patches) == 2, "the press that was cut lies on one, its repetition on another"
@@ -369,8 +368,7 @@ def test_an_end_with_the_brush_in_the_paper_says_so_and_what_to_do(lab: Lab, end
 
 @pytest.mark.parametrize("ends", ["park", "stop"])
 def test_a_run_that_ends_at_travel_height_does_not_speak_of_the_brush(lab: Lab, ends: str) -> None:
-    engine = lab.engine()
-    engine.start()
+    engine = lab.started()
     engine.pause()
     until(engine, lambda now: now.state is State.PAUSED)
     getattr(engine, ends)()

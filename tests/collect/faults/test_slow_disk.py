@@ -58,8 +58,7 @@ def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
 
 
 def run(bare_lab: Lab) -> tuple[BaseException | None, State]:
-    engine = bare_lab.engine()
-    engine.start()
+    engine = bare_lab.started()
     try:
         wait_for_end(engine)
     except Exception as error:
