@@ -66,7 +66,6 @@ def collect(request: CollectRequest) -> Collected:
     with contextlib.ExitStack() as stack:
         if request.live:
             live = stack.enter_context(contextlib.closing(LiveView(request.live_port)))
-            live.start()
             opening = replace(opening, live=live)
         now = _run(opening).snapshot()
     folder = Path(now.folder)

@@ -123,8 +123,7 @@ async def zero_touch(context: StepContext, step: ZeroTouchStep) -> ZeroTouchResu
     if step.between_strokes:
         await _accepted(context, moved_mm)
     run.procedures.plane = plane
-    origin_mm, quaternion = plane.frame(rig.config.paper)
-    context.recorder.paper(origin_mm, quaternion)
+    context.recorder.paper(*plane.frame(rig.config.paper))
     if (optics := rig.config.camera.optics) is not None:
         context.recorder.optics(optics)
     return measured.model_copy(update={"moved_mm": moved_mm})

@@ -114,19 +114,12 @@ JPEG_QUALITY = 80
 
 
 class LiveView:
-    """A server for viewers, from `start` to `close`. `offer` and `frame` may be called at any time, from any thread.
+    """A server for viewers, until `close`. `offer` and `frame` may be called at any time, from any thread.
 
     Neither waits for a viewer, and nothing is encoded for a topic that nobody watches.
     """
 
     def __init__(self, port: int = PORT) -> None:
-        self.port = port
-        self._server: Any = None
-        self._context: Any = None
-        self._lock = threading.Lock()
-        self._channels: dict[Topic, Channel] = {}
-
-    def start(self) -> None:
         """Listen, on 127.0.0.1 only. Raises `ConfigError` if foxglove-sdk is missing or the port is taken."""
         try:
             import foxglove
@@ -134,14 +127,16 @@ class LiveView:
             raise ConfigError("--live", "", "needs foxglove-sdk: pip install 'brushloop[live]'") from None
         # Otherwise a viewer that disconnects would cause log lines across the operator's screen.
         foxglove.set_log_level("CRITICAL")
-        self._context = foxglove.Context()
+        self._context: Any = foxglove.Context()
+        self._lock = threading.Lock()
+        self._channels: dict[Topic, Channel] = {}
         try:
             # No capabilities: a viewer can only look.
-            self._server = foxglove.start_server(
-                name="brushloop", host=HOST, port=self.port, context=self._context, message_backlog_size=BACKLOG
+            self._server: Any = foxglove.start_server(
+                name="brushloop", host=HOST, port=port, context=self._context, message_backlog_size=BACKLOG
             )
         except RuntimeError as error:
-            raise ConfigError("--live", "", f"cannot listen on {HOST}:{self.port}: {error}") from None
+            raise ConfigError("--live", "", f"cannot listen on {HOST}:{port}: {error}") from None
         self.port = int(self._server.port)
 
     @property
@@ -168,9 +163,7 @@ class LiveView:
 
     def close(self) -> None:
         """End the server."""
-        if self._server is not None:
-            self._server.stop()
-            self._server = None
+        self._server.stop()
 
     def _channel(self, outgoing: Outgoing) -> Channel:
         """The channel of a topic, with the schema that files have too; it is advertised at its first message."""

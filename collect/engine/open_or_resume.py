@@ -54,7 +54,7 @@ class Opening:
     snapshots: dict[str, str]
     """Texts of the files that a new session keeps, by name."""
     live: LiveView | None = None
-    """Shows the run to viewers; it has been started."""
+    """Shows the run to viewers."""
 
     @classmethod
     def load(cls, request: CollectRequest) -> Opening:

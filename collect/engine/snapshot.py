@@ -52,11 +52,6 @@ class CellCount:
     next: bool = False
     """The next planned stroke has this condition."""
 
-    @property
-    def over(self) -> bool:
-        """Whether every planned stroke was pressed or given up."""
-        return self.done + self.left_out >= self.planned
-
 
 class Mark(StrEnum):
     """State of a paper patch that is not blank."""
