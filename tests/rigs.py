@@ -20,7 +20,7 @@ import can
 import pytest
 
 from brushloop.collect import start
-from brushloop.collect.engine.engine import Engine
+from brushloop.collect.engine.engine import Engine, engine_for
 from brushloop.collect.engine.open_or_resume import CollectRequest, Opening
 from brushloop.collect.rig import devices
 from brushloop.collect.rig.config import RigConfig
@@ -127,8 +127,8 @@ class Lab:
         """As `brushloop collect` makes it; `options` are those of a `CollectRequest`."""
         request = CollectRequest(self.folder / "rig.toml", self.folder / "protocol.toml", self.sessions, **options)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(start, "Engine", self.make)
-            self.engines.append(start.engine_for(Opening.load(request)))
+            patch.setattr("brushloop.collect.engine.engine.Engine", self.make)
+            self.engines.append(engine_for(Opening.load(request)))
         return self.engines[-1]
 
     def started(self, **options: Any) -> Engine:
@@ -351,7 +351,7 @@ def wireless_lab(folder: Path, config: SimConfig = COARSE) -> Iterator[Lab]:
         patch.setitem(RpcConnection.__init__.__kwdefaults__, "timeout_s", 1.0)  # nobody waits for a busy machine here
         patch.setattr("brushloop.collect.engine.engine.connected", rig.connected)
         patch.setattr(Engine, "new_event_loop", staticmethod(lambda: MemoryLoop(rig.time)))
-        patch.setattr(start, "HostClock", lambda: rig.time)
+        patch.setattr("brushloop.collect.engine.engine.HostClock", lambda: rig.time)
         patch.setattr(start, "REFRESH_S", 0.01)
         lab = Lab(rig, folder, make=SteppedEngine)
         yield lab
