@@ -30,8 +30,7 @@ settings.load_profile("same")
 gc.disable()
 
 # Our command line does not change between tests: its tree of commands is built once instead of at every command.
-typer.main.get_command = functools.cache(typer.main.get_command)
-typer.testing._get_command = typer.main.get_command  # pyright: ignore[reportPrivateImportUsage]
+typer.main.get_command = typer.testing._get_command = functools.cache(typer.main.get_command)
 
 # What comes late names the load of the computer; the words that tests compare must not depend on it.
 os.getloadavg = lambda: (0.0, 0.0, 0.0)

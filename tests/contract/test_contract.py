@@ -62,19 +62,6 @@ async def on_the_way_up(arm: Enabled) -> AsyncIterator[asyncio.Task[None]]:
         await asyncio.gather(move, return_exceptions=True)
 
 
-async def test_connecting_says_who_answers(rig: RigConfig, the_only_driver: None):
-    robot = make_robot(rig, HostClock(), print)
-    with pytest.raises(NotConnected):
-        robot.latest()
-    try:
-        identity = await robot.connect()
-    finally:
-        await robot.close()
-    assert identity.device
-    assert identity.model
-    assert identity.firmware
-
-
 async def test_where_and_latest_agree_on_an_arm_at_rest(arm: AuboArcs):
     here = await assert_still(arm)
     assert_there(arm.latest().pose, here)
@@ -122,12 +109,17 @@ async def test_a_target_out_of_limits_is_refused_before_anything_is_sent(
     assert not [method for method in sent if not method.rpartition(".")[2].startswith("get")], "more than questions"
 
 
-async def test_connecting_and_closing_leaves_the_arm_where_it_is(rig: RigConfig, the_only_driver: None):
+async def test_connecting_says_who_answers_and_with_closing_leaves_the_arm_where_it_is(
+    rig: RigConfig, the_only_driver: None
+):
     poses: list[Pose] = []
     for _ in range(2):
         robot = make_robot(rig, HostClock(), print)
+        with pytest.raises(NotConnected):
+            robot.latest()
         try:
-            await robot.connect()
+            identity = await robot.connect()
+            assert all((identity.device, identity.model, identity.firmware))
             poses.append(await assert_still(robot))
         finally:
             await robot.close()
