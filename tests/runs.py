@@ -1,10 +1,9 @@
-"""Runs of an engine as a test drives them: in turns with the test where time is simulated, and waits that end."""
+"""Runs of an engine as a test drives them: step by step where time is simulated, and waits that end."""
 
 from __future__ import annotations
 
 import asyncio
 import inspect
-import threading
 import time
 from collections.abc import Callable, Coroutine
 from pathlib import Path
@@ -21,80 +20,59 @@ from tests.simulated_time import MemoryLoop, SimulatedTime
 
 PATIENCE_S = 600.0
 """Simulated time that a test waits for anything."""
-LOOK_S = 0.05
-"""Real time between two looks at whether a run is over that no longer takes turns."""
 
 _R = TypeVar("_R")
 _E = TypeVar("_E", bound=Exception)
 
 
-class Turns:
-    """A test and a run in another thread take turns: the run goes on while the test waits for it, and stands still from
-    the moment at which what the test waits for is so."""
+class SteppedEngine(Engine):
+    """An engine in the test's own thread. Its run goes on while the test waits for it, and stands still from the moment
+    at which what the test waits for is so."""
 
-    def __init__(self, time: SimulatedTime) -> None:
-        self.time = time
-        self._turn = threading.Condition()
-        self._met: Callable[[], bool] | None = None
+    def __init__(self, opening: Opening, resumes: Path | None, clock: SimulatedTime) -> None:
+        super().__init__(opening, resumes, clock)
+        self._time = clock
+        self._runner = asyncio.Runner(loop_factory=lambda: MemoryLoop(clock, self._stands_still))
+        self._whole: asyncio.Task[None] | None = None
+        self._met: Callable[[], bool] = lambda: False
         self._until_s = 0.0
-        self._error: BaseException | None = None
-        self._over = False
 
-    def idle(self) -> None:
-        """For the loop of the run, whenever all of its tasks wait: stand still while it is the test's turn."""
-        with self._turn:
-            while not self._over and (self._met is None or self._is_met(self._met)):
-                self._met = None
-                self._turn.notify_all()
-                self._turn.wait()
+    def start(self) -> None:
+        loop = self._runner.get_loop()
+        self._whole = loop.create_task(self._main())
+        self._whole.add_done_callback(lambda _: loop.stop())
 
-    def end(self) -> None:
-        """For the test: from now on the run does not stand still."""
-        with self._turn:
-            self._over = True
-            self._turn.notify_all()
+    def join(self) -> None:
+        self._outcome.result()
 
-    def wait_until(self, met: Callable[[], bool], run_is_over: Callable[[], bool]) -> bool:
-        """For the test: let the run go on until the condition is met, or the run is over.
+    def wait_until(self, met: Callable[[], bool]) -> bool:
+        """Let the run go on until the condition is met, or the run is over.
 
         False where neither is so after `PATIENCE_S`. Raises what the condition raises.
         """
-        with self._turn:
-            self._met, self._until_s, self._error = met, self.time.now_s + PATIENCE_S, None
-            self._turn.notify_all()
-            while self._met is not None and not run_is_over():
-                self._turn.wait(LOOK_S)
-            self._met = None
-        if self._error is not None:
-            raise self._error
-        return self.time.now_s <= self._until_s
+        if self._whole is not None and not self.finished:
+            self._met, self._until_s = met, self._time.now_s + PATIENCE_S
+            self._runner.get_loop().run_forever()
+            if not self._whole.done():
+                return self._time.now_s <= self._until_s
+            self._runner.close()
+            if (error := self._whole.exception()) is None:
+                self._outcome.set_result(None)
+            else:
+                self._outcome.set_exception(error)
+        return True
 
-    def _is_met(self, met: Callable[[], bool]) -> bool:
-        try:
-            return met() or self.time.now_s > self._until_s
-        except BaseException as error:
-            self._error = error
+    def _stands_still(self) -> bool:
+        if self._met() or self._time.now_s > self._until_s:
+            self._runner.get_loop().stop()
             return True
-
-
-class SteppedEngine(Engine):
-    """An engine that stands still unless its test waits for it."""
-
-    def __init__(self, opening: Opening, resumes: Path | None, clock: Any) -> None:
-        super().__init__(opening, resumes, clock)
-        self.turns = Turns(clock)
-        self._loop: MemoryLoop | None = None
-
-    def new_event_loop(self) -> asyncio.AbstractEventLoop:
-        self._loop = MemoryLoop(self.turns.time, self.turns.idle)
-        return self._loop
+        return False
 
     def meanwhile(self, work: Coroutine[Any, Any, _R]) -> _R:
         """Do this in the loop of the run, as somebody else beside it, while the run goes on."""
-        assert self._loop is not None
-        doing = asyncio.run_coroutine_threadsafe(work, self._loop)
-        self.turns.wait_until(doing.done, lambda: self.finished)
-        return doing.result(timeout=0.0)
+        doing = self._runner.get_loop().create_task(work)
+        self.wait_until(doing.done)
+        return doing.result()
 
 
 def until(engine: Engine, condition: Callable[[Snapshot], bool]) -> Snapshot:
@@ -165,13 +143,13 @@ def end(engine: Engine) -> None:
     if not engine.finished:
         engine.stop()
     if isinstance(engine, SteppedEngine):
-        engine.turns.end()
+        engine.wait_until(lambda: False)
 
 
 def _wait(engine: Engine, met: Callable[[], bool]) -> bool:
     """Wait until the condition is met or the run is over; False where neither comes in time."""
     if isinstance(engine, SteppedEngine):
-        return engine.turns.wait_until(met, lambda: engine.finished)
+        return engine.wait_until(met)
     deadline = time.monotonic() + waiting.PATIENCE_S
     while not met() and not engine.finished:
         if time.monotonic() > deadline:

@@ -46,15 +46,16 @@ class LoopClock:
 class _Jumping(selectors.SelectSelector):
     """Instead of waiting, it lets simulated time pass."""
 
-    def __init__(self, time: SimulatedTime, idle: Callable[[], None]) -> None:
+    def __init__(self, time: SimulatedTime, stands_still: Callable[[], bool]) -> None:
         super().__init__()
         self._time = time
-        self._idle = idle
+        self._stands_still = stands_still
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         ready = super().select(0.0)
         if not ready and timeout != 0.0:
-            self._idle()
+            if self._stands_still():
+                return []
             ready = super().select(None if timeout is None else 0.0)
         step_s = STEP_S
         if len(self.get_map()) > 1:  # the first is the loop's own
@@ -68,10 +69,10 @@ class _Jumping(selectors.SelectSelector):
 class SimulatedTimeLoop(asyncio.SelectorEventLoop):
     """For tests without threads and other processes, which are not waited for."""
 
-    def __init__(self, time: SimulatedTime | None = None, idle: Callable[[], None] = lambda: None) -> None:
-        """`idle` is called whenever every task waits, before time passes."""
+    def __init__(self, time: SimulatedTime | None = None, stands_still: Callable[[], bool] = lambda: False) -> None:
+        """`stands_still` is asked whenever every task waits; where it is so no time passes, and the loop is to stop."""
         self._simulated = time or SimulatedTime()
-        super().__init__(_Jumping(self._simulated, idle))
+        super().__init__(_Jumping(self._simulated, stands_still))
 
     def time(self) -> float:
         return self._simulated.now_s
@@ -81,8 +82,8 @@ class MemoryLoop(SimulatedTimeLoop):
     """Servers and their clients in this loop are connected in memory, and what a thread of an executor would do is done
     at once in the thread of the loop."""
 
-    def __init__(self, time: SimulatedTime | None = None, idle: Callable[[], None] = lambda: None) -> None:
-        super().__init__(time, idle)
+    def __init__(self, time: SimulatedTime | None = None, stands_still: Callable[[], bool] = lambda: False) -> None:
+        super().__init__(time, stands_still)
         self._servers: dict[tuple[str, int], MemoryServer] = {}
 
     def run_in_executor(self, executor: object, func: Callable[..., _R], *args: Any) -> asyncio.Future[_R]:  # type: ignore[override]
