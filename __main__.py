@@ -152,8 +152,6 @@ def sim(
     write_rig: Annotated[Path | None, typer.Option(help="Write a rig.toml for this rig, then serve it.")] = None,
     rate: Annotated[float, typer.Option(min=0.01, max=1000, help="Simulated seconds per real second.")] = 1.0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of brush, presses and noise.")] = 1,
-    arcs_port: Annotated[int, typer.Option(min=0, max=65535, help="Controller port; 0: any.")] = 0,
-    camera_port: Annotated[int, typer.Option(min=0, max=65535, help="Camera port; 0: any.")] = 0,
     fps: Annotated[float, typer.Option(min=1, max=60, help="Camera pictures per real second.")] = 8.0,
     idle_exit: Annotated[
         float, typer.Option(min=0, help="Seconds without clients after which to end; 0: never.")
@@ -182,7 +180,7 @@ def sim(
     from brushloop.drivers.sim.rig import LoopbackRig, serve
 
     if unknown is not None:
-        if write_rig is not None or brush != Path("loopback") or arcs_port or camera_port:
+        if write_rig is not None or brush != Path("loopback"):
             raise LabRefused("--unknown: can only be combined with --trap, --control, --rate and --idle-exit")
         lab = UnknownLab(unknown, None if trap is None else trap_of(trap), rate=rate)
         asyncio.run(serve(lab, say, idle_exit_s=idle_exit, control=control))
@@ -193,8 +191,6 @@ def sim(
     config = SimConfig(
         seed=seed,
         rate=rate,
-        arcs_port=arcs_port,
-        camera_port=camera_port,
         brush=pressed.brush,
         brush_name=pressed.name,
         head=pressed.quality,

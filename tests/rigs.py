@@ -12,7 +12,7 @@ import threading
 from collections.abc import AsyncGenerator, Callable, Iterator
 from concurrent.futures import Future
 from contextlib import AbstractAsyncContextManager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -34,7 +34,7 @@ from brushloop.drivers.host import Clock
 from brushloop.drivers.sim.brush.footprint import Flaw
 from brushloop.drivers.sim.config import SimConfig, Table, View
 from brushloop.drivers.sim.faults import Device
-from brushloop.drivers.sim.rig import LoopbackRig, rig_toml
+from brushloop.drivers.sim.rig import PORTS, LoopbackRig, rig_toml
 from brushloop.drivers.sim.world import SimClock
 from brushloop.sessions.journal import JOURNAL_NAME, RunState, replay
 from tests.command import brushloop
@@ -206,8 +206,6 @@ def wired_lab(folder: Path, config: SimConfig = COARSE) -> Iterator[Lab]:
 
 # Without wires
 
-PORTS = {"arcs_port": 30004, "rtde_port": 30010, "camera_port": 8080, "force_port": 29536}
-"""In memory, where nobody else has them."""
 _rigs = itertools.count()
 
 
@@ -246,7 +244,7 @@ class WirelessRig(LoopbackRig):
         self.world.clock = self.clock
 
     def toml(self) -> str:
-        return rig_toml(replace(self.config, **PORTS), self.address, "in memory")
+        return rig_toml(self.config, self.address, "in memory")
 
     @contextlib.asynccontextmanager
     async def connected(self, config: RigConfig, clock: Clock, on_notice: Callable[[str], None]) -> AsyncGenerator[Rig]:
@@ -256,7 +254,7 @@ class WirelessRig(LoopbackRig):
             patch.setattr(devices, "OpenCvCamera", lambda table, clock, _: SceneCamera(self, table, clock))
             patch.setattr(force_driver, "RoundStream", lambda *arguments: LoopRounds(self, *arguments))
             patch.setattr("serial.Serial", lambda *_, **__: MemoryLine(self))
-            for server, port in ((self.arcs, PORTS["arcs_port"]), (self.rtde, PORTS["rtde_port"])):
+            for server, port in ((self.arcs, PORTS["arcs"]), (self.rtde, PORTS["rtde"])):
                 await server.start(self.address, port)
                 stack.push_async_callback(server.stop)
             watching = asyncio.create_task(self.faults.watch(self.arcs.cabinet.safety_stop), name="faults")
@@ -348,7 +346,8 @@ def wireless_lab(folder: Path, config: SimConfig = COARSE) -> Iterator[Lab]:
     """A lab whose runs, within the block, need neither wires nor time; write its files with `coarse` or `sharp`."""
     rig = WirelessRig(config)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(RpcConnection.__init__.__kwdefaults__, "timeout_s", 1.0)  # nobody waits for a busy machine here
+        # nobody waits for a busy machine here
+        patch.setitem(RpcConnection.__init__.__kwdefaults__ or {}, "timeout_s", 1.0)
         patch.setattr("brushloop.collect.engine.engine.connected", rig.connected)
         patch.setattr(Engine, "new_event_loop", staticmethod(lambda: MemoryLoop(rig.time)))
         patch.setattr("brushloop.collect.engine.engine.HostClock", lambda: rig.time)

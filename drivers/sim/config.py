@@ -131,11 +131,6 @@ class SimConfig:
     seed: int = 1
     rate: float = 1.0
     """Simulated seconds per real second."""
-    arcs_port: int = 0
-    """0 lets the system choose."""
-    rtde_port: int = 0
-    camera_port: int = 0
-    force_port: int = 0
     home_mm: Place = (250.0, -230.0, 260.0)
     """Where the tip rests when the rig starts, in the base frame."""
     ink_device: Literal["station", "pump", "none"] = "station"

@@ -28,7 +28,7 @@ from brushloop.drivers.sim.config import View
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 from brushloop.drivers.sim.kinematics import Joints, inverse, inverted, matrix_of
 from brushloop.drivers.sim.lab_facts import CAMERA_PORTS, LIFT_MM, PICTURE_PX, PIN_TILT_DEG, Trap, draw, held, trapped
-from brushloop.drivers.sim.rig import LoopbackRig
+from brushloop.drivers.sim.rig import PORTS, LoopbackRig
 from brushloop.drivers.sim.scene import MjpegServer
 
 HAND_MM, BY_EYE_MM = 0.3, 1.0
@@ -53,7 +53,6 @@ GRIPS = (
 Each is its slant, the side toward which it slants and its turn in the picture, in degrees, and its place to the right
 and down, in shares of the picture's width and height.
 """
-ARCS_PORT, RTDE_PORT, CAN_PORT = 30004, 30010, 29536
 MOST_ROUNDS = 3.0
 """The sensor's rounds come faster with simulated time, up to this many times: what one process can send and read."""
 THINGS = (
@@ -76,27 +75,26 @@ class UnknownLab(LoopbackRig):
         clean = draw(seed, rate, picture_px)
         self.facts, self._mended = (clean, clean) if trap is None else trapped(clean, trap)
         """The lab as it is now, and once the mistake is corrected."""
-        config = self.facts.config
+        config, [other_port] = self.facts.config, {*CAMERA_PORTS} - {self.facts.camera_port}
         force_hz = config.force_hz * min(max(rate, 1.0), MOST_ROUNDS)
         super().__init__(
-            replace(config, arcs_port=ARCS_PORT, rtde_port=RTDE_PORT, force_port=CAN_PORT, force_hz=force_hz),
+            replace(config, force_hz=force_hz),
             # another address each time, so that no client of an earlier lab finds it
             f"127.{16 + seed % 200}.{os.getpid() % 250 + 1}.{secrets.randbelow(250) + 1}",
+            {**PORTS, "camera": self.facts.camera_port, "room": other_port, "older": AUBOPE_PORT},
         )
         self.streams = tuple(f"http://{self.host}:{port}/stream.mjpg" for port in CAMERA_PORTS)
         """The addresses on the stickers of the cameras."""
-        self.can_bus = f"{self.host}:{CAN_PORT}/{LOOPBACK_CHANNEL}"
+        self.can_bus = f"{self.host}:{PORTS['force']}/{LOOPBACK_CHANNEL}"
         """The gateway and bus of the force sensor."""
         self.arcs.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
         self.arcs.cabinet.payload = [self.facts.payload_kg, [0.0] * 3, [0.0] * 3, [0.0] * 6]
         self._noise = np.random.default_rng([seed, 17])
-        [other_port] = {*CAMERA_PORTS} - {config.camera_port}
-        self.servers[MjpegServer(self.world, self._wall, View(fps=5.0))] = other_port
-        self._older = LoopbackServer()
-        """The software before ARCS: its port takes connections, and answers nothing that ARCS would."""
+        self.servers["room"] = MjpegServer(self.world, self._wall, View(fps=5.0))
         if not self.facts.speaks_arcs:
-            del self.servers[self.arcs], self.servers[self.rtde]
-            self.servers[self._older] = AUBOPE_PORT
+            del self.servers["arcs"], self.servers["rtde"]
+            # the software before ARCS takes connections, and answers nothing that ARCS would
+            self.servers["older"] = LoopbackServer()
         self._trap = trap
         self._asked: Counter[str] = Counter()
         self._touches = 0
@@ -173,10 +171,10 @@ class UnknownLab(LoopbackRig):
         for ident in self._pulled:
             self.faults.take(ident)
         if not was.speaks_arcs:
-            await self._older.stop()
-            for server, port in ((self.arcs, ARCS_PORT), (self.rtde, RTDE_PORT)):
-                self.servers[server] = port
-                await server.start(self.host, port)
+            await self.servers.pop("older").stop()
+            self.servers |= {"arcs": self.arcs, "rtde": self.rtde}
+            await self.start("arcs")
+            await self.start("rtde")
         if self.facts.cabinet_tcp != was.cabinet_tcp:
             self.arcs.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
         if self.facts.config != was.config:

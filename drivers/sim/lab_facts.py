@@ -20,7 +20,6 @@ from brushloop.drivers.sim.scene import homography, mapped
 from brushloop.drivers.sim.world import tool_of
 
 CAMERA_PORTS = (8080, 8081)
-"""One of the two cameras shows the sheet."""
 PICTURE_PX = (1280, 960)
 PRINTS = ((26, 20, 12.0, 9.0), (24, 19, 12.0, 9.0), (22, 17, 14.0, 10.5), (27, 20, 12.0, 9.0))
 """Boards that fit on A3: columns, rows, square and marker in mm."""
@@ -83,6 +82,8 @@ class Facts:
     cabinet_tcp: tuple[float, ...]
     """Tool offset that somebody once typed at the pendant: x, y, z in m and three angles in rad."""
     payload_kg: float
+    camera_port: int
+    """Of the camera that shows the sheet."""
     printed_square_mm: float
     printed_marker_mm: float
     """Sizes that the line below the print states, mm."""
@@ -178,13 +179,14 @@ def _guess(rng: np.random.Generator, seed: int, rate: float, picture_px: tuple[i
     if clear is None:
         return None
     return Facts(
-        config=replace(config, home_mm=park, camera_port=camera_port),
+        config=replace(config, home_mm=park),
         pin_mm=table.to_base(*pin, float(rng.uniform(20, 60))),
         wash_mm=wash,
         park_mm=park,
         clear_mm=clear,
         cabinet_tcp=typed,
         payload_kg=payload_kg,
+        camera_port=camera_port,
         printed_square_mm=table.board_square_mm,
         printed_marker_mm=table.board_marker_mm,
     )

@@ -8,8 +8,7 @@ import functools
 import json
 import os
 import signal
-from collections.abc import AsyncGenerator, Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -29,14 +28,16 @@ TEMPLATE = Path(__file__).with_name("rig.toml.j2")
 LOOPBACK_HEAD = "# The loopback rig"
 PUMP_ML = 0.1
 """Delivery of the loopback pump, ml per revolution."""
-
-
+PORTS = {"arcs": 30004, "rtde": 30010, "camera": 8080, "force": 29536}
+"""Of a real rig, by what is served there."""
 HOST = "127.0.0.1"
 """Not configurable: no other machine may drive or watch a simulated arm by mistake."""
 
 
-def rig_toml(config: SimConfig, host: str = HOST, ink_path: str = "/dev/ttyUSB0") -> str:
-    """TOML text for devices at these addresses; a port that the configuration leaves to the system is a real one's."""
+def rig_toml(
+    config: SimConfig, host: str = HOST, ink_path: str = "/dev/ttyUSB0", ports: Mapping[str, int] = PORTS
+) -> str:
+    """TOML text for devices at these addresses."""
     from jinja2 import Environment, StrictUndefined  # slow to import
 
     environment = Environment(
@@ -48,6 +49,7 @@ def rig_toml(config: SimConfig, host: str = HOST, ink_path: str = "/dev/ttyUSB0"
         table=config.table,
         host=host,
         ink_path=ink_path,
+        ports=PORTS | {**ports},
         pump_ml=PUMP_ML,
         bus=LOOPBACK_CHANNEL,
     )
@@ -56,8 +58,11 @@ def rig_toml(config: SimConfig, host: str = HOST, ink_path: str = "/dev/ttyUSB0"
 class LoopbackRig:
     """`async with LoopbackRig(config) as rig:` serves until the block ends."""
 
-    def __init__(self, config: SimConfig, host: str = HOST) -> None:
-        """`host` is another loopback address, where one lab is to have the ports of a real one for itself."""
+    def __init__(self, config: SimConfig, host: str = HOST, ports: Mapping[str, int] | None = None) -> None:
+        """`host` is another loopback address, where one lab is to have the ports of a real one for itself.
+
+        The system chooses a port that is not in `ports`.
+        """
         self.config = config
         self.host = host
         self.world = World(config)
@@ -78,24 +83,20 @@ class LoopbackRig:
         self.scene = Scene(self.world)
         """What the camera looks at."""
         self.camera = MjpegServer(self.world, lambda tool: self.scene.render(tool), config.view, self.faults)
-        self.servers: dict[LoopbackServer, int] = {
-            self.arcs: config.arcs_port,
-            self.rtde: config.rtde_port,
-            self.camera: config.camera_port,
-        }
-        """What is served, and the port of each; 0 lets the system choose."""
+        self.servers: dict[str, LoopbackServer] = {"arcs": self.arcs, "rtde": self.rtde, "camera": self.camera}
+        self._ports = ports or {}
         if self.ink is not None:
             self.ink.next_fault = functools.partial(self.faults.kind_met, Device.INK)
         if self.force is not None:
             self.force.board.next_fault = functools.partial(self.faults.kind_met, Device.FORCE)
-            self.servers[self.force] = config.force_port
+            self.servers["force"] = self.force
         self._open = contextlib.AsyncExitStack()
 
     async def __aenter__(self) -> Self:
         async with contextlib.AsyncExitStack() as opening:
             opening.push_async_callback(self._stop)
-            for server, port in self.servers.items():
-                await server.start(self.host, port)
+            for name in self.servers:
+                await self.start(name)
             if self.force is not None:
                 await asyncio.to_thread(self.world.reaction.push_n, 1.0, 0.0)  # the first is slow
             if self.ink is not None:
@@ -108,17 +109,18 @@ class LoopbackRig:
     async def __aexit__(self, *_: object) -> None:
         await self._open.aclose()
 
+    async def start(self, name: str) -> None:
+        """Serve one of the servers."""
+        await self.servers[name].start(self.host, self._ports.get(name, 0))
+
     async def _stop(self) -> None:
-        for server in self.servers:
+        for server in self.servers.values():
             await server.stop()
 
     def toml(self) -> str:
         """A `rig.toml` for this rig, as an operator would have taught it."""
-        arcs, rtde, camera = self.arcs.port, self.rtde.port, self.camera.port
-        served = replace(self.config, arcs_port=arcs, rtde_port=rtde, camera_port=camera)
-        if self.force is not None:
-            served = replace(served, force_port=self.force.port)
-        return rig_toml(served, self.host, "" if self.ink is None else self.ink.path)
+        ports = {name: server.port for name, server in self.servers.items()}
+        return rig_toml(self.config, self.host, "" if self.ink is None else self.ink.path, ports)
 
     def labels(self, control: Path | None = None) -> list[str]:
         """What a person can read at the rig, whose control socket may be at `control`."""
@@ -154,7 +156,7 @@ class LoopbackRig:
         loop = asyncio.get_running_loop()
         since = loop.time()
         while loop.time() - since < seconds:
-            if any(server.clients for server in self.servers):
+            if any(server.clients for server in self.servers.values()):
                 since = loop.time()
             await asyncio.sleep(0.2)
 
@@ -166,14 +168,18 @@ USAGE = (
 
 
 class ControlServer(LoopbackServer):
-    """Live control of one rig: the requests are in docs/faults.md."""
+    """Live control of one rig, by requests that are in docs/faults.md: `async with ControlServer(rig, path):`.
 
-    def __init__(self, rig: LoopbackRig) -> None:
+    The socket at `path` is its owner's alone; one of a rig that has ended is replaced. Raises `SimFileError`.
+    """
+
+    def __init__(self, rig: LoopbackRig, path: Path) -> None:
         super().__init__()
         self._rig = rig
+        self._path = path
 
-    async def listen(self, path: Path) -> None:
-        """Listen at `path` for its owner alone; a socket of a rig that has ended is replaced. Raises `SimFileError`."""
+    async def __aenter__(self) -> Self:
+        path = self._path
         if path.exists() and not path.is_socket():
             raise SimFileError(path, "", "exists and is not a socket; it is not overwritten")
         with contextlib.suppress(OSError):  # nobody listens
@@ -188,6 +194,11 @@ class ControlServer(LoopbackServer):
             raise SimFileError(path, "", f"cannot listen here: {error.strerror or error}") from None
         finally:
             os.umask(mask)
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.stop()
+        self._path.unlink(missing_ok=True)
 
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer line by line."""
@@ -225,18 +236,6 @@ class ControlServer(LoopbackServer):
                 raise ValueError(USAGE)
 
 
-@contextlib.asynccontextmanager
-async def live_control(rig: LoopbackRig, path: Path) -> AsyncGenerator[None]:
-    """A control socket at `path` until the block ends. Raises `SimFileError`."""
-    server = ControlServer(rig)
-    await server.listen(path)
-    try:
-        yield
-    finally:
-        await server.stop()
-        path.unlink(missing_ok=True)
-
-
 async def serve(
     rig: LoopbackRig,
     tell: Callable[..., None],
@@ -258,7 +257,7 @@ async def serve(
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, over.set)
     loop.add_signal_handler(signal.SIGUSR1, rig.world.fresh_sheet)
-    async with rig, contextlib.nullcontext() if control is None else live_control(rig, control):
+    async with rig, contextlib.nullcontext() if control is None else ControlServer(rig, control):
         if write_rig is None:
             tell(*rig.labels(control))
         else:

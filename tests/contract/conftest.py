@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -95,7 +94,7 @@ async def rig(request: pytest.FixtureRequest) -> AsyncIterator[RigConfig]:
     await pushing.start(HOST, 0)
     try:
         path = request.getfixturevalue("tmp_path") / "rig.toml"
-        path.write_text(rig_toml(replace(config, arcs_port=server.port, rtde_port=pushing.port)), encoding="utf-8")
+        path.write_text(rig_toml(config, ports={"arcs": server.port, "rtde": pushing.port}), encoding="utf-8")
         loopback = load_rig(path)
         how = {"framing": framing, "rtde_port": pushing.port if rtde else None}
         yield loopback.model_copy(update={"robot": loopback.robot.model_copy(update=how)})

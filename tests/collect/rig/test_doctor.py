@@ -60,7 +60,7 @@ def test_a_cabinet_that_does_not_answer_ends_with_code_4(lab: Lab) -> None:
 @pytest.fixture
 def rig(tmp_path: Path) -> Path:
     path = tmp_path / "rig.toml"
-    path.write_text(rig_toml(SimConfig(arcs_port=9, rtde_port=9), ink_path="/dev/serial/by-id/usb-lab-7"))
+    path.write_text(rig_toml(SimConfig(), ink_path="/dev/serial/by-id/usb-lab-7", ports={"arcs": 9, "rtde": 9}))
     return path
 
 

@@ -36,7 +36,7 @@ NOBODY = 65534
 def path(tmp_path: Path) -> Path:
     # No other test has this address; nothing connects to it.
     path = tmp_path / "rig.toml"
-    path.write_text(rig_toml(SimConfig(arcs_port=1 + os.getpid() % 60_000)))
+    path.write_text(rig_toml(SimConfig(), ports={"arcs": 1 + os.getpid() % 60_000}))
     return path
 
 

@@ -30,7 +30,7 @@ from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.brush.spec import SimFileError
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
-from brushloop.drivers.sim.rig import HOST, ControlServer, LoopbackRig, live_control, serve
+from brushloop.drivers.sim.rig import HOST, ControlServer, LoopbackRig, serve
 from brushloop.drivers.sim.scene import MjpegServer, Scene, board
 from brushloop.drivers.sim.world import World
 from tests.command import brushloop
@@ -49,7 +49,7 @@ async def rig() -> AsyncIterator[LoopbackRig]:
 async def test_a_taken_port_leaves_no_half_a_rig():
     async with await asyncio.start_server(lambda *_: None, HOST, 0) as other:
         taken = other.sockets[0].getsockname()[1]
-        rig = LoopbackRig(replace(SMALL, camera_port=taken))
+        rig = LoopbackRig(SMALL, ports={"camera": taken})
         with pytest.raises(OSError, match="in use"):
             await rig.__aenter__()
         with pytest.raises(OSError):  # noqa: PT011 (refused)
@@ -150,7 +150,7 @@ async def ask(rig: LoopbackRig, path: Path) -> AsyncIterator[Ask]:
     async def exchange(do: object, **request: object) -> dict[str, Any]:
         return await asyncio.to_thread(ask_rig, path, {"do": do, **request})
 
-    async with live_control(rig, path):
+    async with ControlServer(rig, path):
         yield exchange
     assert not path.exists()
 
@@ -191,17 +191,17 @@ async def test_what_is_no_request_gets_one_line_and_the_next_is_answered(ask: As
 async def test_only_its_owner_can_open_it_and_no_other_file_or_rig_is_pushed_aside(rig: LoopbackRig, path: Path):
     async def refused(at: Path, words: str) -> None:
         with pytest.raises(SimFileError, match=words):
-            async with live_control(rig, at):
+            async with ControlServer(rig, at):
                 pass
 
     dead = path.with_name("dead")
-    async with live_control(rig, path):
+    async with ControlServer(rig, path):
         mode = path.stat().st_mode
         assert stat.S_ISSOCK(mode)
         assert stat.S_IMODE(mode) == 0o600
         await refused(path, "another rig listens here")
         path.rename(dead)
-    async with live_control(rig, dead):  # replaced
+    async with ControlServer(rig, dead):  # replaced
         pass
     path.write_text("mine")
     await refused(path, "exists and is not a socket")

@@ -18,9 +18,9 @@ from brushloop.drivers.geometry import from_wire
 from brushloop.drivers.loopback import FaultRefused
 from brushloop.drivers.sim.config import CORNERS
 from brushloop.drivers.sim.kinematics import forward, inverted, matrix_of, pose_of
-from brushloop.drivers.sim.lab import ARCS_PORT, LabRefused, UnknownLab
+from brushloop.drivers.sim.lab import LabRefused, UnknownLab
 from brushloop.drivers.sim.lab_facts import draw, in_picture
-from brushloop.drivers.sim.rig import live_control
+from brushloop.drivers.sim.rig import PORTS, ControlServer
 from brushloop.drivers.sim.world import tool_of
 
 SMALL_PX = (640, 480)
@@ -60,7 +60,7 @@ async def test_the_hand_brings_the_true_tip_to_the_thing():
 
 async def test_what_a_client_reads_agrees_with_the_truth_and_the_labels_tell_nothing_of_it():
     async with UnknownLab(4, rate=FAST, picture_px=SMALL_PX) as lab:
-        controller = Controller(RpcConnection(lab.host, ARCS_PORT, timeout_s=10.0))
+        controller = Controller(RpcConnection(lab.host, PORTS["arcs"], timeout_s=10.0))
         await open_arcs(controller.connection)
         [controller.robot, *_] = await controller.robot_names()
         await lab.bring("pin", 2)
@@ -118,7 +118,7 @@ def test_options_that_do_not_go_together_are_refused(arguments: tuple[str, ...],
 
 async def test_a_person_at_the_command_line_guides_the_arm(tmp_path: Path):
     lab, socket = lab_of(4), tmp_path / "lab.sock"
-    async with live_control(lab, socket):
+    async with ControlServer(lab, socket):
         said = await asyncio.to_thread(
             run, "sim", "hand", str(socket), "bring", "board-corner", "--corner", "lower left"
         )
