@@ -133,7 +133,7 @@ STRAIGHT = 0.8
 LEAN_ROOM_DEG = 0.3
 """Room for another sheet on the same table."""
 INSET_MM = 6.0
-"""Distance of the touch points from the sheet's edges: in its margin, where they cost no cell."""
+"""Distance of the touch points from the sheet's edges: in its margin, where they cost no patch."""
 
 
 class ForceStep(Step):

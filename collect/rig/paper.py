@@ -23,7 +23,7 @@ class Layout:
 
     @property
     def capacity(self) -> int:
-        """Cells on a sheet."""
+        """Patches on a sheet."""
         return self.columns * self.rows
 
 

@@ -35,7 +35,7 @@ LONGEST_LIFE_S = 120.0
 START_S, STROKE_S = 3.2, 0.9
 """How long a process takes before its first step, and for each stroke; corrected by what lives really take."""
 SAME_SPOT_MM = 10.0
-"""Cells are at least 24 mm apart."""
+"""Patches are at least 24 mm apart."""
 TOUCH_DEPTH_MM = 1.0
 """Zero touch goes no deeper; it visits its own place in every process."""
 

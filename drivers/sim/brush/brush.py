@@ -172,7 +172,7 @@ class Brush:
 
 @lru_cache(maxsize=REMEMBERED_SPINES)
 def _spine(spec: BrushSpec, depth_mm: float, tilt_deg: float) -> Descent:
-    """The way down; it depends on brush, depth and tilt only, and a protocol repeats its cells."""
+    """The way down; it depends on brush, depth and tilt only, and a protocol repeats its conditions."""
     return press_spine(_bundle(spec), depth_mm, math.radians(tilt_deg))
 
 

@@ -35,7 +35,7 @@ from tests.rigs import Lab
 from tests.runs import answer, answered_alike, ended_by, until, wait_for_end
 
 
-def test_a_split_stroke_is_pressed_again_on_a_new_cell_and_only_the_sound_one_counts(sharp_lab: Lab) -> None:
+def test_a_split_stroke_is_pressed_again_on_a_new_patch_and_only_the_sound_one_counts(sharp_lab: Lab) -> None:
     sharp_lab.rig.world.flaws[0] = (Flaw.SPLIT, 1.0)
     engine = sharp_lab.run()
 
@@ -72,7 +72,7 @@ def test_a_question_that_nobody_answered_is_asked_again_on_resume(sharp_lab: Lab
     assert len(sharp_lab.rig.world.presses) == 3
 
 
-def test_ink_on_a_cell_that_should_be_blank_is_seen_before_the_brush_is_dipped(sharp_lab: Lab) -> None:
+def test_ink_on_a_patch_that_should_be_blank_is_seen_before_the_brush_is_dipped(sharp_lab: Lab) -> None:
     world = sharp_lab.rig.world
     ink_ml = world.well.ml
     world.paper.lay(world.brush.press(13.0, 0.0, ink_load=1.0, press_seed=5), 31.0, 67.0, 0.0)

@@ -45,7 +45,7 @@ def test_a_whole_session_is_collected_as_the_protocol_says_and_merged(collected:
 
 
 @pytest.mark.parametrize("parked_before", [False, True])
-def test_stop_in_mid_press_voids_the_cell_and_the_same_command_goes_on(lab: Lab, parked_before: bool) -> None:
+def test_stop_in_mid_press_voids_the_patch_and_the_same_command_goes_on(lab: Lab, parked_before: bool) -> None:
     """Who has asked to park does not have to wait for the end of the press."""
     engine = lab.started()
     until(engine, lambda now: now.strokes_done == 1)

@@ -64,7 +64,7 @@ def test_force_and_ink_are_recorded_beside_the_poses(collected: Collected) -> No
     assert all(0.02 < peak_n < 0.5 for peak_n in peaks_n)
 
 
-def test_something_hard_under_the_brush_stops_the_arm_at_once_and_burns_the_cell(
+def test_something_hard_under_the_brush_stops_the_arm_at_once_and_burns_the_patch(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(lab.rig.world.reaction, "push_n", lambda depth_mm, _tilt_deg: 9.0 if depth_mm > 4.0 else 0.0)

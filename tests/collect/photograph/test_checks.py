@@ -36,7 +36,7 @@ from tests.calibrate.given import flat_plane
 LIMITS = QualityConfig()
 PAGE = (Path(__file__).parents[3] / "docs" / "quality.md").read_text(encoding="utf-8")
 PX = 8.0
-CELL = Patch(0, 20.0, 15.0, 40.0, 24.0)
+PATCH = Patch(0, 20.0, 15.0, 40.0, 24.0)
 Gray = NDArray[np.uint8]
 
 
@@ -112,31 +112,31 @@ def test_bare_paper_between_wide_marks_is_not_glare(width_mm: float) -> None:
 
 
 def test_a_sound_mark_passes_and_its_place_is_measured() -> None:
-    anchor = CELL.anchor_mm
+    anchor = PATCH.anchor_mm
     image = stroke(paper(), anchor[0] + 0.7, anchor[1])
-    verdict = check_capture(image, plane(), CELL, depth_mm=14.0, limits=LIMITS, previous=paper(seed=1))
+    verdict = check_capture(image, plane(), PATCH, depth_mm=14.0, limits=LIMITS, previous=paper(seed=1))
     assert verdict.passed, verdict.reason
     moved = stroke(paper(), anchor[0] + 0.7, anchor[1] + 3.0)
-    verdict = check_capture(moved, plane(), CELL, depth_mm=14.0, limits=LIMITS, previous=paper(seed=1))
+    verdict = check_capture(moved, plane(), PATCH, depth_mm=14.0, limits=LIMITS, previous=paper(seed=1))
     assert verdict.cause is not None
     assert verdict.cause.name == Failure.MISPLACED
     assert verdict.cause.score == pytest.approx(3.0, abs=0.2)
 
 
 def test_a_brush_that_lies_down_the_other_way_is_sound_too() -> None:
-    anchor = CELL.anchor_mm
+    anchor = PATCH.anchor_mm
     image = stroke(paper(), anchor[0] - 0.7 + 9.0, anchor[1], length_mm=9.0)
-    assert check_capture(image, plane(), CELL, depth_mm=11.0, limits=LIMITS).passed
+    assert check_capture(image, plane(), PATCH, depth_mm=11.0, limits=LIMITS).passed
 
 
-def test_a_press_in_another_cell_is_misplaced_and_not_blank_where_the_still_before_is_known() -> None:
+def test_a_press_in_another_patch_is_misplaced_and_not_blank_where_the_still_before_is_known() -> None:
     before = stroke(paper(seed=1), 50.0, 8.0)
     image = stroke(stroke(paper(), 50.0, 8.0), 50.0, 48.0)
-    verdict = check_capture(image, plane(), CELL, depth_mm=14.0, limits=LIMITS, previous=before, sheet_mm=(80.0, 60.0))
+    verdict = check_capture(image, plane(), PATCH, depth_mm=14.0, limits=LIMITS, previous=before, sheet_mm=(80.0, 60.0))
     assert verdict.cause is not None
     assert verdict.cause.name == Failure.MISPLACED
     assert verdict.cause.score == pytest.approx(18.0, abs=1.0)
-    alone = check_capture(image, plane(), CELL, depth_mm=14.0, limits=LIMITS, sheet_mm=(80.0, 60.0))
+    alone = check_capture(image, plane(), PATCH, depth_mm=14.0, limits=LIMITS, sheet_mm=(80.0, 60.0))
     assert alone.cause is not None
     assert alone.cause.name == Failure.BLANK
 
@@ -150,10 +150,10 @@ def test_a_mark_at_the_edge_of_the_frame_is_cut_and_nothing_else_is_said_of_it()
     assert all(Failure(check.name).of_picture for check in verdict.checks)
 
 
-def test_a_figure_is_sound_where_its_cell_has_new_ink_and_blank_where_it_has_none() -> None:
+def test_a_figure_is_sound_where_its_patch_has_new_ink_and_blank_where_it_has_none() -> None:
     before = stroke(paper(seed=1), 50.0, 27.0)
     drawn = stroke(stroke(paper(), 50.0, 27.0), 52.0, 22.0)
-    judge = partial(check_drawing, plane=plane(), patch=CELL, depth_mm=5.0, limits=LIMITS)
+    judge = partial(check_drawing, plane=plane(), patch=PATCH, depth_mm=5.0, limits=LIMITS)
     assert judge(drawn, previous=before).passed
     late = judge(stroke(paper(), 50.0, 27.0), previous=before)
     assert late.cause is not None
@@ -169,17 +169,17 @@ def test_a_figure_is_sound_where_its_cell_has_new_ink_and_blank_where_it_has_non
     assert dark.cause.name == Failure.EXPOSURE
 
 
-def test_a_cell_that_is_not_wholly_seen_is_not_called_blank() -> None:
+def test_a_patch_that_is_not_wholly_seen_is_not_called_blank() -> None:
     hidden = patch_is_blank(paper(), plane(), Patch(3, -10.0, 15.0, 40.0, 24.0), limits=LIMITS)
     assert not hidden.passed
     assert "not completely in the picture" in hidden.reason
-    inked = patch_is_blank(stroke(paper(), 50.0, 27.0), plane(), CELL, limits=LIMITS)
+    inked = patch_is_blank(stroke(paper(), 50.0, 27.0), plane(), PATCH, limits=LIMITS)
     assert not inked.passed
     assert "Patch 0 is not blank" in inked.reason
-    assert patch_is_blank(paper(), plane(), CELL, limits=LIMITS).passed
+    assert patch_is_blank(paper(), plane(), PATCH, limits=LIMITS).passed
 
 
-def test_the_edge_of_a_sheet_is_no_ink_in_the_cells_along_it() -> None:
+def test_the_edge_of_a_sheet_is_no_ink_in_the_patches_along_it() -> None:
     patch, sheet_mm = Patch(0, 20.0, 36.0, 40.0, 24.0), (80.0, 60.0)
     seen = paper()
     seen[: round(0.8 * PX)] = 20  # the dark table, where the sheet was thought to reach

@@ -60,7 +60,7 @@ def test_a_sound_stroke_is_left_alone(scores: Score) -> None:
     assert scores.false_alarms == 0.0, scores.confused(None)
 
 
-def test_a_cell_is_called_blank_only_where_it_is(scores: Score) -> None:
+def test_a_patch_is_called_blank_only_where_it_is(scores: Score) -> None:
     assert scores.blanks_seen[True, False] == 0
     assert scores.blanks_seen[False, True] == 0
     assert scores.blanks_seen[False, False] >= SOUND

@@ -76,7 +76,7 @@ def test_every_example_passes_and_is_walked(tmp_path: Path) -> None:
         assert make_plan(config, wanted).seconds > 10.0
 
 
-def test_figures_take_cells_of_their_own_size_and_dip_between_strokes(tmp_path: Path) -> None:
+def test_figures_take_patches_of_their_own_size_and_dip_between_strokes(tmp_path: Path) -> None:
     plan = make_plan(rig(tmp_path), example("protocol-write.toml"))
     assert (plan.patches_per_sheet, plan.dips, plan.steps["dip"]) == (6, 4, 2)
 
@@ -142,7 +142,7 @@ def test_what_cannot_be_done_is_named_before_anything_is_connected(
         check_protocol(tmp_path / "rig.toml", tmp_path / "protocol.toml", config, protocol(tmp_path, text))
 
 
-def test_the_outermost_cells_stand_for_all(tmp_path: Path) -> None:
+def test_the_outermost_patches_stand_for_all(tmp_path: Path) -> None:
     config, wanted, plane = rig(tmp_path), example("protocol.toml"), PaperPlane(120.0, 0.01, -0.02)
     corners = [pose for pose, _, _ in all_poses(config, wanted, plane)]
     everywhere = [pose for pose, _, _ in all_poses(config, wanted, plane, every_patch=True)]
@@ -193,7 +193,7 @@ def test_the_ink_of_a_plan_is_what_a_pump_doses(tmp_path: Path) -> None:
     assert make_plan(rig(tmp_path), wanted).ink_ml is None
 
 
-def test_a_self_check_takes_a_cell_before_the_first_stroke(tmp_path: Path) -> None:
+def test_a_self_check_takes_a_patch_before_the_first_stroke(tmp_path: Path) -> None:
     config = rig(tmp_path, "[motion]", "[self_check]\nenabled = true\n\n[motion]")
     check_protocol(tmp_path / "rig.toml", EXAMPLES / "protocol.toml", config, example("protocol.toml"))
     plan = make_plan(config, example("protocol.toml"))

@@ -255,7 +255,7 @@ def paper(**changes: object) -> PaperConfig:
     return PaperConfig.model_validate(values | changes)
 
 
-def test_cells_tile_the_sheet_without_overlap() -> None:
+def test_patches_tile_the_sheet_without_overlap() -> None:
     sheet = Sheet(paper())
     assert (sheet.columns, sheet.rows, sheet.capacity) == (6, 7, 42)
     corners = {sheet.patch(i).rect_mm[:2] for i in range(sheet.capacity)}

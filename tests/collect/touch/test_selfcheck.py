@@ -152,7 +152,7 @@ def paper(size_x_mm: float, size_y_mm: float) -> PaperConfig:
     return PaperConfig(origin_mm=(0.0, 0.0), touch_z_mm=120.0, size_mm=(size_x_mm, size_y_mm))
 
 
-def test_a_sheet_with_room_is_checked_over_three_corners_and_a_small_one_in_one_cell() -> None:
+def test_a_sheet_with_room_is_checked_over_three_corners_and_a_small_one_in_one_patch() -> None:
     sheet = Sheet(paper(244.0, 172.0))
     first = sheet.patch(0)
     wide = partners(sheet, first, {0})
@@ -167,7 +167,7 @@ def test_a_sheet_with_room_is_checked_over_three_corners_and_a_small_one_in_one_
 
 
 @given(width=st.floats(40.0, 600.0), height=st.floats(24.0, 600.0), used=st.sets(st.integers(0, 60)))
-def test_a_wide_triangle_is_always_uneven_wide_and_on_free_cells(width: float, height: float, used: set[int]) -> None:
+def test_a_wide_triangle_is_always_uneven_wide_and_on_free_patches(width: float, height: float, used: set[int]) -> None:
     sheet = Sheet(paper(width, height))
     patch = sheet.patch(0)
     if wide := partners(sheet, patch, used):
@@ -185,7 +185,7 @@ def whole_sheet(make_bench: MakeBench) -> tuple[Bench, Triangle]:
     return bench, triangle((sheet.patch(0), *partners(sheet, sheet.patch(0), set())))
 
 
-async def test_a_camera_that_is_2_percent_wrong_is_seen_over_three_corners_but_not_in_one_cell(
+async def test_a_camera_that_is_2_percent_wrong_is_seen_over_three_corners_but_not_in_one_patch(
     make_bench: MakeBench,
 ) -> None:
     bench, places = whole_sheet(make_bench)

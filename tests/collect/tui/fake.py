@@ -265,7 +265,7 @@ def captured(stroke_id: str, still: int, waited_s: float | None = None, verdict:
 
 
 class FakeReview(Review):
-    """Three captures of one cell, one of them marked bad."""
+    """Three captures of one condition, one of them marked bad."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder / "2026-11-21-grid-01"
