@@ -62,13 +62,9 @@ class Demo:
     """Collect, calibrate, press again, write if asked, and validate, all under `out`."""
 
     def __init__(self, request: DemoRequest, size: Size) -> None:
-        self._out, self._repeats, self._seed = request.out, request.repeats, request.seed
-        self._size, self._verbose = size, request.verbose
-        self._config, self._protocol = self._out / "rig.toml", self._out / "protocol.toml"
-        self._sessions = self._out / "sessions"
-        options = {"rate": request.rate, "seed": request.seed, "brush": request.brush, "fps": FPS}
-        options |= {"idle-exit": IDLE_EXIT_S}
-        self._options = [word for name, value in options.items() for word in (f"--{name}", str(value))]
+        self._request, self._size = request, size
+        self._config, self._protocol = request.out / "rig.toml", request.out / "protocol.toml"
+        self._sessions = request.out / "sessions"
         self._rig: LoopbackRig | None = None
         self._session: Path
         """What the first step collects, for every later step."""
@@ -83,14 +79,11 @@ class Demo:
         A session without a report is continued; a new one is started only when the last one has its report. Raises
         `ConfigError`, `SessionError`, `CollectAborted`, and at the end `StrokesLeftOut` if some were left out.
         """
-        self._out.mkdir(parents=True, exist_ok=True)
-        size = self._size
-        protocol = (
-            f'kind = "grid"\ndepths_mm = {list(size.depths_mm)}\ntilts_deg = {list(size.tilts_deg)}\n'
-            f"repeats = {self._repeats}\nseed = {self._seed}\n"
-        )
-        self._protocol.write_text(protocol, encoding="utf-8")
-        presses = len(size.depths_mm) * len(size.tilts_deg) * self._repeats
+        asked, size = self._request, self._size
+        asked.out.mkdir(parents=True, exist_ok=True)
+        grid = f'kind = "grid"\ndepths_mm = {list(size.depths_mm)}\ntilts_deg = {list(size.tilts_deg)}\n'
+        self._protocol.write_text(f"{grid}repeats = {asked.repeats}\nseed = {asked.seed}\n", encoding="utf-8")
+        presses = len(size.depths_mm) * len(size.tilts_deg) * asked.repeats
         write = [(f"write {CHARACTER} {size.writings} times", self._write)] if size.writings else []
         # Title of each step, and what does the part of it that is not done yet.
         steps = [
@@ -106,7 +99,7 @@ class Demo:
             for number, (title, run) in enumerate(steps, 1):
                 say(f"[{number}/{len(steps)}] {title} ...")
                 step_began_s = time.monotonic()
-                with nullcontext() if self._verbose else _logged(self._out / LOG):
+                with nullcontext() if asked.verbose else _logged(asked.out / LOG):
                     run()
                 say(f"  ✓   {time.monotonic() - step_began_s:.0f} s")
         finally:
@@ -135,7 +128,11 @@ class Demo:
         if self._rig is None:
             say("the loopback rig starts in the background; its log is rig.log")
             self._config.unlink(missing_ok=True)  # the rig writes its own
-            self._rig = start(self._config, self._out / "rig.log", *self._options, detached=True)
+            asked = self._request
+            options = {"rate": asked.rate, "seed": asked.seed, "brush": asked.brush}
+            options |= {"fps": FPS, "idle-exit": IDLE_EXIT_S}
+            words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
+            self._rig = start(self._config, asked.out / "rig.log", *words, detached=True)
         return self._rig
 
     def _collect(self) -> None:
@@ -160,7 +157,7 @@ class Demo:
         if (folder / LOOP_PAGE).is_file():
             return
         self._blank_sheet(folder / REPLAY)
-        presses, seed = self._size.again, self._seed
+        presses, seed = self._size.again, self._request.seed
         run_loop(LoopRequest(self._session, self._config, folder, presses=presses, seed=seed, sheet=1, tui=False))
 
     def _write(self) -> None:

@@ -60,7 +60,7 @@ def run_loop(request: LoopRequest) -> Path:
         repeats=request.repeats,
         seed=request.seed,
     )
-    keep_settings(settings, out)
+    keep_settings(settings, begun, out)
     if not (out / PROTOCOL).exists():  # it is written last: where it exists, this stage is done
         from brushloop.calibrate.recover import recover  # slow to import
 
@@ -116,12 +116,8 @@ def begun_with(folder: Path) -> Settings | None:
         raise ConfigError(path, "", "does not hold the settings of a loop: use another --out") from None
 
 
-def keep_settings(settings: Settings, folder: Path) -> None:
-    """Write the settings of a new loop, or check that they are those it was begun with.
-
-    Raises `ConfigError` and OSError.
-    """
-    begun = begun_with(folder)
+def keep_settings(settings: Settings, begun: Settings | None, folder: Path) -> None:
+    """Write the settings of a new loop, or check that they are those it was begun with. Raises `ConfigError`."""
     if begun is None:
         folder.mkdir(parents=True, exist_ok=True)
         write_whole(folder / SETTINGS, settings.model_dump_json(indent=2) + "\n")

@@ -166,16 +166,14 @@ SETTINGS = Settings(
 
 def test_a_loop_goes_on_with_what_it_was_begun_with_and_nothing_else(tmp_path: Path) -> None:
     folder = tmp_path / "loop"
-    assert begun_with(folder) is None
-    keep_settings(SETTINGS, folder)
-    keep_settings(SETTINGS, folder)
-    assert begun_with(folder) == SETTINGS
+    keep_settings(SETTINGS, begun_with(folder), folder)
+    keep_settings(SETTINGS, begun_with(folder), folder)
     for name, value in (("fit", "ef"), ("original_sha256", "xy"), ("depth_range_mm", (2.0, 20.0)), ("presses", 5)):
         with pytest.raises(ConfigError, match=f"{name}: this loop was begun with"):
-            keep_settings(SETTINGS.model_copy(update={name: value}), folder)
+            keep_settings(SETTINGS.model_copy(update={name: value}), SETTINGS, folder)
     (folder / FILE).write_text("{}")
     with pytest.raises(ConfigError, match="does not hold the settings of a loop"):
-        keep_settings(SETTINGS, folder)
+        begun_with(folder)
 
 
 def test_a_fit_that_does_not_describe_the_brush_is_not_pressed(tmp_path: Path) -> None:
