@@ -29,7 +29,7 @@ from brushloop.calibrate.files import replacing
 from brushloop.collect.errors import ConfigError, NotAccepted, StepError
 from brushloop.collect.operator import Asker, Choice, Prompt
 from brushloop.collect.rig.check import Check, unmeasured
-from brushloop.collect.rig.config import RigConfig, with_optics
+from brushloop.collect.rig.config import RigConfig, rig_from
 from brushloop.collect.rig.config_file import Config, Finite, read_text, refusal
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.host import Clock
@@ -167,11 +167,7 @@ def gaps(notebook: Notebook) -> Iterator[Check]:
 
 def rig_of(notebook: Notebook, rig_path: Path) -> RigConfig:
     """The configuration that the notebook gives, without overrides from the environment. Raises `ConfigError`."""
-    try:
-        rig = RigConfig.model_validate(tomllib.loads(rig_text(notebook, rig_path)))
-    except ValidationError as error:
-        raise refusal(rig_path, error, RigConfig) from None
-    return rig.model_copy(update={"camera": with_optics(rig_path, rig.camera)})
+    return rig_from(rig_path, tomllib.loads(rig_text(notebook, rig_path)))
 
 
 def rig_text(notebook: Notebook, rig_path: Path) -> str:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
@@ -368,19 +369,21 @@ def load_rig(path: Path) -> RigConfig:
         raise ConfigError(path, "", "is a protocol, not a rig: give it to --protocol, and the rig to --config")
     for field, name in environment.items():
         _override(values, field, name)
+    return rig_from(path, values, environment)
+
+
+def rig_from(path: Path, values: dict[str, Any], environment: Mapping[tuple[str, ...], str] | None = None) -> RigConfig:
+    """The rig that these tables describe, with the lens in a file beside `path`. Raises `ConfigError`.
+
+    `environment` maps the path of each value that the environment sets to its variable.
+    """
     try:
         rig = RigConfig.model_validate(values)
+        if (lens_file := rig.camera.lens_file) is None:
+            return rig
+        optics = read_lens(path.parent / lens_file)
     except ValidationError as error:
         raise refusal(path, error, RigConfig, environment=environment) from None
-    return rig.model_copy(update={"camera": with_optics(path, rig.camera)})
-
-
-def with_optics(rig_path: Path, camera: CameraConfig) -> CameraConfig:
-    """The same camera with its lens, read from a file beside `rig.toml`. Raises `ConfigError`."""
-    if camera.lens_file is None:
-        return camera
-    try:
-        optics = read_lens(rig_path.parent / camera.lens_file)
     except CalibrationError as error:
-        raise ConfigError(rig_path, "camera.lens_file", str(error)) from None
-    return camera.model_copy(update={"optics": optics})
+        raise ConfigError(path, "camera.lens_file", str(error)) from None
+    return rig.model_copy(update={"camera": rig.camera.model_copy(update={"optics": optics})})

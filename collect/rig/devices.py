@@ -54,25 +54,17 @@ def make_robot(config: RigConfig, clock: Clock, on_notice: Callable[[str], None]
     return AuboArcs(config.robot, limits_of(config), clock, on_notice)
 
 
-def _resolved(host: str) -> str:
-    """The address of a host, so that two names of one arm count as one arm."""
-    try:
-        return socket.gethostbyname(host)
-    except OSError:
-        return host
-
-
 @contextlib.contextmanager
 def sole_driver(host: str, port: int) -> Generator[None]:
     """Reserve the arm at this address against other processes of this machine, of any user. Raises `ConfigError`."""
-    address = f"{_resolved(host)}:{port}"
-    with contextlib.ExitStack() as stack:
-        try:
-            stack.enter_context(claimed(f"brushloop-arm-{hashlib.sha256(address.encode()).hexdigest()[:16]}"))
-        except Claimed as who:
-            what = f"another brushloop is driving the arm at {address}: {who}"
-            raise ConfigError("rig.toml", "robot", what) from None
-        yield
+    with contextlib.suppress(OSError):
+        host = socket.gethostbyname(host)  # two names of one arm are one arm
+    address = f"{host}:{port}"
+    try:
+        with claimed(f"brushloop-arm-{hashlib.sha256(address.encode()).hexdigest()[:16]}"):
+            yield
+    except Claimed as who:
+        raise ConfigError("rig.toml", "robot", f"another brushloop is driving the arm at {address}: {who}") from None
 
 
 @contextlib.asynccontextmanager

@@ -302,11 +302,7 @@ def write_archive(path: Path, known: dict[str, Any], files: dict[str, str]) -> N
     report = {
         "format": 1,
         "versions": _versions(),
-        "platform": {
-            "system": platform.platform(),
-            "python": platform.python_version(),
-            "cores": os.cpu_count(),
-        },
+        "platform": {"system": platform.platform(), "python": platform.python_version(), "cores": os.cpu_count()},
         **known,
     }
     texts = {"README.txt": ABOUT, "report.json": json.dumps(report, indent=2), **files}
