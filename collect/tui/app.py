@@ -41,6 +41,8 @@ NOT_PARKED = yes_or_no(
 UNSEEN = yes_or_no(f"{NOT_AT_REST} Leave this screen anyway?", "leave it as it is", "stay")
 COMMANDS = {"f": ("sessions", "verify"), "c": ("calibrate",), "t": ("fit",), "w": ("validate",)}
 """What can be done with a session on which no run is in progress, in the order in which it is done."""
+NO_RUN = Snapshot(state=State.DONE)
+"""What is shown before the first run of a day and between two of them."""
 LOOK, BACK = Choice("v", "look through the captures"), Choice("q", "back")
 
 
@@ -67,7 +69,7 @@ class OperatorApp(PlainApp):
         """Whether the app is to end soon, whatever the state; may be set by any thread."""
         self._browser = browser
         self._again = again
-        self._now: Snapshot | None = None if engine is None else engine.snapshot()
+        self._now = NO_RUN if engine is None else engine.snapshot()
         self._main: RunScreen | None = None
         self._leave_when_over = False
 
@@ -83,18 +85,17 @@ class OperatorApp(PlainApp):
     @property
     def at_work(self) -> bool:
         """Whether a run is in progress."""
-        return self._now is not None and self._now.state not in FINAL
+        return self._now.state not in FINAL
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
         """Disable the keys that would do nothing now."""
-        now = self._now
         match action:
             case "stop":
                 return self.at_work
             case "begin_again":
-                return now is not None and now.state in (State.STOPPED, State.FAILED) and bool(now.folder)
+                return self._now.state in (State.STOPPED, State.FAILED) and bool(self._now.folder)
             case "review":
-                return now is not None and bool(now.folder)
+                return bool(self._now.folder)
             case _:
                 return super().check_action(action, parameters)
 
@@ -106,8 +107,7 @@ class OperatorApp(PlainApp):
 
     def action_review(self) -> None:
         """Look through the captures of the run that is shown."""
-        if self._now is not None and self._now.folder and self.screen is self._main:
-            self.review(Path(self._now.folder))
+        self.review(Path(self._now.folder))
 
     def review(self, folder: Path) -> None:
         """Look through the captures of a session."""
@@ -123,15 +123,14 @@ class OperatorApp(PlainApp):
 
     def action_begin_again(self) -> None:
         """Resume the session of a run that ended before its time: the engine asks first."""
-        if self._now is not None and self.screen is self._main:
-            self.begin(partial(self._again, Path(self._now.folder).name))
+        self.begin(partial(self._again, Path(self._now.folder).name))
 
     async def action_quit(self) -> None:
         """Leave; ask first if the arm is not parked."""
         now = self._now
         if isinstance(self.screen, AskScreen) and self.screen.own:
             return
-        if now is None:
+        if self._main is None:
             self.exit()
         elif now.state is State.STOPPING:
             self.notify("The arm is being stopped. Press the red button if it keeps moving.", severity="warning")
@@ -159,9 +158,9 @@ class OperatorApp(PlainApp):
             return
         while len(self.screen_stack) > 2:
             self.pop_screen()
-        if self._now is not None and self._now.rest_unknown and isinstance(self.screen, StartScreen):
+        if self._now.rest_unknown and isinstance(self.screen, StartScreen):
             self.screen.show_trouble(NOT_AT_REST)
-        self._main = self._now = None
+        self._main, self._now = None, NO_RUN
         self._leave_when_over = False
 
     @work(exclusive=True, group="begin")
@@ -203,12 +202,12 @@ class OperatorApp(PlainApp):
             return  # the timer may tick once more while the app closes, when it has no screens left
         if self.leaving:
             self.exit()
-        if self.engine is None or self._now is None:
+        if self.engine is None or self._main is None:
             return
         before, self._now = self._now, self.engine.snapshot()
-        if self._main is not None and self._main.is_mounted:
+        if self._main.is_mounted:
             self._main.show(self._now)
-        self._ask(self._now)
+        self._ask(self.engine, self._main, self._now)
         keys_depend_on = [(now.state, now.last is None, bool(now.folder)) for now in (before, self._now)]
         if keys_depend_on[0] != keys_depend_on[1]:
             self.refresh_bindings()
@@ -239,7 +238,7 @@ class OperatorApp(PlainApp):
         choices = [*([LOOK] if self.screen is self._main else []), *choices, BACK]
         self.push_screen(AskScreen(Prompt(f"What comes next with {folder}?", tuple(choices), BACK.key)), answered)
 
-    def _ask(self, now: Snapshot) -> None:
+    def _ask(self, engine: Engine, run: RunScreen, now: Snapshot) -> None:
         """Show the engine's question, and take it away once it is answered."""
         prompt = now.prompt
         shown = next((screen for screen in self.screen_stack if isinstance(screen, AskScreen) and not screen.own), None)
@@ -248,10 +247,9 @@ class OperatorApp(PlainApp):
             return
         if shown is not None and shown is self.screen:
             self.pop_screen()
-            if self._main is not None:
-                self._main.answered()
-        if prompt is not None and self.engine is not None and not isinstance(self.screen, AskScreen):
-            self.push_screen(AskScreen(prompt, partial(self.engine.answer, prompt.number)))
+            run.answered()
+        if prompt is not None and not isinstance(self.screen, AskScreen):
+            self.push_screen(AskScreen(prompt, partial(engine.answer, prompt.number)))
 
 
 class ScreenCrashed(Exception):

@@ -39,7 +39,6 @@ from brushloop.collect.tui.widgets import (
     Newest,
     app_of,
     condition_text,
-    entitle,
     labelled,
     one_line,
     plain,
@@ -155,7 +154,9 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
         self._grid = DataTable[Text](id="grid", classes="pane", show_cursor=False)
         self._grid.can_focus = False
         self._grid.border_title = "Strokes done/planned by depth H and tilt α"
+        self._why_pane.border_title = "Why it ended"
         self._sheet = Line("sheet", classes="pane")
+        self._sheet.show(Content.styled("no sheet yet", "dim"))
         self._log, self._log_pane = Line("log"), Newest(id="log-pane", classes="pane")
         self._log_pane.border_title = "Log"
         self._capture, self._words = Vertical(id="capture", classes="pane"), Line("capture-words")
@@ -266,13 +267,12 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
         elif now.picture is not None and self._camera.display:
             self._camera.show(now.picture.image)
         self.set_class(bool(now.error), "-wrong")
-        entitle(self._why_pane, "Why it failed" if now.state is State.FAILED else "Why it stopped")
         self._why.show(plain(now.error))
         if now.grid != before.grid:
             fill_grid(self._grid, now.grid)
-        self._sheet.show(sheet_content(now.sheet))
-        if now.sheet is not None:
-            entitle(self._sheet, f"Sheet {now.sheet.number}: {now.sheet.marks.count(None)} free")
+        if now.sheet is not None and now.sheet != before.sheet:
+            self._sheet.show(sheet_content(now.sheet))
+            self._sheet.border_title = f"Sheet {now.sheet.number}: {now.sheet.marks.count(None)} free"
         if now.messages != before.messages:
             self._log.show(Content("\n").join(_message_content(line) for line in now.messages[-LOG_LINES:]))
         if now.last is not None and now.last is not before.last:
@@ -381,10 +381,8 @@ def cell_text(cell: CellCount | None) -> Text:
     return Text(f"{cell.done}/{cell.planned} {sign}", "" if cell.done and not sign else GRID_STYLES[sign])
 
 
-def sheet_content(sheet: SheetMap | None) -> Content:
+def sheet_content(sheet: SheetMap) -> Content:
     """A sign for what became of each patch, in rows from the far edge, as the camera sees the sheet."""
-    if sheet is None:
-        return Content.styled("no sheet yet", "dim")
     signs = [Content.styled(*SHEET_SIGNS[mark]) for mark in sheet.marks]
     rows = (signs[at : at + sheet.columns] for at in range(0, len(signs), sheet.columns))
     return Content("\n").join(Content(" ").join(row) for row in rows)

@@ -13,7 +13,6 @@ from textual.content import Content
 from textual.dom import DOMNode
 from textual.screen import ModalScreen
 from textual.signal import Signal
-from textual.widget import Widget
 from textual.widgets import Footer, Input, OptionList, Static
 from textual.widgets.option_list import Option
 
@@ -95,12 +94,6 @@ class Rows(OptionList):
         self.add_options(Option(row) for row in rows)
         if self.option_count:
             self.highlighted = min(at, self.option_count - 1)
-
-
-def entitle(widget: Widget, title: str) -> None:
-    """Set the title in a widget's border, if it is new: textual draws the whole widget again."""
-    if widget.border_title != title:
-        widget.border_title = title
 
 
 def plain(text: str) -> str:
