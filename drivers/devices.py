@@ -48,11 +48,13 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class QueuedLine:
-    """A straight line to `target`, from rest to rest, that takes `least_s` or longer."""
+    """A straight line to `target`, from rest, that takes `least_s` or longer."""
 
     target: Pose
     speed_mm_s: float
     least_s: float = 0.0
+    blend_mm: float = 0.0
+    """How far before its end the next line may begin; at 0 the arm halts there."""
 
 
 @dataclass(frozen=True, slots=True)

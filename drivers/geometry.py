@@ -95,12 +95,6 @@ def vector(q: Quaternion) -> Vector:
     return share * x, share * y, share * z
 
 
-def angle_rad(q: Quaternion) -> float:
-    """The angle of the rotation, 0 to pi."""
-    x, y, z, w = q
-    return 2.0 * math.atan2(math.sqrt(x * x + y * y + z * z), abs(w))
-
-
 def of_angles(rx: float, ry: float, rz: float) -> Quaternion:
     """Rz(rz) Ry(ry) Rx(rx), angles in rad."""
     about_x, about_y, about_z = of_vector((rx, 0.0, 0.0)), of_vector((0.0, ry, 0.0)), of_vector((0.0, 0.0, rz))
@@ -158,8 +152,9 @@ def from_wire(values: list[float]) -> Pose:
 
 def distance(a: Pose, b: Pose) -> tuple[float, float]:
     """(translation in mm, rotation in deg) from a to b."""
-    translation_mm = math.dist(a.position_mm, b.position_mm)
-    return translation_mm, math.degrees(angle_rad(_turn(a, b)))
+    x, y, z, w = _turn(a, b)
+    angle = 2.0 * math.atan2(math.sqrt(x * x + y * y + z * z), abs(w))
+    return math.dist(a.position_mm, b.position_mm), math.degrees(angle)
 
 
 def interpolate(a: Pose, b: Pose, s: float) -> Pose:

@@ -41,8 +41,6 @@ class LoopbackRig:
 
     config: Path
     """Its rig.toml."""
-    folder: Path
-    """Where it lies, with the rig's log."""
     process: subprocess.Popen[bytes]
 
     def fresh_sheet(self) -> None:
@@ -65,7 +63,7 @@ def start(config: Path, log: Path, *options: str, detached: bool = False) -> Loo
         process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=file, stderr=file, start_new_session=detached
         )
-    rig = LoopbackRig(config, log.parent, process)
+    rig = LoopbackRig(config, process)
     deadline = time.monotonic() + START_S
     while not config.exists():
         if process.poll() is not None or time.monotonic() > deadline:

@@ -16,7 +16,7 @@ import contextlib
 import itertools
 import math
 from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 from brushloop.drivers.arcs.controller import Controller, ReturnCode
 from brushloop.drivers.arcs.wire import DEVICE
@@ -87,15 +87,16 @@ async def until_settled(
         await asyncio.sleep(POLL_S)
 
 
-def planned_s(start: Pose, target: Pose, speed_mm_s: float, acc_mm_s2: float) -> float:
-    """Upper estimate of a move's duration: the line at speed plus one ramp, or the turn at half a radian per second.
+def planned_s(start: Pose, line: QueuedLine, acc_mm_s2: float) -> float:
+    """Upper estimate of a line's duration: at its speed plus one ramp, or the turn at half a radian per second.
 
     If the tip moves less than a millimetre, ARCS reads m/s as rad/s.
     """
-    translation_mm, rotation_deg = distance(start, target)
+    translation_mm, rotation_deg = distance(start, line.target)
+    speed_mm_s = line.speed_mm_s
     ramp_s = speed_mm_s / acc_mm_s2
     turn_s = math.radians(rotation_deg) / (speed_mm_s / 1e3) if translation_mm < 1.0 else rotation_deg / 30.0
-    return max(translation_mm / speed_mm_s, turn_s) + ramp_s
+    return max(max(translation_mm / speed_mm_s, turn_s) + ramp_s, line.least_s)
 
 
 def _not_arrived(what: str) -> MotionFailed:
@@ -115,21 +116,9 @@ LEAST_BLEND_MM = 1.0
 """ARCS takes 0 or 1 mm to 1 m."""
 
 
-@dataclass(frozen=True, slots=True)
-class Leg:
-    """One line as it is sent to the controller."""
-
-    target: Pose
-    speed_mm_s: float
-    least_s: float
-    blend_mm: float
-    seconds: float
-    """An upper estimate of how long it takes."""
-
-
-def legs_of(
-    start: Pose, lines: Sequence[QueuedLine], limits: Limits, acc_mm_s2: float, blend_mm: float | None = None
-) -> list[Leg]:
+def as_sent(
+    start: Pose, lines: Sequence[QueuedLine], limits: Limits, blend_mm: float | None = None
+) -> list[QueuedLine]:
     """The lines, each slow enough for its turn of the tool.
 
     A corner is rounded within `blend_mm` and half the shorter line, but never by less than the controller accepts. At
@@ -137,31 +126,33 @@ def legs_of(
     """
     corners = [start, *(line.target for line in lines)]
     lengths_mm = [distance(a, b)[0] for a, b in itertools.pairwise(corners)]
-    legs: list[Leg] = []
+    sent: list[QueuedLine] = []
     for i, (before, line) in enumerate(zip(corners, lines, strict=False)):
-        speed_mm_s = limits.turn_capped(before, line.target, line.speed_mm_s)
         rounded_mm = 0.0
         if blend_mm is not None and i + 1 < len(lines):
             rounded_mm = max(min(blend_mm, 0.5 * lengths_mm[i], 0.5 * lengths_mm[i + 1]), LEAST_BLEND_MM)
-        seconds = max(planned_s(before, line.target, speed_mm_s, acc_mm_s2), line.least_s)
-        legs.append(Leg(line.target, speed_mm_s, line.least_s, rounded_mm, seconds))
-    return legs
+        speed_mm_s = limits.turn_capped(before, line.target, line.speed_mm_s)
+        sent.append(replace(line, speed_mm_s=speed_mm_s, blend_mm=rounded_mm))
+    return sent
 
 
-def seconds_of(legs: Sequence[Leg]) -> float:
-    """An upper estimate of how long the legs take together."""
-    return sum(leg.seconds for leg in legs)
+def durations_s(start: Pose, lines: Sequence[QueuedLine], acc_mm_s2: float) -> list[float]:
+    """An upper estimate for each of the lines."""
+    corners = [start, *(line.target for line in lines)]
+    return [planned_s(before, line, acc_mm_s2) for before, line in zip(corners, lines, strict=False)]
 
 
 async def feed(
     controller: Controller,
-    legs: Sequence[Leg],
+    lines: Sequence[QueuedLine],
     acc_mm_s2: float,
     *,
+    longest_s: float,
     go: Callable[[], None],
     notice: Callable[[str], None],
 ) -> None:
-    """Queue every leg, at most `MOST_QUEUED` at a time; return once the last one is queued.
+    """Queue every line, none of which takes longer than `longest_s`, at most `MOST_QUEUED` at a time; return once the
+    last one is queued.
 
     `go` raises if the arm was stopped: it is asked before every line, with nothing awaited between, because after a
     stop none may follow. Raises `RobotNotSafe`, `MotionRefused`, and `MotionFailed` where the arm was stopped meanwhile
@@ -173,17 +164,17 @@ async def feed(
 
     await controller.require_safe("moveLine")
     while True:
-        while sent < len(legs) and room > 0:
+        while sent < len(lines) and room > 0:
             go()
-            leg = legs[sent]
+            line = lines[sent]
             try:
-                await controller.move_line(leg.target, leg.speed_mm_s, acc_mm_s2, leg.blend_mm)
+                await controller.move_line(line.target, line.speed_mm_s, acc_mm_s2, line.blend_mm)
             except MotionRefused as refusal:
                 if refusal.code != ReturnCode.QUEUE_FULL or sent == 0:  # then none of those in the queue is ours
                     raise
                 break  # the controller holds fewer lines than assumed: it is sent again
             sent, room = sent + 1, room - 1
-        if sent == len(legs):
+        if sent == len(lines):
             return
         await asyncio.sleep(POLL_S)
         go()
@@ -191,14 +182,14 @@ async def feed(
         before, queue, now = queue, await controller.queue(), loop.time()
         if queue != before:
             advanced_at = now
-        elif now - advanced_at > STUCK_S + 2.0 * max(leg.seconds for leg in legs[:sent]):
-            what = f"the arm does not advance, after {sent} of {len(legs)} points were sent"
+        elif now - advanced_at > STUCK_S + 2.0 * longest_s:
+            what = f"the arm does not advance, after {sent} of {len(lines)} points were sent"
             raise MotionFailed(DEVICE, "follow", what)
         room = max(MOST_QUEUED - queue[1], 0)
         if queue == EMPTY:
             # The lines came too late; or the arm has not begun, or another client stopped it: then nothing may follow.
-            if arrived(await controller.pose(), legs[sent - 1].target):
-                notice(f"the arm halted at point {sent} of {len(legs)}: lines did not reach the controller in time")
+            if arrived(await controller.pose(), lines[sent - 1].target):
+                notice(f"the arm halted at point {sent} of {len(lines)}: lines did not reach the controller in time")
             else:
                 room = 0
 
@@ -206,7 +197,7 @@ async def feed(
 async def queue_all(
     controller: Controller,
     start: Pose,
-    lines: Sequence[Leg],
+    lines: Sequence[QueuedLine],
     acc_mm_s2: float,
     *,
     go: Callable[[], None],
@@ -245,7 +236,7 @@ than any drag that a mark would show."""
 class OwnPath:
     """Watches the controller carry out our lines, from their release on, for anything that another client does."""
 
-    def __init__(self, controller: Controller, start: Pose, lines: Sequence[Leg], seen: Sequence[Pose]) -> None:
+    def __init__(self, controller: Controller, start: Pose, lines: Sequence[QueuedLine], seen: Sequence[Pose]) -> None:
         """`seen` grows meanwhile by the poses that telemetry receives."""
         self._controller = controller
         self._corners = [start, *(line.target for line in lines)]

@@ -12,7 +12,7 @@ import itertools
 from collections.abc import AsyncGenerator, Callable, Sequence
 
 from brushloop.drivers.arcs.controller import LOOPBACK_CONTROL_BOX, Controller, RobotMode
-from brushloop.drivers.arcs.motion import POLL_S, OwnPath, arrived, feed, legs_of, queue_all, seconds_of, until_settled
+from brushloop.drivers.arcs.motion import POLL_S, OwnPath, arrived, as_sent, durations_s, feed, queue_all, until_settled
 from brushloop.drivers.arcs.settings import ArcsTable, Settings, make_ready, power_on, read_back, require_same
 from brushloop.drivers.arcs.stopping import Stopper
 from brushloop.drivers.arcs.telemetry import Telemetry
@@ -114,10 +114,6 @@ class AuboArcs:
         """The controller's names of its robot mode and its safety mode."""
         return await self._motion.mode(), await self._motion.safety()
 
-    def check(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
-        """Raise `LimitExceeded` where the target is not allowed, without asking the controller."""
-        self._limits.check(DEVICE, target, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
-
     async def move(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
         """Move the tip in a straight line; returns when the arm has settled within tolerance. See `follow`."""
         await self.follow([target], speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2, blend_mm=0.0)
@@ -134,10 +130,11 @@ class AuboArcs:
             raise ValueError("follow: no poses")
         lines = [QueuedLine(pose, speed_mm_s) for pose in poses]
         start = await self._depart("moveLine", lines, acc_mm_s2)
-        legs = legs_of(start, lines, self._limits, acc_mm_s2, blend_mm)
-        async with self._under_way("moveLine", legs[-1].target) as go:
-            await feed(self._motion, legs, acc_mm_s2, go=go, notice=self._notice)
-            await until_settled(self._motion.rest, legs[-1].target, seconds_of(legs))
+        lines = as_sent(start, lines, self._limits, blend_mm)
+        planned_s = durations_s(start, lines, acc_mm_s2)
+        async with self._under_way("moveLine", poses[-1]) as go:
+            await feed(self._motion, lines, acc_mm_s2, longest_s=max(planned_s), go=go, notice=self._notice)
+            await until_settled(self._motion.rest, poses[-1], sum(planned_s))
 
     async def sequence(self, lines: Sequence[QueuedLine], *, acc_mm_s2: float) -> list[Pose]:
         """Queue all lines while the controller holds its path, release it, and wait as `follow` does; return the poses
@@ -148,17 +145,17 @@ class AuboArcs:
         interferes, and ValueError for no lines and for lines that end where the arm is.
         """
         start = await self._depart("sequence", lines, acc_mm_s2)
-        if not lines or arrived(start, lines[-1].target):
+        if not lines or arrived(start, end := lines[-1].target):
             raise ValueError("sequence: it must not end where it begins")
-        legs = legs_of(start, lines, self._limits, acc_mm_s2)
-        async with self._under_way("sequence", legs[-1].target) as go:
+        lines = as_sent(start, lines, self._limits)
+        async with self._under_way("sequence", end) as go:
             self._held = True
             with self._telemetry.seeing() as seen:
-                path = OwnPath(self._motion, start, legs, seen)
-                await queue_all(self._motion, start, legs, acc_mm_s2, go=go)
-                await until_settled(path.look, legs[-1].target, seconds_of(legs), patient=True)
+                path = OwnPath(self._motion, start, lines, seen)
+                await queue_all(self._motion, start, lines, acc_mm_s2, go=go)
+                await until_settled(path.look, end, sum(durations_s(start, lines, acc_mm_s2)), patient=True)
                 self._held = False
-                await self._telemetry.reaching(legs[-1].target)
+                await self._telemetry.reaching(end)
                 path.require_followed()
             return seen
 
@@ -186,7 +183,7 @@ class AuboArcs:
     async def _depart(self, op: str, lines: Sequence[QueuedLine], acc_mm_s2: float) -> Pose:
         """Return where the arm is, once it may go from there along `lines`."""
         for line in lines:
-            self.check(line.target, speed_mm_s=line.speed_mm_s, acc_mm_s2=acc_mm_s2)
+            self._limits.check(DEVICE, line.target, speed_mm_s=line.speed_mm_s, acc_mm_s2=acc_mm_s2)
         self._require_enabled(op)
         stops = self._stops
         await self._ready()

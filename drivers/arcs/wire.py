@@ -75,13 +75,14 @@ class _Decoder(abc.ABC):
             raise self._violation(self._broken)
         self._buffer += data
         payloads: list[bytes] = []
-        while (payload := self._next()) is not None:
-            payloads.append(payload)
+        while (span := self._next()) is not None:
+            payloads.append(bytes(self._buffer[span]))
+            del self._buffer[: span.stop]
         return payloads
 
     @abc.abstractmethod
-    def _next(self) -> bytes | None:
-        """Take the next whole item from the buffer; None while it is incomplete."""
+    def _next(self) -> slice | None:
+        """Where the first whole item in the buffer lies; None while it is incomplete."""
 
     def _violation(self, what: str) -> ProtocolViolation:
         self._broken = what
@@ -92,7 +93,7 @@ class _Decoder(abc.ABC):
 class FrameDecoder(_Decoder):
     """Turns a byte stream, split at any point, into the payloads of SOF frames."""
 
-    def _next(self) -> bytes | None:
+    def _next(self) -> slice | None:
         buffer = self._buffer
         while buffer.startswith(PING):
             del buffer[: len(PING)]
@@ -111,11 +112,7 @@ class FrameDecoder(_Decoder):
         if size > self._max_bytes:
             raise self._violation(f"frame of {size} bytes exceeds {self._max_bytes}")
         end = header.size + size
-        if len(buffer) < end:
-            return None
-        payload = bytes(buffer[header.size : end])
-        del buffer[:end]
-        return payload
+        return slice(header.size, end) if len(buffer) >= end else None
 
 
 MAX_DEPTH = 64
@@ -135,7 +132,7 @@ class BareDecoder(_Decoder):
         self._open: list[int] = []
         """Brackets before `_at` that are not closed."""
 
-    def _next(self) -> bytes | None:
+    def _next(self) -> slice | None:
         if not self._open:
             del self._buffer[: len(self._buffer) - len(self._buffer.lstrip(b" \t\r\n"))]
             if self._buffer and self._buffer[0] not in b"{[":
@@ -145,10 +142,8 @@ class BareDecoder(_Decoder):
             raise self._violation(f"document exceeds {self._max_bytes} bytes")
         if end is None:
             return None
-        document = bytes(self._buffer[:end])
-        del self._buffer[:end]
         self._at = 0
-        return document
+        return slice(end)
 
     def _scan(self) -> int | None:
         """Continue where the last piece ended; return the end of the document, or None if it has not arrived."""

@@ -130,7 +130,7 @@ async def enabled(rig: RigConfig, arm: AuboArcs, request: pytest.FixtureRequest)
     top = raised(start, LIFT_MM)
     try:
         limits_of(rig).check_start("robot", start)
-        arm.check(top, speed_mm_s=SPEED_MM_S, acc_mm_s2=ACC_MM_S2)
+        limits_of(rig).check("robot", top, speed_mm_s=SPEED_MM_S, acc_mm_s2=ACC_MM_S2)
     except LimitExceeded as error:
         pytest.skip(f"no room to move: {error}")
     yield Enabled(arm, start, top)

@@ -9,7 +9,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 import pytest
 
 from brushloop.drivers.arcs import motion as queueing
-from brushloop.drivers.arcs.motion import legs_of
+from brushloop.drivers.arcs.motion import as_sent
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.devices import Pose, QueuedLine
 from brushloop.drivers.errors import (
@@ -199,7 +199,7 @@ async def test_a_queue_without_a_size_is_a_violation(arm: AuboArcs, cabinet: Cab
 def test_a_turn_slows_its_own_line_and_corners_are_never_rounded_by_less_than_the_controller_takes():
     start = brush_pose(250.0, -230.0, 260.0)
     poses = [brush_pose(252.0, -230.0, 260.0), brush_pose(254.0, -230.0, 260.0, heading_deg=30.0), line(40)[-1]]
-    legs = legs_of(start, [QueuedLine(pose, 40.0) for pose in poses], LIMITS, 800.0, blend_mm=5.0)
+    legs = as_sent(start, [QueuedLine(pose, 40.0) for pose in poses], LIMITS, blend_mm=5.0)
     assert [leg.blend_mm for leg in legs] == [1.0, 1.0, 0.0]
     assert legs[1].speed_mm_s == pytest.approx(45.0 * 2.0 / 30.0)
     assert legs[0].speed_mm_s == 40.0

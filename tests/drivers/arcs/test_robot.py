@@ -12,6 +12,7 @@ from brushloop.drivers.arcs import stopping, wire
 from brushloop.drivers.arcs.controller import RobotMode, SafetyMode
 from brushloop.drivers.arcs.motion import planned_s
 from brushloop.drivers.arcs.robot import AuboArcs
+from brushloop.drivers.devices import QueuedLine
 from brushloop.drivers.errors import (
     ConnectionLost,
     DeviceError,
@@ -56,7 +57,7 @@ async def test_connecting_reports_who_answers_and_where_the_flange_is(
 async def test_a_slow_turn_on_the_spot_is_given_the_time_it_takes(arm: AuboArcs):
     home = arm.latest().pose
     turn = brush_pose(*home.position_mm, heading_deg=90.0)
-    assert planned_s(home, turn, 20.0, 800.0) >= math.radians(90.0) / 0.020  # 20 mm/s is read as 0.02 rad/s
+    assert planned_s(home, QueuedLine(turn, 20.0), 800.0) >= math.radians(90.0) / 0.020  # 20 mm/s is read as 0.02 rad/s
     await arm.move(turn, **QUICK)
 
 
