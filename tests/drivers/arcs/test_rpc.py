@@ -1,4 +1,4 @@
-"""Transcripts: what the client must send, what the controller answers, what the caller gets.
+"""One connection to the controller: calls, what answers them, and what is said when nothing does.
 
 Every archive of `brushloop doctor --report` in the folder `reports` is a test too: put a lab's there.
 """
@@ -6,121 +6,90 @@ Every archive of `brushloop doctor --report` in the folder `reports` is a test t
 from __future__ import annotations
 
 import asyncio
+import json
 import math
 import re
 from collections.abc import AsyncIterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from brushloop.drivers.arcs.controller import survey
-from brushloop.drivers.arcs.wire import Framing, RpcConnection, encode
+from brushloop.drivers.arcs.wire import Framing, RpcConnection, answer_in
 from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation, RpcError
+from brushloop.drivers.sim.faults import Device, Fault
 from brushloop.drivers.sim.rig import HOST
 from tests.drivers.arcs.conftest import Cabinet
-from tests.drivers.arcs.transcript import (
-    Answer,
-    Archive,
-    Controller,
-    following,
-    hang_up,
-    nothing,
-    reply,
-    result,
-    sends,
-)
+from tests.drivers.arcs.transcript import Archive
 from tests.drivers.failing import mute_to
 
 REPORTS = sorted((Path(__file__).parent / "reports").glob("*.zip"))
+MODE, SAFETY = "rob1.RobotState.getRobotModeType", "rob1.RobotState.getSafetyModeType"
 
 
 @pytest.fixture
-async def controller() -> AsyncIterator[Controller]:
-    async with following([]) as it:
-        yield it
-
-
-@pytest.fixture
-async def client(controller: Controller) -> AsyncIterator[RpcConnection]:
-    connection = RpcConnection("127.0.0.1", controller.port)
+async def client(cabinet: Cabinet) -> AsyncIterator[RpcConnection]:
+    connection = RpcConnection(HOST, cabinet.port)
     await connection.open()
     yield connection
     await connection.close()
 
 
 async def test_callers_at_the_same_time_take_turns_with_ids_of_the_vendors_shape_that_never_repeat(
-    controller: Controller, client: RpcConnection
+    cabinet: Cabinet, client: RpcConnection
 ):
-    methods = [f"method{number}" for number in range(20)]
-    controller.script = [(method, None, sends(lambda i: reply(i, result=i), 0.02)) for method in methods]
-    answers = await asyncio.gather(*(client.call(method) for method in methods))
-    assert answers == controller.ids
-    assert all(re.fullmatch(r"[A-Za-z0-9]{8}-[A-Za-z0-9]{4}-[A-Za-z0-9]{4}", ident) for ident in controller.ids)
-    assert len(set(controller.ids)) == 20
-
-
-async def test_a_late_reply_to_an_old_call_is_dropped(controller: Controller, client: RpcConnection):
-    controller.script = [
-        ("first", None, nothing),
-        ("second", None, sends(lambda i: reply(controller.ids[0], result="late") + reply(i, result="mine"))),
-    ]
-    with pytest.raises(DeviceTimeout):
-        await client.call("first")
-    assert await client.call("second") == "mine"
+    requests: list[dict[str, Any]] = []
+    answer = cabinet._answer
+    cabinet._answer = lambda request: (requests.append(request), answer(request))[1]  # type: ignore[method-assign]
+    answers = await asyncio.gather(*[client.call(method) for method in (MODE, SAFETY) * 10])
+    assert answers == ["PowerOff", "Normal"] * 10
+    assert [request["method"] for request in requests] == [MODE, SAFETY] * 10
+    idents = [request["id"] for request in requests]
+    assert all(re.fullmatch(r"[A-Za-z0-9]{8}-[A-Za-z0-9]{4}-[A-Za-z0-9]{4}", ident) for ident in idents)
+    assert len(set(idents)) == 20
 
 
 @pytest.mark.parametrize(
-    "answer",
+    ("kind", "error"),
     [
-        pytest.param(sends(lambda _: reply("AAAAAAAA-BBBB-CCCC", result=0)), id="another id"),
-        pytest.param(sends(lambda _: reply(7, result=0)), id="an integer id"),
-        pytest.param(sends(lambda _: encode(b"[1, 2]")), id="no object"),
-        pytest.param(nothing, id="silence"),
+        ("mute", DeviceTimeout),
+        ("late", DeviceTimeout),
+        ("wrong-id", DeviceTimeout),
+        ("malformed", ProtocolViolation),
+        ("garbage", ConnectionLost),
+        ("drop", ConnectionLost),
     ],
 )
-async def test_what_does_not_answer_the_call_is_waited_out(
-    controller: Controller, client: RpcConnection, answer: Answer
+async def test_a_call_without_a_good_answer_fails_and_calls_work_again_on_a_connection_that_is_whole_or_opened_again(
+    cabinet: Cabinet, client: RpcConnection, kind: str, error: type[Exception]
 ):
-    controller.script = [("getRobotNames", None, answer)]
-    with pytest.raises(DeviceTimeout, match="getRobotNames"):
-        await client.call("getRobotNames")
+    cabinet.faults.hang(Fault(device=Device.ROBOT, kind=kind, on="getRobotModeType", late_s=1.5))
+    with pytest.raises(error, match="getRobotModeType"):
+        await client.call(MODE)
+    assert client.lost is (error is ConnectionLost)
+    if client.lost:
+        with pytest.raises(ConnectionLost, match="getSafetyModeType"):
+            await client.call(SAFETY)
+        await client.open()
+    await asyncio.sleep(1.0)  # the late reply is there before the next one
+    assert await client.call(SAFETY) == "Normal"
 
 
-@pytest.mark.parametrize(
-    "answer",
-    [
-        pytest.param(sends(lambda _: encode(b"hello")), id="no JSON"),
-        pytest.param(sends(lambda _: encode(b"[" * 100_000)), id="nested without end"),
-        pytest.param(sends(lambda i: reply(i)), id="neither result nor error"),
-        pytest.param(sends(lambda i: reply(i, error="bad")), id="an error that is no object"),
-    ],
-)
-async def test_a_reply_that_makes_no_sense_is_a_violation_and_the_next_call_works(
-    controller: Controller, client: RpcConnection, answer: Answer
-):
-    controller.script = [("first", None, answer), ("second", None, result(2))]
+@pytest.mark.parametrize("reply", [[1, 2], {"id": 7, "result": 0}, {"id": True, "result": 0}, {"result": 0}])
+def test_what_has_not_the_id_of_the_call_does_not_answer_it(reply: object):
+    assert answer_in(json.dumps(reply).encode(), 1, "getRobotNames") is None
+
+
+@pytest.mark.parametrize("reply", [b"hello", b"[" * 100_000, b'{"id": 1}', b'{"id": 1, "error": "bad"}'])
+def test_a_reply_that_makes_no_sense_is_a_violation(reply: bytes):
     with pytest.raises(ProtocolViolation):
-        await client.call("first")
-    assert await client.call("second") == 2
+        answer_in(reply, 1, "getRobotNames")
 
 
-async def test_when_the_controller_hangs_up_all_calls_fail_until_the_connection_is_opened_again(
-    controller: Controller, client: RpcConnection
-):
-    controller.script = [("first", None, hang_up), ("third", None, result(3))]
-    with pytest.raises(ConnectionLost, match="first"):
-        await client.call("first")
-    with pytest.raises(ConnectionLost, match="second"):
-        await client.call("second")
-    assert client.lost
-    await client.close()
-    await client.open()
-    assert await client.call("third") == 3
-
-
-async def test_closing_wakes_the_caller_that_still_waits(controller: Controller, client: RpcConnection):
-    controller.script = [("first", None, nothing)]
-    waiting = asyncio.create_task(client.call("first"))
+async def test_closing_wakes_the_caller_that_still_waits(cabinet: Cabinet, client: RpcConnection):
+    mute_to(cabinet, "getRobotModeType")
+    waiting = asyncio.create_task(client.call(MODE))
     await asyncio.sleep(0.02)
     await client.close()
     with pytest.raises(NotConnected, match="closed while waiting"):
@@ -158,9 +127,6 @@ async def test_what_is_no_request_gets_an_error_and_a_frame_may_be_short(cabinet
     await writer.wait_closed()
 
 
-# ---------------------------------------------------------------- reports of labs
-
-
 async def test_a_cabinet_that_does_not_answer_the_login_is_asked_all_the_same(cabinet: Cabinet) -> None:
     mute_to(cabinet, "login")
     refused, first, *_ = await survey(HOST, cabinet.port, "sof")
@@ -171,8 +137,8 @@ async def test_a_cabinet_that_does_not_answer_the_login_is_asked_all_the_same(ca
 @pytest.mark.parametrize("path", REPORTS, ids=lambda path: path.stem)
 async def test_the_same_questions_get_the_same_answers(path: Path) -> None:
     archive = Archive(path)
-    async with following(archive.script(), archive.framing) as controller:
-        exchanges = await survey("127.0.0.1", controller.port, archive.framing)
+    async with archive.replayed() as port:
+        exchanges = await survey(HOST, port, archive.framing)
     for exchange, line in zip(exchanges, archive.lines, strict=True):
         assert (exchange["method"], exchange["params"]) == (line["method"], line["params"])
         assert exchange["answer"].keys() == line["answer"].keys(), line["method"]
