@@ -33,7 +33,6 @@ def test_a_rate_that_makes_no_sense_is_refused(rate: float):
 LATE = [
     lambda: CameraLate("the camera's delay is not steady: use a cable instead of Wi-Fi."),
     lambda: Stale("force", 130.0, 100.0),
-    lambda: DeviceTimeout("robot", "getTcpPose", "no reply in 2 s"),
     lambda: DeviceTimeout("camera", "fresh", "no valid new frame", remedy="Check cable, light and stream."),
 ]
 

@@ -105,13 +105,17 @@ async def make_arm(cabinet: Cabinet, notices: list[str]) -> AsyncIterator[MakeAr
         await arm.close()
 
 
-@pytest.fixture
-async def arm(make_arm: MakeArm) -> AuboArcs:
-    """Connected, powered, brakes released."""
-    arm = make_arm()
+async def enabled(make: MakeArm, **fields: Any) -> AuboArcs:
+    arm = make(**fields)
     await arm.connect()
     await arm.enable()
     return arm
+
+
+@pytest.fixture
+async def arm(make_arm: MakeArm) -> AuboArcs:
+    """Connected, powered, brakes released."""
+    return await enabled(make_arm)
 
 
 @pytest.fixture

@@ -23,17 +23,10 @@ from brushloop.drivers.errors import (
 )
 from brushloop.drivers.geometry import brush_pose, distance, from_wire, lean
 from brushloop.drivers.sim.kinematics import forward, pose_of
-from tests.drivers.arcs.conftest import NEAR, QUICK, Cabinet, MakeArm
+from tests.drivers.arcs.conftest import NEAR, QUICK, Cabinet, MakeArm, enabled
 
 ABOVE, LOW = brush_pose(300.0, -200.0, 200.0), brush_pose(300.0, -200.0, 130.0)
 ELSEWHERE = brush_pose(340.0, -180.0, 100.0, tilt_deg=10.0)
-
-
-async def enabled(make: MakeArm, **options: Any) -> AuboArcs:
-    arm = make(**options)
-    await arm.connect()
-    await arm.enable()
-    return arm
 
 
 @pytest.mark.parametrize("mode", ["Manual", "Sideways", 7, None])

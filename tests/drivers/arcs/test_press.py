@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Any
 
 import pytest
@@ -23,7 +23,7 @@ from brushloop.drivers.errors import (
 )
 from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
-from tests.drivers.arcs.conftest import Cabinet, MakeArm
+from tests.drivers.arcs.conftest import Cabinet, MakeArm, enabled
 from tests.drivers.failing import cut, mute
 
 X_MM, Y_MM = 250.0, -230.0
@@ -129,13 +129,37 @@ async def test_whatever_happens_before_the_path_is_let_go_drops_it_and_leaves_th
         await arm.move(TOP, speed_mm_s=100.0, acc_mm_s2=ACC)  # the hold is over, too
 
 
-@pytest.mark.parametrize("below_mm", [250.0, 200.1])
-async def test_a_stop_on_the_way_down_or_at_depth_drops_the_lift(arm: AuboArcs, cabinet: Cabinet, below_mm: float):
-    task = asyncio.create_task(arm.sequence(PRESS, acc_mm_s2=ACC))
-    await below(cabinet, below_mm)
+async def stops_itself(_: AuboArcs, cabinet: Cabinet) -> None:
+    cabinet.cabinet.safety_stop()
+
+
+async def is_stopped_although_no_answer_can_be_read(arm: AuboArcs, cabinet: Cabinet) -> None:
+    cabinet.faults.hang(Fault(device=Device.ROBOT, kind="malformed", on="getSafetyModeType", count=ALWAYS))
     await arm.stop()
-    with pytest.raises(MotionFailed):
-        await task
+    cabinet.faults.clear()
+
+
+@pytest.mark.parametrize(
+    ("below_mm", "act", "error"),
+    [
+        (250.0, lambda arm, _: arm.stop(), MotionFailed),
+        (200.1, lambda arm, _: arm.stop(), MotionFailed),
+        (255.0, is_stopped_although_no_answer_can_be_read, MotionFailed),
+        (255.0, stops_itself, RobotNotSafe),
+    ],
+)
+async def test_a_stop_on_the_way_down_or_at_depth_ends_the_press_at_once_and_drops_the_lift(
+    arm: AuboArcs,
+    cabinet: Cabinet,
+    below_mm: float,
+    act: Callable[[AuboArcs, Cabinet], Awaitable[None]],
+    error: type[Exception],
+):
+    press = asyncio.create_task(arm.sequence(PRESS, acc_mm_s2=ACC))
+    await below(cabinet, below_mm)
+    await act(arm, cabinet)
+    with pytest.raises(error):
+        await press
     assert DEEP.z_mm <= z_mm(cabinet) <= below_mm
     assert await nothing_is_left(cabinet)
 
@@ -150,9 +174,7 @@ async def test_lines_that_a_dead_process_left_held_are_dropped_and_do_not_hold_u
     running = cabinet._methods["rob1.MotionControl.getExecId"]
     if not counted:
         cabinet._methods["rob1.MotionControl.getExecId"] = lambda p: -1 if cabinet.cabinet.motion.held else running(p)
-    other = make_arm()
-    await other.connect()
-    await other.enable()
+    other = await enabled(make_arm)
     assert z_mm(cabinet) == HOME.z_mm
     assert await nothing_is_left(cabinet)
     await other.move(TOP, speed_mm_s=100.0, acc_mm_s2=ACC)
@@ -209,27 +231,6 @@ async def test_a_controller_that_never_answers_again_is_given_the_time_of_the_pr
         await press
     assert z_mm(cabinet) == pytest.approx(TOP.z_mm)
     cabinet.faults.clear()
-
-
-async def test_a_stop_is_carried_out_at_once_although_no_answer_can_be_read(arm: AuboArcs, cabinet: Cabinet) -> None:
-    press = asyncio.create_task(arm.sequence(PRESS, acc_mm_s2=ACC))
-    await below(cabinet, 255.0)
-    cabinet.faults.hang(Fault(device=Device.ROBOT, kind="malformed", on="getSafetyModeType", count=ALWAYS))
-    await arm.stop()
-    assert z_mm(cabinet) > DEEP.z_mm
-    assert cabinet.queued == 0
-    cabinet.faults.clear()
-    with pytest.raises(MotionFailed):
-        await press
-
-
-async def test_a_safety_stop_that_can_be_read_ends_the_press_at_once(arm: AuboArcs, cabinet: Cabinet) -> None:
-    press = asyncio.create_task(arm.sequence(PRESS, acc_mm_s2=ACC))
-    await below(cabinet, 255.0)
-    cabinet.cabinet.safety_stop()
-    with pytest.raises(RobotNotSafe):
-        await press
-    assert DEEP.z_mm < z_mm(cabinet) < TOP.z_mm
 
 
 # ---------------------------------------------------------------- another client

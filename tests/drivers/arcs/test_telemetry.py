@@ -5,19 +5,14 @@ from __future__ import annotations
 import asyncio
 import math
 import random
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 import cbor2
 import pytest
 
 from brushloop.drivers.arcs.robot import AuboArcs
-from brushloop.drivers.arcs.telemetry import (
-    LagMeter,
-    RtdeStream,
-    encode_sample,
-    encode_topic,
-)
+from brushloop.drivers.arcs.telemetry import LagMeter, RtdeStream, encode_sample, encode_topic
 from brushloop.drivers.arcs.wire import PING, FrameDecoder, encode
 from brushloop.drivers.devices import Pose, PoseSample, QueuedLine, Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, ProtocolViolation, Stale
@@ -25,13 +20,12 @@ from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.sim.arcs_server import RtdeServer, topic_of
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 from brushloop.drivers.sim.rig import HOST
-from tests.drivers.arcs.conftest import Cabinet, MakeArm
+from tests.drivers.arcs.conftest import NEAR, QUICK, Cabinet, MakeArm
 from tests.drivers.failing import SetClock, mute
 from tests.waiting import until
 
 GREETING = b'{"protocol":"rtde","version":1,"input":{"set_recipe":100},"output":{"R1_actual_TCP_pose":1021}}\n\n'
 POSE = ["R1_actual_TCP_pose"]
-Serve = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 
 
 MAKERS_TOPIC = (
@@ -49,26 +43,22 @@ def test_a_topic_is_the_one_that_the_makers_client_sends_and_is_understood():
     assert topic_of(MAKERS_TOPIC) == (0, 50.0, names)
 
 
-def says(*pieces: bytes, then: str = "silence") -> Serve:
-    async def script(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        for piece in pieces:
-            writer.write(piece)
-            await asyncio.sleep(0.01)
-        if then == "silence":
-            await reader.read()
-        writer.close()
-
-    return script
+HANGS_UP = b""
 
 
-async def newest(script: Serve) -> list[Any]:
-    """The newest sample of a controller that says what its script says."""
+async def newest(*said: bytes) -> list[Any]:
+    """The newest sample of a controller that says this, and then is silent or hangs up."""
     over = asyncio.Event()
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
-            await script(reader, writer)
+            for piece in said:
+                writer.write(piece)
+                await asyncio.sleep(0.01)
+            if HANGS_UP not in said:
+                await reader.read()
         finally:
+            writer.close()
             over.set()
 
     async with await asyncio.start_server(serve, HOST, 0) as server:
@@ -82,23 +72,23 @@ async def newest(script: Serve) -> list[Any]:
 
 
 @pytest.mark.parametrize(
-    ("script", "error"),
+    ("said", "error"),
     [
-        (says(), DeviceTimeout),
-        (says(GREETING[:30]), DeviceTimeout),
-        (says(then="end"), ConnectionLost),
-        (says(GREETING.replace(b"R1_actual_TCP_pose", b"R1_other")), ProtocolViolation),
-        (says(*[b"x" * 65536] * 10), ProtocolViolation),
-        (says(GREETING), DeviceTimeout),
-        (says(GREETING, then="end"), ConnectionLost),
-        (says(GREETING, b"SOF\x01\x7f\xff\xff\xff"), ProtocolViolation),
-        (says(GREETING, encode_sample(0, [])), ProtocolViolation),
-        (says(GREETING, encode_sample(7, [1])), DeviceTimeout),
+        ([], DeviceTimeout),
+        ([GREETING[:30]], DeviceTimeout),
+        ([HANGS_UP], ConnectionLost),
+        ([GREETING.replace(b"R1_actual_TCP_pose", b"R1_other")], ProtocolViolation),
+        ([b"x" * 65536] * 10, ProtocolViolation),
+        ([GREETING], DeviceTimeout),
+        ([GREETING, HANGS_UP], ConnectionLost),
+        ([GREETING, b"SOF\x01\x7f\xff\xff\xff"], ProtocolViolation),
+        ([GREETING, encode_sample(0, [])], ProtocolViolation),
+        ([GREETING, encode_sample(7, [1])], DeviceTimeout),
     ],
 )
-async def test_what_is_no_telemetry_is_distinguished(script: Serve, error: type[Exception]):
+async def test_what_is_no_telemetry_is_distinguished(said: list[bytes], error: type[Exception]):
     with pytest.raises(error):
-        await newest(script)
+        await newest(*said)
 
 
 @pytest.mark.parametrize(
@@ -112,7 +102,7 @@ async def test_what_is_no_telemetry_is_distinguished(script: Serve, error: type[
     ids=["CBOR", "JSON", "after a ping", "a backlog"],
 )
 async def test_the_newest_sample_is_handed_over(frames: bytes, sample: object):
-    assert await newest(says(GREETING, frames)) == [sample]
+    assert await newest(GREETING, frames) == [sample]
 
 
 @pytest.fixture
@@ -121,6 +111,14 @@ async def rtde(cabinet: Cabinet) -> AsyncIterator[RtdeServer]:
     await server.start(HOST, 0)
     yield server
     await server.stop()
+
+
+@pytest.fixture
+async def pushed(rtde: RtdeServer, make_arm: MakeArm) -> AuboArcs:
+    """Connected, and poses are pushed."""
+    arm = make_arm(rtde_port=rtde.port)
+    assert (await arm.connect()).firmware == "interface 24000, telemetry by RTDE"
+    return arm
 
 
 async def samples_of(arm: AuboArcs, seconds: float) -> list[PoseSample]:
@@ -132,35 +130,30 @@ async def samples_of(arm: AuboArcs, seconds: float) -> list[PoseSample]:
 
 
 async def test_poses_are_pushed_at_the_frequency_that_was_asked_for(
-    rtde: RtdeServer, make_arm: MakeArm, notices: list[str], cabinet: Cabinet
+    rtde: RtdeServer, pushed: AuboArcs, notices: list[str], cabinet: Cabinet
 ):
-    arm = make_arm(rtde_port=rtde.port)
-    identity = await arm.connect()
-    assert identity.firmware == "interface 24000, telemetry by RTDE"
-    await arm.enable()
-    assert 40 <= len(await samples_of(arm, 0.5)) <= 60
-    await arm.move(brush_pose(300.0, -200.0, 240.0), speed_mm_s=200.0, acc_mm_s2=800.0)
+    await pushed.enable()
+    assert 40 <= len(await samples_of(pushed, 0.5)) <= 60
+    await pushed.move(NEAR, **QUICK)
     await asyncio.sleep(0.05)
-    assert distance(arm.latest().pose, cabinet.tool)[0] < 0.01
+    assert distance(pushed.latest().pose, cabinet.tool)[0] < 0.01
     assert not notices
-    await arm.close()
+    await pushed.close()
     await until(lambda: rtde.clients == 0, "the subscription to end")
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.8])
 async def test_the_lag_of_pushed_poses_is_measured_while_the_arm_moves(
-    rtde: RtdeServer, make_arm: MakeArm, late_s: float
+    rtde: RtdeServer, pushed: AuboArcs, late_s: float
 ):
-    arm = make_arm(rtde_port=rtde.port)
-    await arm.connect()
-    await arm.enable()
-    assert arm.pose_lag_ms() is None
+    await pushed.enable()
+    assert pushed.pose_lag_ms() is None
     if late_s:
         rtde.faults.hang(Fault(device=Device.TELEMETRY, kind="late", late_s=late_s, count=ALWAYS))
         await asyncio.sleep(late_s)
     down, up = (QueuedLine(brush_pose(250.0, -230.0, z_mm), 4.0) for z_mm in (220.0, 259.0))
-    await arm.sequence([down, up], acc_mm_s2=800.0)
-    assert arm.pose_lag_ms() == pytest.approx(1e3 * late_s, abs=60.0)
+    await pushed.sequence([down, up], acc_mm_s2=800.0)
+    assert pushed.pose_lag_ms() == pytest.approx(1e3 * late_s, abs=60.0)
 
 
 async def test_a_port_that_is_closed_or_silent_is_reported_and_poses_are_polled(
@@ -186,36 +179,32 @@ async def test_a_port_that_is_closed_or_silent_is_reported_and_poses_are_polled(
 )
 async def test_a_short_silence_is_bridged_by_asking_and_after_a_long_one_poses_are_polled_for_good(
     rtde: RtdeServer,
-    make_arm: MakeArm,
+    pushed: AuboArcs,
     notices: list[str],
     end: Callable[[RtdeServer], None],
     for_s: float,
     source: str,
     notices_expected: int,
 ):
-    arm = make_arm(rtde_port=rtde.port)
-    await arm.connect()
     end(rtde)
     await asyncio.sleep(for_s)
-    assert arm.latest()
+    assert pushed.latest()
     rtde.faults.clear()
     await asyncio.sleep(0.1)
-    assert len(await samples_of(arm, 0.2)) >= 3
+    assert len(await samples_of(pushed, 0.2)) >= 3
     assert len(notices) == notices_expected
-    assert arm._telemetry.source == source
+    assert pushed._telemetry.source == source
 
 
-async def test_where_both_ways_are_silent_the_pose_goes_stale(rtde: RtdeServer, make_arm: MakeArm, cabinet: Cabinet):
-    arm = make_arm(rtde_port=rtde.port)
-    await arm.connect()
+async def test_where_both_ways_are_silent_the_pose_goes_stale(rtde: RtdeServer, pushed: AuboArcs, cabinet: Cabinet):
     mute(rtde)
     mute(cabinet)
     await asyncio.sleep(0.7)
     with pytest.raises(Stale):
-        arm.latest()
+        pushed.latest()
     cabinet.faults.clear()
     await asyncio.sleep(1.5)
-    arm.latest()  # fresh again by itself
+    pushed.latest()  # fresh again by itself
 
 
 async def test_where_the_arm_rested_between_two_pushes_is_reported_where_time_runs_fast(
