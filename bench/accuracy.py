@@ -71,7 +71,7 @@ def fit(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     results: list[Result] = []
     for name, presses, prior in _pressed(n, seed):
         rows = leave_condition_out(presses, fit_presses(presses, prior=prior), prior)
-        csim = {row.model: row.csim for row in rows}
+        csim = {row.model: row.csim.avg for row in rows}
         where = f"simulated; ceiling {csim[CEILING]:.2f}, refitted Bezier {csim[BEZIER]:.2f} %; {machine()}"
         gap = csim[CEILING] - csim[FITTED]
         results.append(at_most(f"fit.gap.{name}", gap, POINTS, FULL_POINTS, len(presses), seed, where))
@@ -94,7 +94,7 @@ def few(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
                 left_out = DESIGN[size:]
                 images = [{FITTED: image_of(press.outline(*cell), presses.grid)} for cell in left_out]
                 predicted = [(presses.ink[cells[cell]], drawn) for cell, drawn in zip(left_out, images, strict=True)]
-                csim = {row.model: row.csim for row in held_out_scores(predicted, (FITTED,))}
+                csim = {row.model: row.csim.avg for row in held_out_scores(predicted, (FITTED,))}
                 gaps.append(csim[CEILING] - csim[FITTED])
             where = f"simulated; worst draw {max(gaps):.2f}; {machine()}"
             results.append(at_most(f"few.gap.{size}.{name}", statistics.fmean(gaps), POINTS, goal, draws, seed, where))
@@ -221,7 +221,7 @@ def twin(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
         presses = every.pick([k for numbers in every.cells.values() for k in numbers[:TWIN_REPEATS]])
         with workers() as pool:
             fitted = fit_twin(presses, pool)
-        csim = {row.model: row.csim for row in fitted.held_out}
+        csim = {row.model: row.csim.avg for row in fitted.held_out}
         where = f"simulated; ceiling {csim[CEILING]:.2f}, refitted Bezier {csim[BEZIER]:.2f} %; {machine()}"
         gap = csim[CEILING] - csim[TWIN]
         results.append(at_most(f"twin.gap.{name}", gap, POINTS, TWIN_POINTS, len(presses), seed, where))

@@ -75,7 +75,7 @@ class Polarity(StrEnum):
 Key = tuple[Alignment, Tone]
 KEYS: tuple[Key, ...] = tuple(itertools.product(Alignment, Tone))
 """Every way in which two images are compared."""
-GRAY_MM = KEYS.index((Alignment.MM, Tone.GRAY))
+MM_BINARY, MM_GRAY = (KEYS.index((Alignment.MM, tone)) for tone in Tone)
 SHOWN_ROWS = slice(32, 96)
 """Rows to show: the middle half of a field, as a press is at most half as thick as the field is high."""
 
@@ -95,7 +95,7 @@ def field_grid() -> Grid:
 
 def covered(prepared: Prepared) -> Image:
     """(128, 128) share of each pixel that is ink in a capture that was rectified to the field."""
-    return _shrunk(prepared.mask.astype(np.float32))
+    return shrunk(prepared.mask.astype(np.float32))
 
 
 def captured(prepared: Prepared) -> Pixels:
@@ -111,7 +111,7 @@ def captured(prepared: Prepared) -> Pixels:
     images: list[Pixels] = []
     for alignment, tone in KEYS:
         ink = prepared.soft if tone is Tone.GRAY else prepared.mask.astype(np.float32)
-        aligned = _shrunk(ink) if alignment is Alignment.MM else averaged(ink, (left, top), step_px, SIZE_PX)
+        aligned = shrunk(ink) if alignment is Alignment.MM else averaged(ink, (left, top), step_px, SIZE_PX)
         images.append(to_pixels(to_tone(aligned, tone)))
     return np.stack(images)
 
@@ -127,10 +127,11 @@ def averaged(
     # cv2 puts pixel centres on integers, here a pixel covers [j, j + 1).
     left, top = (scale * (0.5 - corner) - 0.5 for corner in corner_px)
     move, side = np.array([[scale, 0.0, left], [0.0, scale, top]]), fine * size_px
-    return _shrunk(cv2.warpAffine(image, move, (side, side), flags=cv2.INTER_LINEAR), size_px)
+    return shrunk(cv2.warpAffine(image, move, (side, side), flags=cv2.INTER_LINEAR), size_px)
 
 
-def _shrunk(image: cv2.typing.MatLike, size_px: int = SIZE_PX) -> Image:
+def shrunk(image: cv2.typing.MatLike, size_px: int = SIZE_PX) -> Image:
+    """The mean of an image over (size_px, size_px) squares."""
     return cast("Image", cv2.resize(image, (size_px, size_px), interpolation=cv2.INTER_AREA))
 
 
@@ -164,7 +165,7 @@ def images_of(mark: Outline, origin_x_mm: float) -> Pixels:
 
 def shown(images: Pixels) -> Image:
     """The rows to show of the gray image on the millimetre field, of (len(KEYS), 128, 128)."""
-    return np.asarray(images[GRAY_MM][SHOWN_ROWS] / 255.0, np.float32)
+    return np.asarray(images[MM_GRAY][SHOWN_ROWS] / 255.0, np.float32)
 
 
 def draw_loop(loop: Outline, views: Sequence[tuple[float, float, float]], size_px: int) -> NDArray[np.float32]:

@@ -26,7 +26,7 @@ from brushloop.calibrate.commands import (
     RecoverRequest,
     ValidateRequest,
 )
-from brushloop.calibrate.compare import GRAY_MM, brush_of, simulated
+from brushloop.calibrate.compare import MM_GRAY, brush_of, simulated
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.presses import Refused, read_presses, rectified
 from brushloop.calibrate.session import Calibration, OpenSession, open_session
@@ -220,7 +220,7 @@ def predict(condition: Condition, brush: Brush | BrushFit | None = None, model: 
     chosen = brush or Brush()
     drawn = named_model(model, chosen) if isinstance(chosen, Brush) else fitted_model(chosen.press())
     images = simulated(drawn, condition.depth_mm, condition.tilt_deg)
-    image = np.asarray(images[GRAY_MM] / 255.0, np.float32)
+    image = np.asarray(images[MM_GRAY] / 255.0, np.float32)
     edge = drawn.profile(condition.depth_mm, condition.tilt_deg).polyline()[0]
     return Prediction(drawn.name, image, edge)
 

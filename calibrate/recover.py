@@ -49,7 +49,6 @@ Floats = NDArray[np.float64]
 LEAST_CONDITIONS = 3
 """With fewer other conditions, the model error is unknown."""
 NORMAL_95 = 1.96
-ROUNDS = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,15 +255,12 @@ def common_variance(off: Floats, sd: Floats) -> float:
 
     A press that its image hardly determines counts little, however large its deviation.
     """
-    variance = 0.0
-    square = np.maximum(sd**2, 1e-12)
-    for _ in range(ROUNDS):  # Newton's method, which approaches the root of a convex function from below
-        weight = 1.0 / (square + variance)
-        excess = float(np.mean(off**2 * weight)) - 1.0
-        if excess < 1e-9:
-            break
-        variance += excess / float(np.mean((off * weight) ** 2))
-    return variance
+    from scipy.optimize import brentq  # slow to import
+
+    def excess(variance: float) -> float:
+        return float(np.mean(off**2 / (np.maximum(sd**2, 1e-12) + variance))) - 1.0
+
+    return 0.0 if excess(0.0) <= 0.0 else float(brentq(excess, 0.0, float(np.mean(off**2))))
 
 
 def _spread(off: Floats, sd: Floats, conditions: int) -> float:

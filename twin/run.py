@@ -25,9 +25,10 @@ from brushloop.calibrate.artefact import made_by
 from brushloop.calibrate.commands import TwinRequest
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written, check_target, write_whole
-from brushloop.calibrate.fit.heldout import BEZIER, HeldOut, Predicted, held_out_scores
+from brushloop.calibrate.fit.heldout import BEZIER, Predicted, held_out_scores
 from brushloop.calibrate.presses import read_for_fit
 from brushloop.calibrate.report import source_note
+from brushloop.calibrate.scores import Stat
 from brushloop.calibrate.work import Store, key_of
 from brushloop.drivers.sim.brush.spec import BrushSpec, SoundHead
 from brushloop.model.presses import Cell, Grid, Presses, image_of, refit_bezier
@@ -107,7 +108,7 @@ class Twin:
     estimates: tuple[Estimate, ...]
     spread: Spread | None
     """None where no cell has enough captures; the spread is then the default brush's."""
-    held_out: tuple[HeldOut, ...]
+    held_out: tuple[Stat, ...]
     """Empty where the cells cannot be divided."""
     head: SoundHead | None = None
     """Where its marks begin; None if it leaves no ink."""
@@ -307,7 +308,7 @@ def twin_toml(twin: Twin, session_id: str, noise_gray: float | None) -> Iterator
         unit = f"{one.constant.unit}; " if one.constant.unit else ""
         yield f"{one.constant.name} = {one.value:.6g}    # {unit}{known}; default {one.constant.default:.4g}"
     for row in twin.held_out:
-        scores = f"CSIM {row.csim:.2f} %, SSIM {row.ssim:.2f} %, n = {row.n}"
+        scores = f"CSIM {row.csim.avg:.2f} %, SSIM {row.ssim.avg:.2f} %, n = {row.csim.n}"
         yield f"# a third of the conditions left out in turn: {row.model}: {scores}"
     if twin.spread is None:
         yield "# No condition has three captures: how presses differ is left as in the default brush."

@@ -24,7 +24,7 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written
 from brushloop.calibrate.fit.descent import SPREAD_MM, Floats
 from brushloop.calibrate.fit.descent import fit_presses as fit_parameters
-from brushloop.calibrate.fit.heldout import FITTED, HeldOut, leave_condition_out
+from brushloop.calibrate.fit.heldout import FITTED, leave_condition_out
 from brushloop.calibrate.presses import Refused, read_for_fit
 from brushloop.calibrate.report import (
     COLOURS,
@@ -39,6 +39,7 @@ from brushloop.calibrate.report import (
     source_point,
     write_page,
 )
+from brushloop.calibrate.scores import Stat
 from brushloop.calibrate.session import OpenSession
 from brushloop.calibrate.stats import NEAR_POINTS, is_near, student_95
 from brushloop.model.ccdbsm import DomainError
@@ -164,7 +165,7 @@ class FitResult:
     """The contents of the file."""
     sizes: list[Size]
     """Empty where the session has too few conditions for an interval."""
-    held_out: list[HeldOut]
+    held_out: list[Stat]
     """Empty with one condition only."""
     path: Path
 
@@ -196,7 +197,7 @@ class FitResult:
                 "model", "n", "CSIM", "SSIM", title=f"on combinations left out of the fit in turn, percent ({label})"
             )
             for row in self.held_out:
-                scores.add_row(row.model, str(row.n), f"{row.csim:.2f}", f"{row.ssim:.2f}")
+                scores.add_row(row.model, str(row.csim.n), f"{row.csim.avg:.2f}", f"{row.ssim.avg:.2f}")
             yield scores
         else:
             yield "Only one condition: nothing can be held out."
@@ -238,7 +239,7 @@ def fit_presses(request: FitRequest, progress: Progress = unseen, opened: Record
         parameters=dict(zip(NAMES, press.values.tolist(), strict=True)),
         edges_mm=press.edges.tolist(),
         ends_mm=press.ends.tolist(),
-        csim_percent={row.model: row.csim for row in held_out},
+        csim_percent={row.model: row.csim.avg for row in held_out},
     )
     path = put_to_use(fit, session.recording.path.parent, FITS)
     result = FitResult(session, presses, refused, fit, sizes_of(presses), held_out, path)
@@ -359,16 +360,16 @@ def _verdict(result: FitResult) -> Iterator[str]:
     presses, conditions = len(result.presses), len(result.presses.cells)
     yield f"The stroke model was fitted to {presses} presses at {conditions} combinations of H and α: {brush}."
     if result.held_out:
-        scores = ", ".join(f"{row.model} {row.csim:.1f} %" for row in result.held_out)
+        scores = ", ".join(f"{row.model} {row.csim.avg:.1f} %" for row in result.held_out)
         yield f"On combinations that were left out of the fit, the CSIM is: {scores}."
 
 
 def _trust(result: FitResult) -> Iterator[Point]:
-    off = next((row.below for row in result.held_out if row.model == FITTED), None)
-    if off is None:
+    csim = next((row.csim for row in result.held_out if row.model == FITTED), None)
+    if csim is None or csim.below_ceiling is None:
         yield Point(None, "No combination was pressed twice, so the repeatability of the brush is not known here.")
     else:
-        span = "" if off.avg_interval is None else " (95 % {:.1f} to {:.1f})".format(*off.avg_interval)
-        words = f"Held out, the fit is {off.avg:.1f} points of CSIM{span} below the ceiling"
-        yield Point(is_near(off.avg, off.avg_interval), f"{words}; {NEAR_POINTS:g} or less is near.")
+        span = "" if csim.below_interval is None else " (95 % {:.1f} to {:.1f})".format(*csim.below_interval)
+        words = f"Held out, the fit is {csim.below_ceiling:.1f} points of CSIM{span} below the ceiling"
+        yield Point(is_near(csim.below_ceiling, csim.below_interval), f"{words}; {NEAR_POINTS:g} or less is near.")
     yield Point(None, "The pictures above show presses that were fitted; judge the fit by the held-out scores.")

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.compare import Alignment, similarity
+from brushloop.calibrate.compare import KEYS, MM_BINARY, Alignment, similarity
 from brushloop.calibrate.fit.descent import Floats, Prior, fit_presses
-from brushloop.calibrate.stats import CEILING, Summary, ceiling_values, pair_means, summarise
+from brushloop.calibrate.scores import Stat, statistics
+from brushloop.calibrate.stats import CEILING, ceiling_values, pair_means
 from brushloop.calibrate.work import Arrays, Scheduler, Store, key_of, threads
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.fitted import FittedPress
@@ -25,18 +26,6 @@ MAX_FOLDS = 15
 PER_CONDITION = 3
 """Presses of each other condition that a fit uses; more did not change it."""
 MAX_STROKES = 60
-
-
-@dataclass(frozen=True, slots=True)
-class HeldOut:
-    """Scores of one model on held-out strokes, binary images, percent; of the ceiling, its estimate."""
-
-    model: str
-    csim: float
-    ssim: float
-    n: int
-    below: Summary | None = None
-    """Points of CSIM below the ceiling; None for the ceiling itself, and where no condition was pressed twice."""
 
 
 Predicted = tuple[Floats, Mapping[str, Images]]
@@ -96,7 +85,7 @@ def leave_condition_out(
     prior: Prior | None = None,
     progress: Progress = unseen,
     store: Store | None = None,
-) -> list[HeldOut]:
+) -> list[Stat]:
     """Score each condition as predicted by fits to other conditions; empty for a single condition.
 
     The fits descend from `press`, the fit to all conditions. `brushloop validate` uses the same fits, which the store
@@ -123,32 +112,22 @@ def leave_condition_out(
     return held_out_scores(predicted, (FITTED, BEZIER, UNCALIBRATED))
 
 
-def held_out_scores(predicted: Sequence[Predicted], models: Sequence[str]) -> list[HeldOut]:
-    """The ceiling, then these models in this order; one without a score is left out."""
-    values: dict[str, list[Floats]] = {name: [] for name in (CEILING, *models)}
-    for ink, images in predicted:
-        inks = _binary(ink)
+def held_out_scores(predicted: Sequence[Predicted], models: Sequence[str]) -> list[Stat]:
+    """The statistics of the ceiling, then of these models, mm and binary; one without a score has none."""
+    conditions = np.repeat(np.arange(len(predicted)), [len(ink) for ink, _ in predicted])
+    percent = {name: np.full((len(conditions), len(KEYS), 2), np.nan) for name in (CEILING, *models)}
+    for number, (ink, images) in enumerate(predicted):
+        inks, rows = _binary(ink), conditions == number
 
         def score(k: int, others: list[int], inks: Floats = inks) -> Floats:
             return similarity(inks[k], inks[others], Alignment.MM)
 
-        values[CEILING].append(pair_means(len(inks), score))
-        for name in models:
-            drawn = _binary(images[name]) if name in images else np.zeros_like(inks[0])
-            values[name].append(similarity(drawn, inks, Alignment.MM))
-    if not predicted:
-        return []
-    groups = np.repeat(np.arange(len(predicted)), [len(ink) for ink, _ in predicted])
-    percent = {name: 100.0 * np.concatenate(scores) for name, scores in values.items()}
-    ceiling = np.stack([ceiling_values(pairs, groups) for pairs in percent[CEILING].T], axis=1)
-    rows: list[HeldOut] = []
-    for name, scores in (percent | {CEILING: ceiling}).items():
-        known = np.isfinite(scores[:, 0])
-        if known.any():
-            below = summarise(ceiling[:, 0] - scores[:, 0], groups) if name != CEILING else None
-            csim, ssim = scores[known].mean(axis=0).tolist()
-            rows.append(HeldOut(name, csim, ssim, int(known.sum()), below))
-    return rows
+        percent[CEILING][rows, MM_BINARY] = 100.0 * pair_means(len(inks), score)
+        for name in images:
+            percent[name][rows, MM_BINARY] = 100.0 * similarity(_binary(images[name]), inks, Alignment.MM)
+    ceiling = np.apply_along_axis(ceiling_values, 0, percent[CEILING], conditions)
+    stats = statistics(CEILING, ceiling, conditions)
+    return [*stats, *(stat for name in models for stat in statistics(name, percent[name], conditions, None, ceiling))]
 
 
 def _binary(image: Images) -> Floats:

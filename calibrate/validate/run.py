@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.commands import ValidateRequest
-from brushloop.calibrate.compare import KEYS, Alignment, Pixels, Tone, brush_of, images_of, similarity
+from brushloop.calibrate.compare import MM_BINARY, Alignment, Pixels, brush_of, images_of, similarity
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.fit import BrushFit
 from brushloop.calibrate.fit.heldout import Refit, leave_out, refits
@@ -56,7 +56,6 @@ DRAWS = 2
 """Random draws to average, since a fit from few presses depends on which are drawn."""
 MAX_SCORED, MIN_LEFT = 200, 5
 """Most and fewest other presses that such a fit is scored on."""
-MM_BINARY = KEYS.index((Alignment.MM, Tone.BINARY))
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,9 +11,8 @@ import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, cast
+from typing import ClassVar
 
-import cv2
 import numpy as np
 
 from brushloop.calibrate.artefact import Frozen, made_by
@@ -27,6 +26,7 @@ from brushloop.calibrate.compare import (
     Polarity,
     Tone,
     averaged,
+    shrunk,
     similarity,
     to_tone,
 )
@@ -201,7 +201,7 @@ def compare_written(path: Path, plan: Plan, progress: Progress = unseen) -> Writ
     writings: dict[str, dict[str, Ink]] = {}
     cut = list[str]()
     for stroke_id, name, prepared in read_writings(session, refused, progress):
-        ink = {Tone.BINARY: _small(prepared.mask.astype(np.float32)), Tone.GRAY: _small(prepared.soft)}
+        ink = {Tone.BINARY: shrunk(prepared.mask.astype(np.float32)), Tone.GRAY: shrunk(prepared.soft)}
         writings.setdefault(name, {})[stroke_id] = ink
         if prepared.cut:
             cut.append(stroke_id)
@@ -254,10 +254,6 @@ def aligned(ink: Image, alignment: Alignment) -> Image:
 def as_ink(image: Image) -> Ink:
     """Make ink from an image that was not photographed: its darkness is its coverage."""
     return dict.fromkeys(Tone, image)
-
-
-def _small(image: Image) -> Image:
-    return cast("Image", cv2.resize(image, (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA))
 
 
 def round_of(character: Character, side_mm: float) -> Round:

@@ -16,8 +16,10 @@ import pytest
 from typer.testing import CliRunner
 
 import brushloop.__main__
+from brushloop.calibrate.compare import Alignment, Tone
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.fit.heldout import HeldOut
+from brushloop.calibrate.scores import Stat
+from brushloop.calibrate.stats import Summary
 from brushloop.drivers.sim.brush.spec import BrushSpec, CameraNoise, SoundHead, load_brush
 from brushloop.twin.brush import SHAPE
 from brushloop.twin.run import PARTS, Estimate, Twin, TwinStopped, noise_of, twin_toml, workers
@@ -27,6 +29,9 @@ from tests.twin.test_search import Serial
 from tests.waiting import wait_until
 
 CONDITIONS = [(height, tilt) for height in (3.0, 4.0, 5.0) for tilt in (0.0, 5.0)]
+HELD_OUT = Stat(
+    model="twin", alignment=Alignment.MM, tone=Tone.BINARY, cell=None, csim=Summary(45, 95.1), ssim=Summary(45, 90.2)
+)
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +90,7 @@ def test_a_session_gets_a_twin_and_a_run_that_was_broken_off_goes_on(
 def test_a_twin_is_read_back_and_what_is_not_determined_has_no_interval(tmp_path: Path) -> None:
     spec = BrushSpec(radius_mm=5.0, length_mm=42.0, friction=0.3, set_deg=9.0, seed=7)
     estimates = tuple(Estimate(one, float(getattr(spec, one.name)), 0.1, 0.4, one.name != "set_deg") for one in SHAPE)
-    fitted = Twin(spec, estimates, None, (HeldOut("twin", 95.1, 90.2, 45),), SoundHead(head_mm=2.2, misplaced_mm=4.0))
+    fitted = Twin(spec, estimates, None, (HELD_OUT,), SoundHead(head_mm=2.2, misplaced_mm=4.0))
     path = tmp_path / "twin.toml"
     path.write_text("\n".join(twin_toml(fitted, 'session "1"\n', 1.234)))
     found = load_brush(path)

@@ -111,15 +111,13 @@ def test_edges_that_the_profile_does_not_have_are_found() -> None:
 def test_held_out_conditions_are_scored_beside_the_ceiling() -> None:
     strokes = presses(a_brush(), CONDITIONS * 3, noise=0.05)
     rows = {row.model: row for row in leave_condition_out(strokes, fit_presses(strokes))}
-    assert rows[FITTED].n == rows[CEILING].n == 15
-    assert rows["uncalibrated"].csim + 5.0 < rows[FITTED].csim <= 100.0
-    below = rows[FITTED].below
-    assert below is not None
-    assert below.avg == pytest.approx(rows[CEILING].csim - rows[FITTED].csim, abs=1e-6)
-    assert below.avg < 2.5
-    assert below.avg_interval is not None
-    assert below.avg_interval[0] < below.avg < below.avg_interval[1]
-    assert rows[CEILING].below is None
+    fitted, ceiling = rows[FITTED].csim, rows[CEILING].csim
+    assert fitted.n == ceiling.n == 15
+    assert rows["uncalibrated"].csim.avg + 5.0 < fitted.avg <= 100.0
+    assert fitted.below_ceiling == pytest.approx(ceiling.avg - fitted.avg, abs=1e-5)
+    assert fitted.below_interval is not None
+    assert fitted.below_interval[0] < fitted.below_ceiling < min(2.5, fitted.below_interval[1])
+    assert ceiling.below_ceiling is None
 
 
 def test_two_presses_of_a_condition_are_enough_for_the_ceiling_and_one_is_not() -> None:
@@ -127,7 +125,7 @@ def test_two_presses_of_a_condition_are_enough_for_the_ceiling_and_one_is_not() 
         strokes = presses(a_brush(), CONDITIONS[:3] * repeats, noise=0.05)
         rows = {row.model: row for row in leave_condition_out(strokes, fit_presses(strokes))}
         assert (CEILING in rows) is known
-        assert (rows[FITTED].below is not None) is known
+        assert (rows[FITTED].csim.below_ceiling is not None) is known
     assert leave_condition_out(presses(a_brush(), CONDITIONS[:1] * 2), a_brush()) == []
     with pytest.raises(ValueError, match="at least one press"):
         fit_presses(presses(a_brush(), []))
