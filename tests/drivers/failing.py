@@ -44,31 +44,32 @@ class PatientClock:
         self._now_s += 1000.0
 
 
-def heard(instrument: Any, clock: PatientClock) -> Any:
-    """The instrument; time runs out where it does not reply."""
-    answer = instrument.answer
+class PatientLine(PtyLine):
+    """The line of an instrument, on which the time of a request runs out where it is not answered as it should be."""
 
-    def answered(request: bytes) -> bytes | None:
-        reply = answer(request)
+    clock = PatientClock()
+
+    def __init__(self, instrument: Any) -> None:
+        super().__init__(instrument)
+        self._answer, instrument.answer = instrument.answer, self._answered
+
+    def _answered(self, request: bytes) -> bytes | None:
+        reply = self._answer(request)
         if not reply:
-            clock.jump_soon()
+            self.clock.jump_soon()
         return reply
 
-    instrument.answer = answered
-    return instrument
+    def fail(self, *faults: str | None) -> None:
+        """Apply these faults to the next requests, one each."""
+        coming = iter(faults)
 
+        def next_fault() -> str | None:
+            fault = next(coming, None)
+            if fault not in (None, "unplug"):
+                self.clock.jump_soon()
+            return fault
 
-def fail_requests(line: PtyLine, clock: PatientClock, *faults: str | None) -> None:
-    """Apply these faults to the next requests on the line, one each; time runs out for those that spoil the reply."""
-    coming = iter(faults)
-
-    def next_fault() -> str | None:
-        fault = next(coming, None)
-        if fault not in (None, "unplug"):
-            clock.jump_soon()
-        return fault
-
-    line.next_fault = next_fault
+        self.next_fault = next_fault
 
 
 class Script:
@@ -94,10 +95,10 @@ class Script:
 
 
 @contextmanager
-def scripted(exchanges: Sequence[tuple[bytes, bytes]], clock: PatientClock) -> Iterator[str]:
+def scripted(*exchanges: tuple[bytes, bytes]) -> Iterator[str]:
     """The port of an instrument that expects these requests and nothing else."""
     script = Script(exchanges)
-    with PtyLine(heard(script, clock)) as line:
+    with PatientLine(script) as line:
         yield line.path
     assert not script.surprises
     assert not script.left, f"never asked for: {script.left}"

@@ -28,17 +28,15 @@ from brushloop.drivers.ink.port import DoseLost, InkRefused
 from brushloop.drivers.ink.pump import ModbusPump, ModbusPumpConfig
 from brushloop.drivers.ink.simulator import PtyLine, PumpFirmware, StationFirmware
 from brushloop.drivers.ink.station import InkStation, InkStationConfig, seal
-from tests.drivers.failing import PatientClock, SetClock, fail_requests, heard, scripted
+from tests.drivers.failing import PatientLine, SetClock, scripted
 from tests.waiting import until
 
 
 @pytest.fixture(autouse=True)
-def clock(monkeypatch: pytest.MonkeyPatch) -> PatientClock:
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """No reply is too late while one is being made, and a silence is over at once."""
-    clock = PatientClock()
-    monkeypatch.setattr(port_module, "time", clock)
+    monkeypatch.setattr(port_module, "time", PatientLine.clock)
     monkeypatch.setattr(station_module, "CONNECT_ATTEMPTS", 2)
-    return clock
 
 
 # ---------------------------------------------------------------- the station
@@ -54,9 +52,9 @@ def station_at(path: str, clock: Clock | None = None) -> InkStation:
 
 
 @asynccontextmanager
-async def talking(clock: PatientClock, *exchanges: tuple[bytes, bytes]) -> AsyncIterator[InkStation]:
+async def talking(*exchanges: tuple[bytes, bytes]) -> AsyncIterator[InkStation]:
     """A connected station that expects these requests and nothing else."""
-    with scripted([HELLO, *exchanges], clock) as path:
+    with scripted(HELLO, *exchanges) as path:
         station = station_at(path)
         await station.connect()
         yield station
@@ -69,27 +67,27 @@ def well() -> StationFirmware:
 
 
 @pytest.fixture
-async def station_line(well: StationFirmware, clock: PatientClock) -> AsyncIterator[PtyLine]:
-    with PtyLine(heard(well, clock)) as line:
+async def station_line(well: StationFirmware) -> AsyncIterator[PatientLine]:
+    with PatientLine(well) as line:
         yield line
 
 
 @pytest.fixture
-async def station(station_line: PtyLine) -> AsyncIterator[InkStation]:
+async def station(station_line: PatientLine) -> AsyncIterator[InkStation]:
     station = station_at(station_line.path)
     await station.connect()
     yield station
     await station.close()
 
 
-async def test_a_session_reads_like_the_documented_one(clock: PatientClock):
+async def test_a_session_reads_like_the_documented_one():
     exchanges = [
         (seal(1, "light 0.500"), seal(1, "ok")),
         (seal(2, "dose 1.250"), seal(2, "ok 1.250")),
         (seal(3, "level"), seal(3, "ok 0.730")),
         (seal(4, "dose 0.500"), seal(4, "err 4 reservoir is empty")),
     ]
-    async with talking(clock, *exchanges) as station:
+    async with talking(*exchanges) as station:
         assert await station.light() == 0.5
         await station.dose(1.25)
         assert await station.level() == 0.73
@@ -109,22 +107,22 @@ async def test_a_session_reads_like_the_documented_one(clock: PatientClock):
     ],
 )
 async def test_a_reply_that_is_lost_twice_or_makes_no_sense_is_an_error(
-    clock: PatientClock, exchanges: list[tuple[bytes, bytes]], error: type[DeviceError], says: str
+    exchanges: list[tuple[bytes, bytes]], error: type[DeviceError], says: str
 ):
-    async with talking(clock, *exchanges) as station:
+    async with talking(*exchanges) as station:
         with pytest.raises(error, match=says):
             await (station.level() if exchanges[0][0] == LEVEL else station.dose(0.5))
 
 
-async def test_a_board_that_starts_slowly_is_waited_for_and_another_device_is_refused(clock: PatientClock):
+async def test_a_board_that_starts_slowly_is_waited_for_and_another_device_is_refused():
     hello, answer = HELLO
-    with scripted([(hello, b""), (hello, answer)], clock) as path:
+    with scripted((hello, b""), (hello, answer)) as path:
         station = station_at(path)
         identity = await station.connect()
         assert (identity.model, identity.firmware, identity.simulated) == ("ink-station", "1.0.0", False)
         await station.close()
     for other in (b"000 ok ink-station 2 9.0 real*24F2\n", b"000 ok gcode 1.1 real x*EE49\n"):
-        with scripted([(hello, other)], clock) as path:
+        with scripted((hello, other)) as path:
             station = station_at(path)
             with pytest.raises(ProtocolViolation, match=r"expected ink-station with protocol 1.*Check that the path"):
                 await station.connect()
@@ -134,14 +132,14 @@ async def test_a_board_that_starts_slowly_is_waited_for_and_another_device_is_re
 
 @pytest.mark.parametrize("fault", ["deaf", "mute", "garbage", "late"])
 async def test_one_fault_gives_the_dose_once_and_one_that_lasts_is_an_error(
-    fault: str, station_line: PtyLine, well: StationFirmware, station: InkStation, clock: PatientClock
+    fault: str, station_line: PatientLine, well: StationFirmware, station: InkStation
 ):
-    fail_requests(station_line, clock, fault)
+    station_line.fail(fault)
     await station.dose(1.0)
     assert well.well.ml == 11.0
     assert await station.level() == 0.55
     if fault != "late":
-        fail_requests(station_line, clock, fault, fault)
+        station_line.fail(fault, fault)
         with pytest.raises((DeviceTimeout, ProtocolViolation), match="may be in the well"):
             await station.dose(1.0)
         assert well.well.ml == (11.0 if fault == "deaf" else 12.0)
@@ -149,9 +147,9 @@ async def test_one_fault_gives_the_dose_once_and_one_that_lasts_is_an_error(
 
 
 async def test_a_pulled_cable_is_a_lost_connection_at_once_and_leads_to_no_other_station(
-    station_line: PtyLine, station: InkStation, clock: PatientClock
+    station_line: PatientLine, station: InkStation
 ):
-    fail_requests(station_line, clock, "unplug")
+    station_line.fail("unplug")
     with pytest.raises(ConnectionLost, match=r"may be in the well.*Check cable") as lost:
         await station.dose(1.0)
     assert lost.value.op == "dose"
@@ -161,7 +159,7 @@ async def test_a_pulled_cable_is_a_lost_connection_at_once_and_leads_to_no_other
 
 
 async def test_a_port_that_is_missing_or_held_by_somebody_else_is_not_opened(
-    tmp_path: Path, station_line: PtyLine, station: InkStation
+    tmp_path: Path, station_line: PatientLine, station: InkStation
 ):
     nowhere = station_at(str(tmp_path / "ttyUSB0"))
     with pytest.raises(ConnectionLost, match=r"cannot open .*ttyUSB0"):
@@ -175,7 +173,7 @@ async def test_a_port_that_is_missing_or_held_by_somebody_else_is_not_opened(
 
 
 async def test_closing_ends_an_exchange_that_waits_and_a_cancelled_one_does_not_disturb_the_next(
-    station_line: PtyLine, station: InkStation
+    station_line: PatientLine, station: InkStation
 ):
     faults = iter(["mute", "late"])  # the clock stands still: each would wait for ever
     station_line.next_fault = lambda: next(faults, None)
@@ -194,14 +192,14 @@ async def test_closing_ends_an_exchange_that_waits_and_a_cancelled_one_does_not_
 
 
 async def test_the_limit_per_minute_slides_and_counts_what_was_not_confirmed(
-    station_line: PtyLine, well: StationFirmware, clock: PatientClock
+    station_line: PatientLine, well: StationFirmware
 ):
     minute = SetClock()
     station = station_at(station_line.path, minute)
     await station.connect()
     await station.dose(2.0)
     minute.s = 30.0
-    fail_requests(station_line, clock, "deaf", "deaf")
+    station_line.fail("deaf", "deaf")
     with pytest.raises(DeviceTimeout):
         await station.dose(2.0)
     with pytest.raises(LimitExceeded, match=r"dose per minute = 5\.500"):
@@ -257,13 +255,13 @@ def rotor() -> PumpFirmware:
 
 
 @pytest.fixture
-async def pump_line(rotor: PumpFirmware, clock: PatientClock) -> AsyncIterator[PtyLine]:
-    with PtyLine(heard(rotor, clock)) as line:
+async def pump_line(rotor: PumpFirmware) -> AsyncIterator[PatientLine]:
+    with PatientLine(rotor) as line:
         yield line
 
 
 @pytest.fixture
-async def pump(pump_line: PtyLine, rotor: PumpFirmware) -> AsyncIterator[ModbusPump]:
+async def pump(pump_line: PatientLine, rotor: PumpFirmware) -> AsyncIterator[ModbusPump]:
     pump = pump_at(pump_line.path)
     await pump.connect()
     yield pump
@@ -271,8 +269,8 @@ async def pump(pump_line: PtyLine, rotor: PumpFirmware) -> AsyncIterator[ModbusP
     assert not rotor.running
 
 
-async def test_a_dose_sets_the_speed_starts_and_stops(clock: PatientClock):
-    with scripted([*CONNECTED, (SPEED, SPEED), (START, START), (STOP, STOP), *BYE], clock) as path:
+async def test_a_dose_sets_the_speed_starts_and_stops():
+    with scripted(*CONNECTED, (SPEED, SPEED), (START, START), (STOP, STOP), *BYE) as path:
         pump = pump_at(path)
         assert isinstance(pump, Ink)
         identity = await pump.connect()
@@ -287,7 +285,7 @@ async def test_a_dose_sets_the_speed_starts_and_stops(clock: PatientClock):
         await pump.close()
 
 
-async def test_it_doses_before_every_nth_dip(pump_line: PtyLine):
+async def test_it_doses_before_every_nth_dip(pump_line: PatientLine):
     pump = pump_at(pump_line.path, dose_ml=0.02, every_dips=3)
     await pump.connect()
     assert [(await pump.replenish(dips)).dosed_ml for dips in range(7)] == [0.0, 0.0, 0.02, 0.02, 0.02, 0.04, 0.04]
@@ -295,8 +293,8 @@ async def test_it_doses_before_every_nth_dip(pump_line: PtyLine):
     assert pump._table.doses_ml(7) == pytest.approx(0.04)
 
 
-async def test_a_line_that_echoes_is_refused(clock: PatientClock):
-    with scripted([(PROBE, PROBE)], clock) as path:
+async def test_a_line_that_echoes_is_refused():
+    with scripted((PROBE, PROBE)) as path:
         pump = pump_at(path)
         with pytest.raises(ProtocolViolation, match=r"echoes.*Switch off local echo"):
             await pump.connect()
@@ -314,10 +312,10 @@ async def test_a_line_that_echoes_is_refused(clock: PatientClock):
     ids=["a speed that is refused", "a start without a reply", "a stop without a reply, sent three times"],
 )
 async def test_a_dose_that_fails_says_how_the_pump_is_left(
-    clock: PatientClock, exchanges: list[tuple[bytes, bytes]], error: type[DeviceError], says: str
+    exchanges: list[tuple[bytes, bytes]], error: type[DeviceError], says: str
 ):
     runs_on = exchanges[-1] == SILENT
-    with scripted([*CONNECTED, *exchanges, *([SILENT] * 3 if runs_on else BYE)], clock) as path:
+    with scripted(*CONNECTED, *exchanges, *([SILENT] * 3 if runs_on else BYE)) as path:
         pump = pump_at(path)
         await pump.connect()
         with pytest.raises(error, match=says):
@@ -330,11 +328,11 @@ async def test_a_dose_that_fails_says_how_the_pump_is_left(
 
 @pytest.mark.parametrize("times", [1, 3])
 async def test_a_cancelled_dose_stops_the_pump_however_often_it_is_cancelled(
-    rotor: PumpFirmware, pump_line: PtyLine, pump: ModbusPump, clock: PatientClock, times: int
+    rotor: PumpFirmware, pump_line: PatientLine, pump: ModbusPump, times: int
 ):
     dosing = asyncio.create_task(pump.dose(2.0))
     await until(lambda: rotor.running, "the pump to run")
-    fail_requests(pump_line, clock, "late")
+    pump_line.fail("late")
     for _ in range(times):
         dosing.cancel()
         await asyncio.sleep(0.02)
@@ -343,7 +341,7 @@ async def test_a_cancelled_dose_stops_the_pump_however_often_it_is_cancelled(
     assert not rotor.running
 
 
-async def test_a_cancelled_dose_whose_stop_fails_says_so(rotor: PumpFirmware, pump_line: PtyLine):
+async def test_a_cancelled_dose_whose_stop_fails_says_so(rotor: PumpFirmware, pump_line: PatientLine):
     pump = pump_at(pump_line.path)
     await pump.connect()
     dosing = asyncio.create_task(pump.dose(2.0))
@@ -360,9 +358,9 @@ async def test_a_cancelled_dose_whose_stop_fails_says_so(rotor: PumpFirmware, pu
 @pytest.mark.parametrize("fault", ["deaf", "garbage", "late"])
 @pytest.mark.parametrize("at", ["speed", "start", "stop"])
 async def test_a_fault_anywhere_leaves_the_pump_stopped_and_no_late_reply_passes_for_the_next(
-    fault: str, at: str, rotor: PumpFirmware, pump_line: PtyLine, pump: ModbusPump, clock: PatientClock
+    fault: str, at: str, rotor: PumpFirmware, pump_line: PatientLine, pump: ModbusPump
 ):
-    fail_requests(pump_line, clock, *[None] * ("speed", "start", "stop").index(at), fault)
+    pump_line.fail(*[None] * ("speed", "start", "stop").index(at), fault)
     if at == "stop":
         await pump.dose(0.01)  # the second stop is confirmed
     else:
@@ -377,7 +375,7 @@ async def test_a_fault_anywhere_leaves_the_pump_stopped_and_no_late_reply_passes
 
 @pytest.mark.parametrize("after_requests", [0, 1, 2])
 async def test_closing_in_mid_dose_leaves_the_pump_stopped(
-    rotor: PumpFirmware, pump_line: PtyLine, after_requests: int
+    rotor: PumpFirmware, pump_line: PatientLine, after_requests: int
 ):
     pump = pump_at(pump_line.path)
     await pump.connect()
