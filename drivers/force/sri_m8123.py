@@ -158,14 +158,12 @@ class ForceTable(BaseModel, frozen=True, extra="forbid"):
         return self
 
 
-Round = tuple[Stamp, Wrench]
-
-
 class RoundStream:
     """Starts the sensor, reads it until `stop`, and stops it again. Use one for each connection."""
 
-    def __init__(self, table: ForceTable, clock: Clock, on_round: Callable[[Round], None]) -> None:
-        """`on_round` gets each round, in the reader's thread."""
+    def __init__(self, table: ForceTable, clock: Clock, on_round: Callable[[RoundStream, Stamp, Wrench], None]) -> None:
+        """`on_round` gets each round, in the event loop that runs now."""
+        self._loop = asyncio.get_running_loop()
         self._table = table
         self.assembler = RoundAssembler()
         """Counts the rounds that were dropped."""
@@ -173,13 +171,11 @@ class RoundStream:
         self._on_round = on_round
         self._closing = threading.Event()
         self.bus_errors = 0
-        self.newest: Round | None = None
+        self.newest: tuple[Stamp, Wrench] | None = None
         self.alike_since = Stamp(0)
         """Of the first round in a row that exactly equals the newest; a strain gauge is never that still."""
         self.loss: tuple[str, str] | None = None
         """Why the stream ended, and what to do about it."""
-        self.collecting: list[Wrench] | None = None
-        """Collects every round while an average is taken."""
         self._thread = threading.Thread(target=self._run, name="force reader", daemon=True)
         self._thread.start()
 
@@ -251,9 +247,8 @@ class RoundStream:
         if self.newest is None or wrench != self.newest[1]:
             self.alike_since = stamp
         self.newest = (stamp, wrench)
-        if (collecting := self.collecting) is not None:
-            collecting.append(wrench)
-        self._on_round(self.newest)
+        with contextlib.suppress(RuntimeError):  # the loop ended before the stream was closed
+            self._loop.call_soon_threadsafe(self._on_round, self, stamp, wrench)
 
     def _lose_bus(self, what: str) -> None:
         self.loss = (
@@ -272,6 +267,8 @@ class SriM8123:
         self._stream: RoundStream | None = None
         self._listener: Callable[[ForceSample], None] | None = None
         self._biasing = asyncio.Lock()
+        self._averaged: list[Wrench] | None = None
+        """Collects every round while an average is taken."""
         self.bias_wrench = NO_BIAS
         """What is subtracted from every round; raw value = sample + bias."""
 
@@ -281,19 +278,8 @@ class SriM8123:
         After a failure the board is stopped and nothing is left open. A bias does not survive.
         """
         await self.close()
-        loop = asyncio.get_running_loop()
         self.bias_wrench = NO_BIAS
-
-        def on_round(latest: Round) -> None:
-            if self._listener is not None:
-                with contextlib.suppress(RuntimeError):  # the loop ended before the stream was closed
-                    loop.call_soon_threadsafe(deliver, latest)
-
-        def deliver(latest: Round) -> None:
-            if self._stream is stream and self._listener is not None:
-                self._listener(self._sample(*latest))
-
-        stream = self._stream = RoundStream(self._table, self._clock, on_round)
+        stream = self._stream = RoundStream(self._table, self._clock, self._hear)
         try:
             async with asyncio.timeout(CONNECT_S):
                 while stream.newest is None:
@@ -340,12 +326,11 @@ class SriM8123:
         """
         async with self._biasing:
             stream = self._require("bias")
-            rounds: list[Wrench] = []
-            stream.collecting = rounds
+            rounds = self._averaged = list[Wrench]()
             try:
                 await asyncio.sleep(seconds)
             finally:
-                stream.collecting = None
+                self._averaged = None
             if self._stream is not stream:
                 raise NotConnected(DEVICE, "bias", "closed while averaging")
             self.latest()
@@ -367,16 +352,22 @@ class SriM8123:
 
     @property
     def stream(self) -> RoundStream:
-        """Counters since `connect`. Raises `NotConnected`; a lost connection still has them."""
-        if self._stream is None:
-            raise NotConnected(DEVICE, "stream", "not connected")
-        return self._stream
+        """Counters since `connect`. Raises `NotConnected`, `ConnectionLost`."""
+        return self._require("stream")
 
     async def close(self) -> None:
         """Stop the board, shut the bus down, join the reader; may be repeated."""
         stream, self._stream = self._stream, None
         if stream is not None:
             await asyncio.shield(asyncio.to_thread(stream.stop))
+
+    def _hear(self, stream: RoundStream, stamp: Stamp, wrench: Wrench) -> None:
+        if stream is not self._stream:
+            return  # of an earlier connection
+        if self._averaged is not None:
+            self._averaged.append(wrench)
+        if self._listener is not None:
+            self._listener(self._sample(stamp, wrench))
 
     def _require(self, op: str) -> RoundStream:
         if self._stream is None:
