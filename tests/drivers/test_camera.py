@@ -6,7 +6,7 @@ import asyncio
 import queue
 import re
 import threading
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any, ClassVar
@@ -50,6 +50,8 @@ class Feed:
         self.t_ns = 10**12
         self._pictures: queue.Queue[bytes | NDArray[np.uint8] | None] = queue.Queue()
         self.released = threading.Event()
+        self.notices: list[str] = []
+        """What the camera said of it."""
 
     def now_ns(self) -> int:
         return self.t_ns
@@ -88,15 +90,10 @@ def sources(feed: Feed, monkeypatch: pytest.MonkeyPatch) -> list[Feed]:
 
 
 @pytest.fixture
-def notices() -> list[str]:
-    return []
-
-
-@pytest.fixture
-async def camera(feed: Feed, sources: list[Feed], notices: list[str]) -> AsyncIterator[OpenCvCamera]:
+async def camera(feed: Feed, sources: list[Feed]) -> AsyncIterator[OpenCvCamera]:
     """Connected, over a feed that has shown `SOUND`; it gives up after two seconds."""
     table = CameraTable(kind="opencv", source="rtsp://camera", latency_ms=0.0)
-    camera = OpenCvCamera(table, feed, notices.append)
+    camera = OpenCvCamera(table, feed, feed.notices.append)
     feed.show(SOUND)
     await camera.connect()
     assert camera._grabber is not None
@@ -113,9 +110,9 @@ async def asked(camera: OpenCvCamera, feed: Feed) -> asyncio.Task[Any]:
     return task
 
 
-def camera_at(source: str, on_notice: Callable[[str], None] = lambda _text: None, **more: Any) -> OpenCvCamera:
+def camera_at(source: str, **more: Any) -> OpenCvCamera:
     table = {"kind": "opencv", "source": source, "timeout_s": 60.0, **more}
-    return OpenCvCamera(CameraTable.model_validate(table), HostClock(), on_notice)
+    return OpenCvCamera(CameraTable.model_validate(table), HostClock())
 
 
 async def test_no_frame_is_older_than_asked_by_the_latency_and_the_first_is_as_old_as_the_connection(
@@ -151,20 +148,20 @@ async def test_a_frame_is_decoded_only_when_somebody_looks(
 
 
 async def test_a_stream_that_ends_is_opened_again_and_both_are_reported(
-    camera: OpenCvCamera, feed: Feed, sources: list[Feed], notices: list[str]
+    camera: OpenCvCamera, feed: Feed, sources: list[Feed]
 ):
     feed.show(None)
-    await until(lambda: notices, "the end of the stream")
+    await until(lambda: feed.notices, "the end of the stream")
     with pytest.raises(DeviceTimeout, match="the stream ended and is opened again"):
         await camera.fresh(Stamp(feed.now_ns() + 1))
     second = Feed()
     sources.append(second)
-    await until(lambda: len(notices) == 2, "the stream to be opened")
+    await until(lambda: len(feed.notices) == 2, "the stream to be opened")
     second.show(picture := page())
     await until(lambda: camera._grabber._newest.picture is picture, "a picture")  # type: ignore[union-attr]
     assert np.array_equal((await camera.fresh(Stamp(0))).image, picture)
-    assert notices[0] == "camera: the stream ended and is opened again"
-    assert notices[1].startswith("camera is back after")
+    assert feed.notices[0] == "camera: the stream ended and is opened again"
+    assert feed.notices[1].startswith("camera is back after")
     second.show(None)
 
 
@@ -229,27 +226,25 @@ async def test_a_server_that_says_nothing_is_given_up():
 # ---------------------------------------------------------------- one frame after the other
 
 
-def inked() -> np.ndarray:
+def filled(rows: slice, columns: slice, level: int) -> np.ndarray:
     image = page()
-    image[200:260, 100:500] = 20
+    image[rows, columns] = level
     return image
 
 
-def cut(fill: int) -> np.ndarray:
-    image = page()
-    image[400:] = fill
-    return image
+END = slice(400, None)
+WHOLE = slice(None)
 
 
 @pytest.mark.parametrize(
     ("image", "fault"),
     [
-        (inked(), None),
+        (filled(slice(200, 260), slice(100, 500), 20), None),
         (page(8.0, 3.0), FrameFault.BLACK),
         (page(300.0), FrameFault.SATURATED),
         (page(245.0), None),
-        (cut(0), FrameFault.TORN),
-        (cut(200), FrameFault.TORN),
+        (filled(END, WHOLE, 0), FrameFault.TORN),
+        (filled(END, WHOLE, 200), FrameFault.TORN),
     ],
     ids=["ink", "lens cap", "overexposed", "white paper", "black end", "gray end"],
 )

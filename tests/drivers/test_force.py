@@ -9,7 +9,7 @@ import re
 import threading
 import time
 from collections.abc import AsyncIterator, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import asynccontextmanager, contextmanager
 from functools import partial
 from itertools import count, pairwise
 
@@ -27,6 +27,7 @@ from tests.waiting import until
 
 WRENCH: Wrench = (1.0, -2.0, 3.5, 0.25, -0.5, 0.125)
 NUMBERS = count()
+RATE_HZ = 100.0
 
 
 @pytest.fixture(autouse=True)
@@ -37,7 +38,7 @@ def lenient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @contextmanager
-def served(channel: str, board: ForceBoard, rate_hz: float = 200.0) -> Iterator[ForceBoard]:
+def served(channel: str, board: ForceBoard) -> Iterator[None]:
     """Serve the board in a thread on python-can's `virtual` bus, which no other process can reach."""
     bus, over = can.Bus(channel, "virtual", ignore_config=True), threading.Event()
 
@@ -47,27 +48,16 @@ def served(channel: str, board: ForceBoard, rate_hz: float = 200.0) -> Iterator[
             if (message := bus.recv(max(0.0, due_s - time.monotonic()))) is not None:
                 board.obey(CanFrame(message.arbitration_id, bytes(message.data), message.is_error_frame))
             elif time.monotonic() >= due_s:
-                due_s = max(due_s + 1.0 / rate_hz, time.monotonic())
+                due_s = max(due_s + 1.0 / RATE_HZ, time.monotonic())
                 for frame in board.round(due_s - began_s):
                     bus.send(can.Message(0.0, frame.can_id, frame.error, False, frame.error, data=frame.data))
 
     thread = threading.Thread(target=stream, daemon=True)
     thread.start()
-    yield board
+    yield
     over.set()
     thread.join()
     bus.shutdown()
-
-
-@pytest.fixture
-def channel() -> str:
-    return f"force-{next(NUMBERS)}"
-
-
-@pytest.fixture
-def board(channel: str) -> Iterator[ForceBoard]:
-    with served(channel, ForceBoard(lambda _: WRENCH), rate_hz=100.0) as board:
-        yield board
 
 
 def sensor_on(channel: str, stale_ms: float = 1e6) -> SriM8123:
@@ -75,26 +65,39 @@ def sensor_on(channel: str, stale_ms: float = 1e6) -> SriM8123:
     return SriM8123(table.model_copy(update={"stale_ms": stale_ms}), HostClock())
 
 
+@asynccontextmanager
+async def sensing(board: ForceBoard, stale_ms: float = 1e6) -> AsyncIterator[SriM8123]:
+    """A sensor that is connected to the board."""
+    with served(channel := f"force-{next(NUMBERS)}", board):
+        sensor = sensor_on(channel, stale_ms)
+        await sensor.connect()
+        yield sensor
+        await sensor.close()
+
+
 @pytest.fixture
-async def sensor(board: ForceBoard, channel: str) -> AsyncIterator[SriM8123]:
-    sensor = sensor_on(channel)
-    await sensor.connect()
-    yield sensor
-    await sensor.close()
+def board() -> ForceBoard:
+    return ForceBoard(lambda _: WRENCH)
+
+
+@pytest.fixture
+async def sensor(board: ForceBoard) -> AsyncIterator[SriM8123]:
+    async with sensing(board) as sensor:
+        yield sensor
 
 
 def readers() -> int:
     return sum(t.name == "force reader" for t in threading.enumerate())
 
 
-async def test_connecting_starts_the_board_and_closing_stops_it(board: ForceBoard, channel: str):
-    sensor = sensor_on(channel)
-    identity = await sensor.connect()
-    assert (identity.model, identity.simulated) == (f"SRI M8123B2 on virtual {channel}", True)
-    assert sensor.latest().force_n == WRENCH[:3]
-    assert sensor.latest().torque_nm == WRENCH[3:]
-    await sensor.close()
-    await until(lambda: not board.streaming, "the driver")
+async def test_connecting_starts_the_board_and_closing_stops_it(board: ForceBoard):
+    sensor = sensor_on("a board")
+    with served("a board", board):
+        identity = await sensor.connect()
+        assert (identity.model, identity.simulated) == ("SRI M8123B2 on virtual a board", True)
+        assert (sensor.latest().force_n, sensor.latest().torque_nm) == (WRENCH[:3], WRENCH[3:])
+        await sensor.close()
+        await until(lambda: not board.streaming, "the driver")
     assert readers() == 0
     with pytest.raises(NotConnected):
         sensor.latest()
@@ -135,28 +138,24 @@ def latest_error(sensor: SriM8123) -> DeviceError | None:
 
 @pytest.mark.parametrize("fault", ["silence", "nan"])
 async def test_silence_and_what_is_no_number_make_the_sample_stale_until_it_measures_again(
-    board: ForceBoard, channel: str, fault: str
+    board: ForceBoard, fault: str
 ):
-    sensor, seen = sensor_on(channel, stale_ms=250.0), list[ForceSample]()
-    await sensor.connect()
-    sensor.listen(seen.append)
-    board.next_fault = lambda: fault
-    await until(lambda: isinstance(latest_error(sensor), Stale), "a stale sample")
-    if fault != "silence":
-        await until(lambda: sensor.stream.assembler.refused >= 2, "refused rounds")
-    board.next_fault = lambda: None
-    await until(lambda: latest_error(sensor) is None, "a new sample")
+    seen: list[ForceSample] = []
+    async with sensing(board, stale_ms=250.0) as sensor:
+        sensor.listen(seen.append)
+        board.next_fault = lambda: fault
+        await until(lambda: isinstance(latest_error(sensor), Stale), "a stale sample")
+        if fault != "silence":
+            await until(lambda: sensor.stream.assembler.refused >= 2, "refused rounds")
+        board.next_fault = lambda: None
+        await until(lambda: latest_error(sensor) is None, "a new sample")
     assert all(math.isfinite(value) for s in seen for value in (*s.force_n, *s.torque_nm))
-    await sensor.close()
 
 
-async def test_a_sensor_that_says_the_same_again_and_again_is_named_as_stuck(
-    channel: str, monkeypatch: pytest.MonkeyPatch
-):
+async def test_a_sensor_that_says_the_same_again_and_again_is_named_as_stuck(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sri_m8123, "STUCK_MS", 100.0)
-    with served(channel, ForceBoard(lambda _: WRENCH, noise_n=0.002, noise_nm=2e-4)) as board:
-        sensor = sensor_on(channel)
-        await sensor.connect()
+    board = ForceBoard(lambda _: WRENCH, noise_n=0.002, noise_nm=2e-4)
+    async with sensing(board) as sensor:
         await until(lambda: sensor.latest().stamp.seq > 50, "rounds")
         assert sensor.latest().force_n == pytest.approx(WRENCH[:3], abs=0.02)
         board.next_fault = lambda: "stuck"
@@ -165,7 +164,6 @@ async def test_a_sensor_that_says_the_same_again_and_again_is_named_as_stuck(
         assert re.search(words, str(latest_error(sensor)))
         board.next_fault = lambda: None
         await until(lambda: latest_error(sensor) is None, "a sensor that measures")
-        await sensor.close()
 
 
 async def test_bus_off_is_a_lost_connection_that_says_what_to_do_and_a_bus_error_is_counted(
@@ -201,9 +199,9 @@ async def test_an_adapter_that_goes_away_is_a_lost_connection(
         sensor.latest()
 
 
-async def test_where_no_board_answers_the_connection_times_out(channel: str, monkeypatch: pytest.MonkeyPatch):
+async def test_where_no_board_answers_the_connection_times_out(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sri_m8123, "CONNECT_S", 0.2)
-    sensor = sensor_on(channel)
+    sensor = sensor_on("nobody")
     with pytest.raises(DeviceTimeout, match=r"no whole round in 0.2 s \(0 torn, 0 refused\).*termination"):
         await sensor.connect()
     assert readers() == 0
@@ -219,11 +217,9 @@ async def test_an_adapter_that_is_not_there_is_a_lost_connection(interface: str)
     assert readers() == 0
 
 
-async def test_a_bias_is_subtracted_from_now_on(channel: str):
+async def test_a_bias_is_subtracted_from_now_on():
     load: list[Wrench] = [WRENCH]
-    with served(channel, ForceBoard(lambda _: load[0], noise_n=0.02, noise_nm=0.002)):
-        sensor = sensor_on(channel)
-        await sensor.connect()
+    async with sensing(ForceBoard(lambda _: load[0], noise_n=0.02, noise_nm=0.002)) as sensor:
         await sensor.bias(0.4)
         assert sensor.bias_wrench == pytest.approx(WRENCH, abs=0.02)
         seen: list[ForceSample] = []
@@ -231,21 +227,17 @@ async def test_a_bias_is_subtracted_from_now_on(channel: str):
         sensor.listen(seen.append)
         await until(lambda: len(seen) > 5, "the driver")
         assert seen[-1].force_n == pytest.approx((0.0, 0.0, 5.0), abs=0.1)
-        await sensor.close()
 
 
 @pytest.mark.parametrize(("axis", "size", "says"), [(2, 1.0, "Fz varied"), (3, 0.1, "Mx varied")])
-async def test_a_bias_while_something_moves_is_refused(channel: str, axis: int, size: float, says: str):
+async def test_a_bias_while_something_moves_is_refused(axis: int, size: float, says: str):
     def shake(t_s: float) -> Wrench:
         return tuple(v + size * math.sin(50.0 * t_s) * (k == axis) for k, v in enumerate(WRENCH))
 
-    with served(channel, ForceBoard(shake)):
-        sensor = sensor_on(channel)
-        await sensor.connect()
+    async with sensing(ForceBoard(shake)) as sensor:
         with pytest.raises(DeviceError, match=rf"{says}.*The previous bias remains.*try again"):
             await sensor.bias(0.2)
         assert sensor.bias_wrench == (0.0,) * 6
-        await sensor.close()
 
 
 async def test_a_bias_over_silence_is_refused_and_closing_ends_one(board: ForceBoard, sensor: SriM8123):
