@@ -266,7 +266,6 @@ class SriM8123:
         self._clock = clock
         self._stream: RoundStream | None = None
         self._listener: Callable[[ForceSample], None] | None = None
-        self._biasing = asyncio.Lock()
         self._averaged: list[Wrench] | None = None
         """Collects every round while an average is taken."""
         self.bias_wrench = NO_BIAS
@@ -324,31 +323,30 @@ class SriM8123:
         Raises `DeviceError` if the sensor was not still, `Stale` or `DeviceTimeout` if it sent too little; the previous
         bias then remains.
         """
-        async with self._biasing:
-            stream = self._require("bias")
-            rounds = self._averaged = list[Wrench]()
-            try:
-                await asyncio.sleep(seconds)
-            finally:
-                self._averaged = None
-            if self._stream is not stream:
-                raise NotConnected(DEVICE, "bias", "closed while averaging")
-            self.latest()
-            if len(rounds) < MIN_BIAS_ROUNDS:
-                what = f"{len(rounds)} rounds in {seconds:g} s, {MIN_BIAS_ROUNDS} are needed"
-                raise DeviceTimeout(DEVICE, "bias", what, remedy="Average for longer.")
-            axes = list(zip(*rounds, strict=True))
-            for name, values in zip(AXES, axes, strict=True):
-                limit, unit = (STILL_N, "N") if name.startswith("F") else (STILL_NM, "Nm")
-                if (deviation := statistics.stdev(values)) > limit:
-                    raise DeviceError(
-                        DEVICE,
-                        "bias",
-                        f"{name} varied by {deviation:.4f} {unit} (standard deviation), limit {limit:g} {unit}",
-                        condition="The previous bias remains.",
-                        remedy="Let nothing touch the brush, wait until the arm is still, and try again.",
-                    )
-            self.bias_wrench = tuple(statistics.fmean(values) for values in axes)
+        stream = self._require("bias")
+        rounds = self._averaged = list[Wrench]()
+        try:
+            await asyncio.sleep(seconds)
+        finally:
+            self._averaged = None
+        if self._stream is not stream:
+            raise NotConnected(DEVICE, "bias", "closed while averaging")
+        self.latest()
+        if len(rounds) < MIN_BIAS_ROUNDS:
+            what = f"{len(rounds)} rounds in {seconds:g} s, {MIN_BIAS_ROUNDS} are needed"
+            raise DeviceTimeout(DEVICE, "bias", what, remedy="Average for longer.")
+        axes = list(zip(*rounds, strict=True))
+        for name, values in zip(AXES, axes, strict=True):
+            limit, unit = (STILL_N, "N") if name.startswith("F") else (STILL_NM, "Nm")
+            if (deviation := statistics.stdev(values)) > limit:
+                raise DeviceError(
+                    DEVICE,
+                    "bias",
+                    f"{name} varied by {deviation:.4f} {unit} (standard deviation), limit {limit:g} {unit}",
+                    condition="The previous bias remains.",
+                    remedy="Let nothing touch the brush, wait until the arm is still, and try again.",
+                )
+        self.bias_wrench = tuple(statistics.fmean(values) for values in axes)
 
     @property
     def stream(self) -> RoundStream:

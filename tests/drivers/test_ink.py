@@ -375,10 +375,8 @@ async def test_a_fault_anywhere_leaves_the_pump_stopped_and_no_late_reply_passes
 
 @pytest.mark.parametrize("after_requests", [0, 1, 2])
 async def test_closing_in_mid_dose_leaves_the_pump_stopped(
-    rotor: PumpFirmware, pump_line: PatientLine, after_requests: int
+    rotor: PumpFirmware, pump_line: PatientLine, pump: ModbusPump, after_requests: int
 ):
-    pump = pump_at(pump_line.path)
-    await pump.connect()
     requests: list[None] = []
     pump_line.next_fault = lambda: requests.append(None)
     dosing = asyncio.create_task(pump.dose(0.02))

@@ -16,7 +16,6 @@ from brushloop.drivers.sim.brush.footprint import (
     FLAWLESS,
     Flaw,
     Trouble,
-    Tuft,
     blank_footprint,
     draw_trouble,
     grow_bristles,
@@ -47,6 +46,9 @@ MAX_DEPTH = 0.9
 
 Descent = tuple[SpineShape, ...]
 """The spine after each load step on the way down; the last is final."""
+
+LIE, PAPER, TROUBLE = range(3)
+"""Streams of random numbers of a press, so that the paper does not change with the number of bristles."""
 
 REMEMBERED_SPINES = 64
 REMEMBERED_STANCES = 8
@@ -84,7 +86,7 @@ class Brush:
             return blank_footprint()
         trouble = FLAWLESS
         if flaw is not None and severity > 0.0:
-            rng = np.random.default_rng([self.spec.seed, press_seed, 2])
+            rng = self._rng(press_seed, TROUBLE)
             trouble = draw_trouble(flaw, severity, self.spec.bristles, self.spec.length_mm, rng)
         spine = _spine(self.spec, float(depth_mm), float(tilt_deg))
         return self.print_descent(spine, ink_load=ink_load, press_seed=press_seed, trouble=trouble)
@@ -116,8 +118,8 @@ class Brush:
         trouble: Trouble = FLAWLESS,
     ) -> Footprint:
         """The mark that a descent leaves, as `press` prints it."""
-        tuft = self._tuft(press_seed, trouble)
-        return print_footprint(descent, tuft, ink_load, px_per_mm, self._paper(press_seed))
+        tuft = wet_tuft(self._bundle, self._bristles, trouble, self._rng(press_seed, LIE))
+        return print_footprint(descent, tuft, ink_load, px_per_mm, self._rng(press_seed, PAPER))
 
     @property
     def set_lean_deg(self) -> float:
@@ -152,8 +154,8 @@ class Brush:
         if deepest <= LEAST_DEPTH_MM:
             return blank_footprint()
         stances = _stances(self.spec, math.ceil(deepest), float(tilt_deg))
-        tuft, paper_rng = self._tuft(press_seed), self._paper(press_seed)
-        return draw_drag(path, stances, math.radians(heading_deg), tuft, ink_load, paper_rng)
+        tuft = wet_tuft(self._bundle, self._bristles, FLAWLESS, self._rng(press_seed, LIE))
+        return draw_drag(path, stances, math.radians(heading_deg), tuft, ink_load, self._rng(press_seed, PAPER))
 
     def _check(self, depth_mm: float, tilt_deg: float, ink_load: float, press_seed: int) -> None:
         within("tilt_deg", tilt_deg, 0.0, MAX_TILT_DEG)
@@ -161,13 +163,8 @@ class Brush:
         within("press_seed", press_seed, 0, 2**63 - 1)
         within("depth_mm", depth_mm, -math.inf, self.deepest_mm(tilt_deg))
 
-    # two random streams, so that the paper does not change with the number of bristles
-    def _tuft(self, press_seed: int, trouble: Trouble = FLAWLESS) -> Tuft:
-        lie_rng = np.random.default_rng([self.spec.seed, press_seed, 0])
-        return wet_tuft(self._bundle, self._bristles, trouble, lie_rng)
-
-    def _paper(self, press_seed: int) -> np.random.Generator:
-        return np.random.default_rng([self.spec.seed, press_seed, 1])
+    def _rng(self, press_seed: int, stream: int) -> np.random.Generator:
+        return np.random.default_rng([self.spec.seed, press_seed, stream])
 
 
 @lru_cache(maxsize=REMEMBERED_SPINES)
