@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import SimpleNamespace
@@ -113,28 +114,39 @@ def arm_is_in(theatre: Theatre, frame: Frame) -> bool:
     return theatre.way(exposed_s) * OVER_MM[0] > OUT_MM
 
 
-@pytest.mark.parametrize("delay_s", [0.0, 0.05, 0.4])
-async def test_a_steady_delay_is_reported(delay_s: float):
-    theatre = Theatre(lambda _t_s: delay_s)
-    photographer = theatre.photographer()
+async def measured_s(photographer: Photographer) -> float:
+    """The delay that it knows after a photograph."""
     await photographer.photograph()
     assert photographer.delay is not None
-    assert photographer.delay.delay_s == pytest.approx(delay_s, abs=PERIOD_S)
+    return photographer.delay.delay_s
 
 
+@pytest.mark.parametrize("before", [(), (1.0, 0.0, 1.0, 0.0)])
+@pytest.mark.parametrize("delay_s", [0.0, 0.05, 0.4])
+async def test_a_steady_delay_is_reported_whatever_the_arm_did_before(delay_s: float, before: tuple[float, ...]):
+    theatre = Theatre(lambda _t_s: delay_s)
+    for way in before:
+        await theatre.go(way)
+    assert await measured_s(theatre.photographer()) == pytest.approx(delay_s, abs=PERIOD_S)
+
+
+@pytest.mark.parametrize("parked", [False, True])
 @pytest.mark.parametrize(
-    ("name", "delay"),
+    "delay",
     [
-        ("steady", lambda _t_s: 0.2),
-        ("jittering", lambda t_s: 0.1 + 0.15 * ((t_s * 7919.0) % 1.0)),
-        ("growing", lambda t_s: min(0.05 + 0.1 * t_s, 0.5)),
+        pytest.param(lambda _t_s: 0.2, id="steady"),
+        pytest.param(lambda t_s: 0.1 + 0.15 * ((t_s * 7919.0) % 1.0), id="jittering"),
+        pytest.param(lambda t_s: min(0.05 + 0.1 * t_s, 0.5), id="growing"),
+        pytest.param(lambda t_s: max(0.05, 0.6 - t_s % 1.7), id="stalling: frames wait, and arrive at once"),
     ],
 )
-async def test_no_photograph_shows_the_arm_or_the_sheet_of_before(name: str, delay: Callable[[float], float]):
+async def test_no_photograph_shows_the_arm_or_the_sheet_of_before(delay: Callable[[float], float], parked: bool):
+    """Nor where the arm is parked already: after a change of sheets, nothing else distinguishes a new picture."""
     theatre = Theatre(delay)
     photographer = theatre.photographer(max_jitter_ms=1500)
     for _ in range(3):
-        await theatre.go(1.0)
+        if not parked:
+            await theatre.go(1.0)
         theatre.ink += 1
         inked_s = theatre.clock.now_ns() / 1e9
         frame = await photographer.photograph()
@@ -142,32 +154,23 @@ async def test_no_photograph_shows_the_arm_or_the_sheet_of_before(name: str, del
         assert not arm_is_in(theatre, frame)
 
 
-async def test_an_arm_that_is_parked_already_is_shown_once_more():
-    """After a change of sheets nothing else distinguishes a new picture from one of the old sheet."""
-    theatre = Theatre(lambda _t_s: 0.2)
-    photographer = theatre.photographer()
-    await photographer.photograph()
-    changed_s = theatre.clock.now_ns() / 1e9
-    assert age_s(theatre, await photographer.photograph(), changed_s) >= 0.0
-
-
-async def test_a_camera_that_is_too_late_is_refused_with_the_figure_and_the_way_out():
-    theatre = Theatre(lambda _t_s: 0.3)
-    with pytest.raises(CameraLate, match=r"too long: (2[5-9]|3[0-5])\d ± .*max_delay_ms = 200.* cable"):
-        await theatre.photographer(max_delay_ms=200).photograph()
-
-
-async def test_a_camera_that_is_not_steady_is_refused():
-    theatre = Theatre(lambda t_s: 0.02 if t_s % 0.6 < 0.3 else 0.32)
-    with pytest.raises(CameraLate, match=r"not steady: .*max_jitter_ms = 50"):
-        await theatre.photographer(max_jitter_ms=50).photograph()
-
-
-async def test_a_camera_that_looks_elsewhere_is_refused():
-    theatre = Theatre(lambda _t_s: 0.0)
-    theatre.way = lambda t_s: 0.0  # type: ignore[method-assign]
-    with pytest.raises(CameraLate, match=r"did not show .* that the arm went over the sheet"):
-        await theatre.photographer(max_delay_ms=50).photograph()
+@pytest.mark.parametrize(
+    ("delay", "way", "limits", "message"),
+    [
+        (lambda _: 0.3, None, {"max_delay_ms": 200}, r"too long: (2[5-9]|3[0-5])\d ± .*max_delay_ms = 200.* cable"),
+        (lambda t_s: 0.02 if t_s % 0.6 < 0.3 else 0.32, None, {"max_jitter_ms": 50}, r"not steady: .*jitter_ms = 50"),
+        (lambda _: 0.0, lambda _: 0.0, {"max_delay_ms": 50}, r"did not show .* that the arm went over the sheet"),
+    ],
+    ids=["too late", "not steady", "looks elsewhere"],
+)
+async def test_a_camera_that_cannot_be_trusted_is_refused_with_the_figure_and_the_way_out(
+    monkeypatch: pytest.MonkeyPatch, delay: Any, way: Any, limits: dict[str, float], message: str
+) -> None:
+    theatre = Theatre(delay)
+    if way is not None:
+        monkeypatch.setattr(theatre, "way", way)
+    with pytest.raises(CameraLate, match=message):
+        await theatre.photographer(**limits).photograph()
 
 
 async def test_a_delay_that_has_grown_past_its_limit_is_refused_later():
@@ -191,31 +194,6 @@ async def test_a_hand_in_the_picture_is_named_and_gives_no_photograph():
     await photographer.photograph()
 
 
-async def test_frames_that_waited_for_a_stalled_computer_are_not_taken_for_new():
-    """All that was exposed in the meantime arrives at once when it goes on."""
-    theatre = Theatre(lambda _t_s: 0.05)
-    photographer = theatre.photographer()
-    await photographer.photograph()
-    stall_s = theatre.clock.now_ns() / 1e9 - theatre.start_s + 0.1
-    theatre.delay = lambda t_s: max(0.05, stall_s + 0.6 - t_s) if t_s >= stall_s else 0.05
-    for _ in range(3):
-        await theatre.go(1.0)
-        inked_s = theatre.clock.now_ns() / 1e9
-        frame = await photographer.photograph()
-        assert age_s(theatre, frame, inked_s) >= 0.0
-        assert not arm_is_in(theatre, frame)
-
-
-async def test_pictures_of_what_the_arm_did_before_are_not_taken_for_the_first_trip():
-    theatre = Theatre(lambda _t_s: 0.4)
-    for way in (1.0, 0.0, 1.0, 0.0):
-        await theatre.go(way)
-    photographer = theatre.photographer()
-    await photographer.photograph()
-    assert photographer.delay is not None
-    assert photographer.delay.delay_s == pytest.approx(0.4, abs=PERIOD_S)
-
-
 async def test_a_delay_that_was_measured_wrongly_is_measured_again():
     theatre = Theatre(lambda _t_s: 0.4)
     photographer = theatre.photographer()
@@ -224,39 +202,25 @@ async def test_a_delay_that_was_measured_wrongly_is_measured_again():
     inked_s = theatre.clock.now_ns() / 1e9
     assert age_s(theatre, await photographer.photograph(), inked_s) >= 0.0
     assert photographer.delay is None
-    await photographer.photograph()
-    assert photographer.delay is not None
-    assert photographer.delay.delay_s == pytest.approx(0.4, abs=PERIOD_S)
+    assert await measured_s(photographer) == pytest.approx(0.4, abs=PERIOD_S)
 
 
-def stalling(seed: int, share: float) -> Callable[[float], float]:
-    """A delay of 0.3 s, which stalls of a busy computer prolong for a while, by 0.2 s on average."""
+def stalling(seed: int, share: float) -> Photographer:
+    """Asked for an exact delay of 0.3 s, which stalls of a busy computer prolong for a while, by 0.2 s on average."""
     rng = np.random.default_rng(seed)
     extra_s = rng.exponential(0.2, 4000) * (rng.random(4000) < share)
-    return lambda t_s: 0.3 + float(extra_s[int(t_s / 0.5)])
+    theatre = Theatre(lambda t_s: 0.3 + float(extra_s[int(t_s / 0.5)]))
+    return theatre.photographer(max_jitter_ms=2000, max_delay_ms=3000, exact_delay=True)
 
 
 async def test_beside_a_busy_computer_an_exact_delay_is_right_or_refused():
-    found: list[float] = []
+    found_s: list[float] = []
     for seed in range(3):
-        photographer = Theatre(stalling(seed, 0.6)).photographer(
-            max_jitter_ms=2000, max_delay_ms=3000, exact_delay=True
-        )
-        try:
-            await photographer.photograph()
-        except CameraLate:
-            continue
-        assert photographer.delay is not None
-        found.append(photographer.delay.delay_s)
-    assert all(abs(delay_s - 0.3) <= 0.2 * 0.3 for delay_s in found), found
-    assert len(found) < 3
-
-
-async def test_a_few_stalls_do_not_keep_an_exact_delay_from_being_measured():
-    photographer = Theatre(stalling(3, 0.1)).photographer(max_jitter_ms=2000, max_delay_ms=3000, exact_delay=True)
-    await photographer.photograph()
-    assert photographer.delay is not None
-    assert photographer.delay.delay_s == pytest.approx(0.3, rel=0.1)
+        with contextlib.suppress(CameraLate):
+            found_s.append(await measured_s(stalling(seed, 0.6)))
+    assert all(abs(delay_s - 0.3) <= 0.2 * 0.3 for delay_s in found_s), found_s
+    assert len(found_s) < 3
+    assert await measured_s(stalling(3, 0.1)) == pytest.approx(0.3, rel=0.1), "a few stalls do no harm"
 
 
 # The delay by one trip, from when the camera saw the arm and when it was where
@@ -324,19 +288,13 @@ def test_pictures_that_do_not_show_the_trip_give_no_delay(
     assert look([frame for frame in map(shown, seen) if frame is not None], placed) is None
 
 
-def test_several_looks_are_reported_with_their_spread():
+def test_several_looks_are_reported_with_their_spread_and_a_stall_does_not_make_the_camera_later() -> None:
     delay = CameraDelay((Look(0.20, 0.02), Look(0.26, 0.04)))
-    assert delay.delay_s == pytest.approx(0.23)
-    assert delay.spread_s == pytest.approx(0.06)
-    assert delay.bound_s == pytest.approx(0.30)
+    assert (delay.delay_s, delay.spread_s, delay.bound_s) == pytest.approx((0.23, 0.06, 0.30))
     assert str(delay) == "230 ± 21 ms (from 2 trips, which differ by 60 ms)"
-
-
-def test_a_trip_in_which_the_computer_stalled_does_not_make_the_camera_later() -> None:
     delay = CameraDelay((Look(0.41, 0.03), Look(0.65, 0.03), Look(0.42, 0.03), Look(0.40, 0.03)))
-    assert delay.delay_s == pytest.approx(0.41)
-    assert delay.spread_s == pytest.approx(0.25), "it still counts as unsteady"
-    assert delay.bound_s == pytest.approx(0.68), "and a photograph waits for the longest"
+    # The stall still counts as unsteady, and a photograph waits for the longest.
+    assert (delay.delay_s, delay.spread_s, delay.bound_s) == pytest.approx((0.41, 0.25, 0.68))
     assert CameraDelay((Look(0.40, 0.03), Look(0.65, 0.03))).delay_s == pytest.approx(0.525), "either may have stalled"
 
 
