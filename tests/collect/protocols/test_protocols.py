@@ -55,48 +55,40 @@ names = st.text(st.sampled_from("abcXYZ019-_.~永"), min_size=1, max_size=8).fil
 layouts = st.none() | st.builds(Layout, st.integers(1, 9), st.integers(1, 9))
 seeds = st.none() | st.integers(0, 99)
 points = st.integers(2, 6).map(lambda n: tuple((10.0 + 3.0 * k, 20.0, 5.0 + k, 1.0 * k, 10.0 * k) for k in range(n)))
-grids = st.builds(
-    GridConfig,
-    kind=st.just("grid"),
-    depths_mm=st.lists(heights, min_size=1, max_size=5, unique=True),
-    tilts_deg=st.lists(tilts, min_size=1, max_size=4, unique=True),
-    repeats=st.integers(1, 4),
-    seed=st.integers(0, 99),
-    board_every=st.none() | st.integers(1, 9),
+
+
+def some(kind: type[Any], **fields: Any) -> st.SearchStrategy[tuple[Any, ...]]:
+    """A few of them, each with a name of its own if they have names."""
+    name = next((name for name in ("stroke_id", "name") if name in fields), None)
+    return st.lists(
+        st.builds(kind, **fields), min_size=1, max_size=8, unique_by=id if name is None else lambda v: getattr(v, name)
+    ).map(tuple)
+
+
+def several(kind: type[Any], name: str, **fields: Any) -> st.SearchStrategy[Any]:
+    """Protocols of a kind, in one to three rounds, shuffled or not."""
+    return st.builds(kind, kind=st.just(name), repeats=st.integers(1, 3), seed=seeds, **fields)
+
+
+protocols: st.SearchStrategy[ProtocolConfig] = st.one_of(
+    several(
+        GridConfig,
+        "grid",
+        depths_mm=st.lists(heights, min_size=1, max_size=5, unique=True),
+        tilts_deg=st.lists(tilts, min_size=1, max_size=4, unique=True),
+        board_every=st.none() | st.integers(1, 9),
+    ),
+    several(ListConfig, "list", presses=some(PressRow, depth_mm=heights, tilt_deg=tilts)),
+    several(
+        ReplayConfig, "replay", of=names, presses=some(ReplayRow, stroke_id=names, depth_mm=heights, tilt_deg=tilts)
+    ),
+    several(
+        WriteConfig,
+        "write",
+        cell_mm=st.just((60.0, 60.0)),
+        figures=some(Figure, name=names, strokes=some(DrawnStroke, points=points)),
+    ),
 )
-rows = st.builds(PressRow, depth_mm=heights, tilt_deg=tilts)
-lists = st.builds(
-    ListConfig,
-    kind=st.just("list"),
-    presses=st.lists(rows, min_size=1, max_size=8).map(tuple),
-    repeats=st.integers(1, 3),
-    seed=seeds,
-)
-replays = st.builds(
-    ReplayConfig,
-    kind=st.just("replay"),
-    of=st.just("2026-11-21-grid-01"),
-    presses=st.lists(
-        st.builds(ReplayRow, stroke_id=names, depth_mm=heights, tilt_deg=tilts),
-        min_size=1,
-        max_size=8,
-        unique_by=lambda row: row.stroke_id,
-    ).map(tuple),
-    repeats=st.integers(1, 3),
-    seed=seeds,
-)
-figures = st.builds(
-    Figure, name=names, strokes=st.lists(st.builds(DrawnStroke, points=points), min_size=1, max_size=3).map(tuple)
-)
-writes = st.builds(
-    WriteConfig,
-    kind=st.just("write"),
-    cell_mm=st.just((60.0, 60.0)),
-    figures=st.lists(figures, min_size=1, max_size=3, unique_by=lambda figure: figure.name).map(tuple),
-    repeats=st.integers(1, 3),
-    seed=seeds,
-)
-protocols = st.one_of(grids, lists, replays, writes)
 
 
 def run(config: ProtocolConfig, layout: Layout | None = None, patch: int = 7) -> list[Step]:
@@ -129,17 +121,14 @@ def test_every_planned_stroke_is_dipped_for_marked_and_captured_exactly_once(
 
 @given(protocols, layouts)
 @settings(deadline=None)
-def test_the_sheet_changes_the_order_and_never_a_key(config: ProtocolConfig, layout: Layout | None) -> None:
-    there = {step.key for step in run(config, layout) if step.kind != StepKind.BOARD}
-    assert there == {step.key for step in run(config) if step.kind != StepKind.BOARD}
-
-
-@given(protocols)
-@settings(deadline=None)
-def test_what_was_dumped_is_the_whole_protocol(config: ProtocolConfig) -> None:
+def test_neither_the_sheet_nor_a_dump_changes_a_key(config: ProtocolConfig, layout: Layout | None) -> None:
+    keys = [step.key for step in run(config)]
+    assert {step.key for step in run(config, layout) if step.kind != StepKind.BOARD} == {
+        key for key, step in zip(keys, run(config), strict=True) if step.kind != StepKind.BOARD
+    }
     again = type(config).model_validate_json(config.model_dump_json())
     assert again == config
-    assert [step.key for step in run(again)] == [step.key for step in run(config)]
+    assert [step.key for step in run(again)] == keys
 
 
 def test_keys_and_order_are_the_same_in_another_process() -> None:
@@ -250,46 +239,29 @@ def test_keys_tell_steps_apart() -> None:
     assert CaptureStep(3, measured).key == CaptureStep(3, press).key, "what was measured does not change what was asked"
 
 
-def paper(**changes: object) -> PaperConfig:
-    values = {"origin_mm": (460.0, -110.0), "yaw_deg": 90.0, "touch_z_mm": 120.0, "size_mm": (244.0, 172.0)}
-    return PaperConfig.model_validate(values | changes)
-
-
 def test_patches_tile_the_sheet_without_overlap() -> None:
-    sheet = Sheet(paper())
-    assert (sheet.columns, sheet.rows, sheet.capacity) == (6, 7, 42)
-    corners = {sheet.patch(i).rect_mm[:2] for i in range(sheet.capacity)}
-    assert len(corners) == 42
-    for index in range(sheet.capacity):
-        x, y, width, height = sheet.patch(index).rect_mm
-        assert x >= 0.0
-        assert x + width <= 244.0
-        assert y >= 0.0
-        assert y + height <= 172.0
-        anchor_x, anchor_y = sheet.patch(index).anchor_mm
-        assert x < anchor_x < x + width
-        assert y < anchor_y < y + height
+    sheet = Sheet(PaperConfig(origin_mm=(460.0, -110.0), touch_z_mm=120.0, size_mm=(244.0, 172.0)))
+    patches = [sheet.patch(index) for index in range(sheet.capacity)]
+    assert (sheet.columns, sheet.rows, len({patch.rect_mm for patch in patches})) == (6, 7, 42)
+    for patch in patches:
+        x, y, width, height = patch.rect_mm
+        assert 0.0 <= x < patch.anchor_mm[0] < x + width <= 244.0
+        assert 0.0 <= y < patch.anchor_mm[1] < y + height <= 172.0
 
 
 # Few strokes
 
-FEW = GRID | {"kind": "few-strokes"}
+
+def pressed(strokes: int) -> list[tuple[float, float]]:
+    few = FewStrokesConfig(kind="few-strokes", **GRID, strokes=strokes)
+    return [(p.condition.depth_mm, p.condition.tilt_deg) for p in few.planned()]
 
 
-def pressed(**changed: object) -> list[tuple[float, float]]:
-    return [
-        (p.condition.depth_mm, p.condition.tilt_deg) for p in FewStrokesConfig.model_validate(FEW | changed).planned()
-    ]
-
-
-def test_the_first_four_presses_are_the_corners_of_the_grid() -> None:
-    assert set(pressed(strokes=4)) == {(11.0, 0.0), (11.0, 10.0), (20.0, 0.0), (20.0, 10.0)}
-
-
-def test_more_presses_continue_the_same_order() -> None:
-    assert pressed(strokes=9) == pressed(strokes=12)[:9]
-    assert len(set(pressed(strokes=15))) == 15
-    assert pressed(strokes=20)[15:] == pressed(strokes=5)
+def test_the_first_four_presses_are_the_corners_of_the_grid_and_more_continue_the_same_order() -> None:
+    assert set(pressed(4)) == {(11.0, 0.0), (11.0, 10.0), (20.0, 0.0), (20.0, 10.0)}
+    assert pressed(9) == pressed(12)[:9]
+    assert len(set(pressed(15))) == 15
+    assert pressed(20)[15:] == pressed(5)
 
 
 # Files: what cannot be used is one line that names file, line, field and range; nothing huge or odd is read
@@ -313,33 +285,27 @@ def load(folder: Path, protocol: str, csv: str | bytes | None = None):
     [
         (LIST, "depth_mm\n11\nx\n", r"p.csv: line 3: depth_mm: .* valid number \(given: 'x'\)$"),
         (LIST, "depth_mm\n1_1\n", r"p.csv: line 2: depth_mm: .* valid number \(given: '1_1'\)$"),
-        (LIST, "depth_mm,dwell_s\n11,1_0\n", r"p.csv: line 2: dwell_s: .* valid number \(given: '1_0'\)$"),
         (LIST, "depth_mm,tilt_deg\n11,31\n", r"p.csv: line 2: tilt_deg: .* less than or equal to 30 \(given: 31.0\)$"),
         (LIST, "depth_mm\nnan\n", r"line 2: depth_mm: .* valid number"),
-        (LIST, "depth_mm\ninf\n", r"line 2: depth_mm: .* valid number"),
         (LIST, "depth_mm\n0\n", r"line 2: depth_mm: .* greater than 0"),
         (LIST, "depth_mm,dwell_s\n11,61\n", r"line 2: dwell_s: .* less than or equal to 60"),
         (LIST, "depth_mm,tilt_deg\n,5\n", r"line 2: depth_mm: Field required"),
         (LIST, "depth_mm,tilt_deg\n11\n", r"line 2: 1 cells under 2 columns"),
         (LIST, "depth_mm,tilt\n11,5\n", r"p.csv: line 2: tilt: unknown field; did you mean tilt_deg"),
-        (LIST, "tilt_deg\n5\n", r"line 2: depth_mm: Field required"),
         (LIST, "depth_mm,depth_mm\n5,5\n", r"line 1: the column 'depth_mm' occurs twice"),
         (LIST, "depth_mm\n", r"p.csv: has no rows"),
-        (LIST, "", r"p.csv: has no rows"),
         (LIST, b"depth_mm\n\xff\n", r"p.csv: is not UTF-8 at byte 9"),
         (LIST, 'depth_mm\n"11', r"p.csv: line 2: is not CSV"),
         (LIST, "depth_mm,stroke_id\n11,a/b\n", r"line 2: stroke_id: a name has no .*slashes"),
         (LIST, "depth_mm,stroke_id\n11,\x1b[2J\n", r"line 2: stroke_id: .*control"),
         (LIST, "depth_mm,stroke_id\n11,a\n12,a\n", r"'a' occurs twice"),
+        (LIST + "repeats = 2\n", "depth_mm,stroke_id\n11,a\n12,a-r02\n", r"'a-r02' occurs twice"),
         (LIST, None, r"p.csv: no such file"),
         (LIST.replace("p.csv", "../p.csv"), None, r"protocol.toml: file: must be the plain name of a file next to it"),
-        (LIST.replace("p.csv", "/etc/passwd"), None, r"file: must be the plain name"),
         (LIST.replace('"p.csv"', "3"), None, r"file: must be the plain name"),
         (LIST + "presses = []\n", "depth_mm\n11\n", r"presses: a file is named too"),
         ('kind = "list"\n', None, r"protocol.toml: presses: Field required"),
-        ('kind = "list"\npresses = []\n', None, r"presses: .*at least 1"),
         (REPLAY, "stroke_id,depth_mm\na,11\n", r"line 2: tilt_deg: Field required"),
-        (REPLAY, "stroke_id,depth_mm,tilt_deg\na,11,-0.2\n", r"line 2: tilt_deg: .* greater than or equal to 0"),
         (REPLAY.replace("old", "a b"), "stroke_id,depth_mm,tilt_deg\na,11,0\n", r"of: a name has no spaces"),
         (WRITE + 'file = "p.csv"\n' + POINTS, None, r"figures.0.strokes.0: points: a file is named too"),
         (WRITE + 'file = "p.csv"\n', "x_mm,y_mm,depth_mm\n1,1,3\n70,1,3\n", r"the point \[70, 1\] lies outside"),
@@ -347,14 +313,13 @@ def load(folder: Path, protocol: str, csv: str | bytes | None = None):
         (WRITE + 'file = "p.csv"\n', "x_mm,y_mm,depth_mm\n1,1,3\n", r"figures.0.strokes.0.points: .*at least 2"),
         (WRITE + POINTS.replace("5.0,", "-1.0,"), None, r"nothing would be drawn"),
         (WRITE + POINTS.replace("20.0", "nan"), None, r"figures.0.strokes.0.points.1.0: "),
-        (WRITE.replace('"a"', '"a b"') + POINTS, None, r"figures.0.name: .*spaces"),
         ('kind = "write"\ncell_mm = [60.0, 60.0]\nfigures = 3\n', None, r"figures: "),
         (CALIBRATION + "touches_mm = [[1.0, 1.0], [1.0, 1.0]]\n", None, r"touches_mm: \(1.0, 1.0\) occurs twice"),
         (CALIBRATION + "board_every = 3\n", None, r"board_every: unknown field; did you mean board_views"),
         ('kind = "teapot"\n', None, r"kind: .*'grid', 'few-strokes', 'list', 'replay', 'write', 'calibration'"),
-        ("x = 1\n", None, r"protocol.toml: kind: "),
         ('kind = "grid"\ndepths_mm = [11.0]\ntilts_deg = [0.0]\nspeed = 3\n', None, r"speed: unknown field"),
         ('kind = "grid"\ndepths_mm = [11.0]\ntilts_deg = [0.0]\nrepeats = 0\n', None, r"repeats: .*1 \(given: 0\)$"),
+        ("x = 1\n", None, r"protocol.toml: kind: "),
         ("kind = ", None, r"is not TOML"),
         ("x = " + "[" * 5000, None, r"is not TOML"),
     ],
@@ -370,15 +335,12 @@ def test_a_protocol_that_cannot_be_used_is_one_line(
 
 
 def test_rows_become_part_of_the_protocol_and_an_empty_cell_is_left_out(tmp_path: Path) -> None:
-    listed = load(tmp_path, LIST, "\ufeffheight_mm , tilt_deg,stroke_id\r\n 11.5,,deep\r\n\r\n12,3,\r\n")
+    listed = load(tmp_path, LIST, "\ufeffheight_mm , tilt_deg,stroke_id\r\n 11.5,,deep永\r\n\r\n12,3,\r\n")
     assert isinstance(listed, ListConfig)
-    assert [(row.depth_mm, row.tilt_deg, row.stroke_id) for row in listed.presses] == [
-        (11.5, 0, "deep"),
-        (12, 3, None),
-    ]
+    rows = [(row.depth_mm, row.tilt_deg, row.stroke_id) for row in listed.presses]
+    assert rows == [(11.5, 0, "deep永"), (12, 3, None)]
     assert '"depth_mm":11.5' in listed.model_dump_json()
-    (tmp_path / "p.csv").write_text("depth_mm\n13\n")
-    assert load_protocol(tmp_path / "protocol.toml").model_dump_json() != listed.model_dump_json()
+    assert load(tmp_path, LIST, "depth_mm\n13\n").model_dump_json() != listed.model_dump_json()
 
 
 def test_rows_and_bytes_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -407,15 +369,6 @@ def test_what_is_no_file_is_not_read(tmp_path: Path) -> None:
         load(tmp_path, LIST)
     with pytest.raises(ConfigError, match=r"is not a file"):
         load_protocol(tmp_path)
-
-
-def test_names_of_a_list_may_not_meet_those_of_its_own_repeats(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"'a-r02' occurs twice"):
-        load(tmp_path, LIST + "repeats = 2\n", "depth_mm,stroke_id\n11,a\n12,a-r02\n")
-
-
-def test_chinese_names_are_names(tmp_path: Path) -> None:
-    assert isinstance(load(tmp_path, WRITE.replace('"a"', '"永"') + POINTS), WriteConfig)
 
 
 @given(st.binary(max_size=200) | st.text(max_size=200).map(str.encode))
