@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable
 from pathlib import Path
+from subprocess import CompletedProcess
 from typing import Any
 
 import pytest
@@ -34,12 +34,6 @@ from tests.runs import until, wait_for_end
 from tests.waiting import PATIENCE_S, wait_until
 
 
-def at_each_press(lab: Lab, do: Callable[[], object]) -> None:
-    """Do something whenever a press has left its mark."""
-    leave = lab.rig.world._leave_mark
-    lab.rig.world._leave_mark = lambda deepest: (leave(deepest), do())[0]  # type: ignore[method-assign]
-
-
 def test_a_signal_stops_the_process_and_the_same_command_goes_on(wired_lab: Lab) -> None:
     """SIGTERM to a process of its own; the command that goes on is this process."""
     lab = wired_lab
@@ -59,6 +53,13 @@ def test_a_signal_stops_the_process_and_the_same_command_goes_on(wired_lab: Lab)
     assert len({c.stroke.stroke_id for c in Recording(lab.session).captures()}) == 2
 
 
+def parked(ran: CompletedProcess[str]) -> bool:
+    last = ran.stderr.splitlines()[-1]
+    return (ran.returncode, ran.stdout) == (4, "") and last.startswith(
+        "brushloop: parked on request; the same command resumes from here"
+    )
+
+
 def test_where_the_output_goes_away_the_step_ends_and_the_arm_parks(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     def closed(_engine: Engine) -> None:
         wait_until(lambda: lab.rig.world.presses, "a press")
@@ -66,18 +67,20 @@ def test_where_the_output_goes_away_the_step_ends_and_the_arm_parks(lab: Lab, mo
 
     monkeypatch.setattr(start, "show_progress", closed)
     lab.write_protocol(repeats=10)
-    ran = lab.command()
-    assert (ran.returncode, ran.stdout) == (4, "")
-    assert ran.stderr.splitlines()[-1].startswith("brushloop: parked on request; the same command resumes from here")
+    assert parked(lab.command())
 
 
 def test_where_the_terminal_is_closed_the_step_ends_and_the_arm_parks(lab: Lab) -> None:
     """Nobody is there to lift a brush that was stopped on the paper."""
     lab.write_protocol(repeats=10)
-    at_each_press(lab, lambda: os.kill(os.getpid(), signal.SIGHUP))  # a shell may pass it on again
-    ran = lab.command()
-    assert (ran.returncode, ran.stdout) == (4, "")
-    assert ran.stderr.splitlines()[-1].startswith("brushloop: parked on request; the same command resumes from here")
+    leave = lab.rig.world._leave_mark
+
+    def close(deepest: Any) -> None:
+        leave(deepest)
+        os.kill(os.getpid(), signal.SIGHUP)  # a shell may pass it on again
+
+    lab.rig.world._leave_mark = close  # type: ignore[method-assign]
+    assert parked(lab.command())
     assert lab.rig.faults.phase() is Phase.PARKED
     assert not lab.state.cut
 
@@ -101,15 +104,15 @@ def test_a_session_that_is_open_elsewhere_is_refused_before_anything_moves(lab: 
 def test_a_folder_that_may_not_be_written_is_refused_before_anything_is_connected(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    def refused() -> tuple[int, str]:
+        ran = lab.command()
+        return ran.returncode, ran.stderr.splitlines()[-1].removeprefix("brushloop: ")
+
     with monkeypatch.context() as patch:
         patch.setattr("brushloop.sessions.disk.os.access", lambda path, _mode: path != lab.folder)
-        ran = lab.command()
-    said = f"brushloop: {lab.folder}: may not be written: it is read-only, or another user's"
-    assert (ran.returncode, ran.stderr.splitlines()[-1]) == (2, said)
+        assert refused() == (2, f"{lab.folder}: may not be written: it is read-only, or another user's")
     lab.sessions.write_text("not a folder", encoding="utf-8")
-    ran = lab.command()
-    said = f"brushloop: {lab.sessions}: is a file; a folder is needed"
-    assert (ran.returncode, ran.stderr.splitlines()[-1]) == (2, said)
+    assert refused() == (2, f"{lab.sessions}: is a file; a folder is needed")
     assert lab.rig.arcs.cabinet.power.mode == "PowerOff"
 
 
