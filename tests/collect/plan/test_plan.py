@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
 import pytest
 
 from brushloop.collect.engine.recorder import StepContext
@@ -14,12 +15,7 @@ from brushloop.collect.engine.run import Run
 from brushloop.collect.errors import ConfigError, StepVoid
 from brushloop.collect.motion import Path as MotionPath
 from brushloop.collect.motion import Procedures, inking_moves, stroke_moves
-from brushloop.collect.plan import (
-    Plan,
-    make_plan,
-    move_s,
-    path_s,
-)
+from brushloop.collect.plan import make_plan, move_s, path_s
 from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
 from brushloop.collect.protocols.steps import MARKING, Drawn, DrawStep, Step, StepKind
 from brushloop.collect.rig.config import RigConfig, load_rig
@@ -57,34 +53,34 @@ def example(name: str) -> ProtocolConfig:
 
 
 @pytest.fixture
-def grid_plan(tmp_path: Path) -> Plan:
-    return make_plan(rig(tmp_path), example("protocol.toml"))
+def config(tmp_path: Path) -> RigConfig:
+    return rig(tmp_path)
 
 
-def test_the_grid_of_the_paper_needs_four_sheets_and_a_dip_for_each_press(grid_plan: Plan) -> None:
-    assert (len(grid_plan.placed), grid_plan.patches_per_sheet, grid_plan.sheets, grid_plan.dips) == (150, 42, 4, 150)
-    assert len({(p.sheet, p.patch) for p in grid_plan.placed}) == 150
-    assert list(grid_plan.sheet_changes) == [grid_plan.placed[i].stroke_id for i in (42, 84, 126)]
-    assert sum(grid_plan.seconds_by_kind.values()) == pytest.approx(grid_plan.seconds)
+@pytest.mark.parametrize(
+    ("name", "strokes", "patches", "sheets", "dips", "touches"),
+    [
+        ("protocol.toml", 150, 42, 4, 150, 1),
+        ("protocol-write.toml", 2, 6, 1, 4, 1),  # figures have patches of their own size, and dip between strokes
+        ("protocol-calibration.toml", 0, 42, 1, 0, 6),
+    ],
+)
+def test_a_plan_says_what_a_protocol_takes(
+    config: RigConfig, name: str, strokes: int, patches: int, sheets: int, dips: int, touches: int
+) -> None:
+    plan = make_plan(config, example(name))
+    assert (len(plan.placed), plan.patches_per_sheet, plan.sheets, plan.dips) == (strokes, patches, sheets, dips)
+    assert len(plan.touches_mm) == touches
+    assert len({(p.sheet, p.patch) for p in plan.placed}) == strokes
+    assert list(plan.sheet_changes) == [plan.placed[i].stroke_id for i in range(patches, strokes, patches)]
+    assert sum(plan.seconds_by_kind.values()) == pytest.approx(plan.seconds)
 
 
-def test_every_example_passes_and_is_walked(tmp_path: Path) -> None:
-    config = rig(tmp_path)
+def test_every_example_passes_and_is_walked(tmp_path: Path, config: RigConfig) -> None:
     for path in EXAMPLES.glob("*.toml"):
         wanted = load_protocol(path)
         check_protocol(tmp_path / "rig.toml", path, config, wanted)
         assert make_plan(config, wanted).seconds > 10.0
-
-
-def test_figures_take_patches_of_their_own_size_and_dip_between_strokes(tmp_path: Path) -> None:
-    plan = make_plan(rig(tmp_path), example("protocol-write.toml"))
-    assert (plan.patches_per_sheet, plan.dips, plan.steps["dip"]) == (6, 4, 2)
-
-
-def test_a_calibration_marks_nothing_and_shows_where_it_touches(tmp_path: Path) -> None:
-    plan = make_plan(rig(tmp_path), example("protocol-calibration.toml"))
-    assert (plan.placed, plan.dips) == ((), 0)
-    assert len(plan.touches_mm) == 6
 
 
 def figure(*points: list[float], patch: str = "[60.0, 60.0]") -> str:
@@ -142,27 +138,25 @@ def test_what_cannot_be_done_is_named_before_anything_is_connected(
         check_protocol(tmp_path / "rig.toml", tmp_path / "protocol.toml", config, protocol(tmp_path, text))
 
 
-def test_the_outermost_patches_stand_for_all(tmp_path: Path) -> None:
-    config, wanted, plane = rig(tmp_path), example("protocol.toml"), PaperPlane(120.0, 0.01, -0.02)
-    corners = [pose for pose, _, _ in all_poses(config, wanted, plane)]
-    everywhere = [pose for pose, _, _ in all_poses(config, wanted, plane, every_patch=True)]
+def test_the_outermost_patches_stand_for_all(config: RigConfig) -> None:
+    wanted, plane = example("protocol.toml"), PaperPlane(120.0, 0.01, -0.02)
+    corners, everywhere = (
+        np.array([pose.position_mm for pose, _, _ in all_poses(config, wanted, plane, every_patch=every)])
+        for every in (False, True)
+    )
     assert len(everywhere) > 8 * len(corners)
-    for axis in range(3):
-        for extreme in (min, max):
-            assert extreme(p.position_mm[axis] for p in everywhere) == pytest.approx(
-                extreme(p.position_mm[axis] for p in corners), abs=1e-9
-            )
+    assert np.allclose((everywhere.min(axis=0), everywhere.max(axis=0)), (corners.min(axis=0), corners.max(axis=0)))
 
 
-def test_a_sheet_that_leans_is_checked_as_it_lies(tmp_path: Path) -> None:
-    config, wanted = rig(tmp_path), example("protocol.toml")
+def test_a_sheet_that_leans_is_checked_as_it_lies(tmp_path: Path, config: RigConfig) -> None:
+    wanted = example("protocol.toml")
     check_poses(tmp_path / "rig.toml", config, all_poses(config, wanted, PaperPlane(120.0)))
     with pytest.raises(ConfigError, match=r"z = \d\d\.\d+ mm is outside .* on patch \d+\)"):
         check_poses(tmp_path / "rig.toml", config, all_poses(config, wanted, PaperPlane(120.0, -0.05)))
 
 
-def test_a_drawn_stroke_goes_through_its_points_at_its_depths(tmp_path: Path) -> None:
-    config, wanted = rig(tmp_path), example("protocol-write.toml")
+def test_a_drawn_stroke_goes_through_its_points_at_its_depths(config: RigConfig) -> None:
+    wanted = example("protocol-write.toml")
     [draw, *_] = [w for w in walk(config, wanted) if w.step.kind == StepKind.DRAW]
     moves = moves_of(config, PaperPlane(config.paper.touch_z_mm), draw.step, draw.patches)
     ways = [part for part in moves.segments if isinstance(part, MotionPath)]
@@ -182,9 +176,8 @@ def test_a_turn_on_the_spot_is_read_in_radians(tmp_path: Path) -> None:
     limits = limits_of(rig(tmp_path))
     upright, tilted = brush_pose(300.0, 0.0, 200.0), brush_pose(300.0, 0.0, 200.0, tilt_deg=10.0)
     assert move_s(upright, tilted, 20.0, 800.0, limits) == pytest.approx(0.17453 / 0.02 + 0.025, abs=1e-3)
-    assert path_s(
-        upright, MotionPath([brush_pose(310.0, 0.0, 200.0), brush_pose(320.0, 0.0, 200.0)], 20.0), 800.0, limits
-    ) == (pytest.approx(1.025))
+    path = MotionPath([brush_pose(310.0, 0.0, 200.0), brush_pose(320.0, 0.0, 200.0)], 20.0)
+    assert path_s(upright, path, 800.0, limits) == pytest.approx(1.025)
 
 
 def test_the_ink_of_a_plan_is_what_a_pump_doses(tmp_path: Path) -> None:
@@ -197,15 +190,11 @@ def test_a_self_check_takes_a_patch_before_the_first_stroke(tmp_path: Path) -> N
     config = rig(tmp_path, "[motion]", "[self_check]\nenabled = true\n\n[motion]")
     check_protocol(tmp_path / "rig.toml", EXAMPLES / "protocol.toml", config, example("protocol.toml"))
     plan = make_plan(config, example("protocol.toml"))
-    assert [step.step.kind for step in walk(config, example("protocol.toml"))][:4] == [
-        StepKind.ZERO_TOUCH,
-        StepKind.BOARD,
-        StepKind.SELF_CHECK,
-        StepKind.DIP,
-    ]
+    first = [str(walked.step.kind) for walked in walk(config, example("protocol.toml"))][:4]
+    assert first == ["zero_touch", "board", "self_check", "dip"]
     assert (len(plan.placed), plan.placed[0].patch, plan.placed[41].sheet, plan.dips) == (150, 1, 1, 153)
-    first = {placed.patch for placed in plan.placed if placed.sheet == 0}
-    assert first == set(range(42)) - {0, 5, 36}, "the self-check lies over three corners"
+    used = {placed.patch for placed in plan.placed if placed.sheet == 0}
+    assert used == set(range(42)) - {0, 5, 36}, "the self-check lies over three corners"
     assert "self_check" not in make_plan(config, example("protocol-calibration.toml")).steps
     small = rig(tmp_path, "[motion]", "[self_check]\nenabled = true\nlegs_mm = [50.0, 15.0]\n\n[motion]")
     with pytest.raises(ConfigError, match=r"rig.toml: self_check.legs_mm: a triangle of 50 by 15 mm does not fit"):
@@ -215,11 +204,6 @@ def test_a_self_check_takes_a_patch_before_the_first_stroke(tmp_path: Path) -> N
 # A press is believed where the brush was seen at its depth
 
 NOBODY = Identity("robot", "made up", "", True)
-
-
-@pytest.fixture
-def config(tmp_path: Path) -> RigConfig:
-    return rig(tmp_path)
 
 
 class MadeUpRobot:
@@ -266,17 +250,14 @@ async def test_every_press_stays_long_enough_to_be_seen(
     assert 0.0 < near.target.z_mm - deep.target.z_mm <= 0.051
 
 
-@pytest.mark.parametrize("off_mm", [0.15, -0.15])
-async def test_a_press_that_was_not_seen_at_its_depth_is_void(config: RigConfig, off_mm: float):
-    with pytest.raises(StepVoid, match=f"the depth was {13.0 - off_mm:.3f} mm, 13 mm was commanded"):
-        await pressed(config, MadeUpRobot(off_mm))
+@pytest.mark.parametrize(
+    ("off_mm", "seen"),
+    [(0.15, slice(None)), (-0.15, slice(None)), (0.0, slice(0, 1)), (0.0, slice(4, None)), (0.0, slice(0))],
+)
+async def test_a_press_that_was_not_seen_at_its_depth_is_void(config: RigConfig, off_mm: float, seen: slice):
+    with pytest.raises(StepVoid, match=r"the depth was .* mm, 13 mm was commanded"):
+        await pressed(config, MadeUpRobot(off_mm, seen))
     assert await pressed(config, MadeUpRobot(0.5 * off_mm)) == pytest.approx(13.0 - 0.5 * off_mm)
-
-
-@pytest.mark.parametrize("seen", [slice(0, 1), slice(4, None), slice(0)])
-async def test_a_depth_that_nobody_saw_is_not_believed(config: RigConfig, seen: slice):
-    with pytest.raises(StepVoid, match="13 mm was commanded"):
-        await pressed(config, MadeUpRobot(seen=seen))
 
 
 # Drawn strokes

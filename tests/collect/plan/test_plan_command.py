@@ -57,21 +57,22 @@ def plan(rig_path: Path, name: str, *options: str) -> str:
     return ran.stdout
 
 
-def test_the_table_says_what_it_takes(rig_path: Path) -> None:
+def test_a_plan_is_shown_as_tables_or_as_one_json_object(rig_path: Path) -> None:
     words = " ".join(plan(rig_path, "protocol.toml").split())
     for expected in ("4 of 42 patches", "a fresh one before", "150 press", "not counting"):
         assert expected in words
-
-
-def test_json_is_one_object(rig_path: Path) -> None:
     made = json.loads(plan(rig_path, "protocol-write.toml", "--json"))
     assert (made["kind"], made["dips"], made["poses_in_reach"]) == ("write", 4, None)
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in EXAMPLES.glob("*.toml")))
-def test_every_kind_has_a_picture(rig_path: Path, tmp_path: Path, name: str) -> None:
+def test_every_kind_has_a_picture_whatever_its_names(rig_path: Path, tmp_path: Path, name: str) -> None:
     path = tmp_path / "plan.png"
-    wanted = load_protocol(EXAMPLES / name)
+    for each in EXAMPLES.glob("*.csv"):
+        (tmp_path / each.name).write_bytes(each.read_bytes())
+    # No font here has that character, and a dollar would begin a formula.
+    (tmp_path / name).write_text((EXAMPLES / name).read_text().replace('"shi"', '"永$x"'))
+    wanted = load_protocol(tmp_path / name)
     draw_plan(load_rig(rig_path), wanted, make_plan(load_rig(rig_path), wanted), path)
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     assert image is not None
@@ -99,15 +100,6 @@ def test_a_picture_that_cannot_be_made_is_refused_before_anything_else(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["folder.png", "rig.toml"]
 
 
-def test_a_picture_shows_names_that_no_font_here_has(rig_path: Path, tmp_path: Path) -> None:
-    text = (EXAMPLES / "protocol-write.toml").read_text().replace('"shi"', '"永$x"')
-    (tmp_path / "protocol.toml").write_text(text)
-    (tmp_path / "shi-1.csv").write_text((EXAMPLES / "shi-1.csv").read_text())
-    wanted = load_protocol(tmp_path / "protocol.toml")
-    draw_plan(load_rig(rig_path), wanted, make_plan(load_rig(rig_path), wanted), tmp_path / "plan.png")
-    assert (tmp_path / "plan.png").stat().st_size > 0
-
-
 async def test_the_controller_is_asked_for_every_pose_and_nothing_is_powered_set_or_moved(
     rig_path: Path, cabinet: ArcsServer
 ) -> None:
@@ -118,12 +110,8 @@ async def test_the_controller_is_asked_for_every_pose_and_nothing_is_powered_set
     wanted = load_protocol(EXAMPLES / "protocol-write.toml")
     count = await ask_reach(rig_path, config, all_poses(config, wanted, PaperPlane(120.0)))
     assert count > 40
-    assert {name.split(".")[-1] for name in asked} == {
-        "getRobotNames",
-        "getTcpOffset",
-        "getJointPositions",
-        "inverseKinematics",
-    }
+    names = {name.split(".")[-1] for name in asked}
+    assert names == {"getRobotNames", "getTcpOffset", "getJointPositions", "inverseKinematics"}
     assert cabinet.cabinet.power.mode == RobotMode.POWER_OFF
     assert cabinet.cabinet.tcp_offset[0] == 0.01
 
