@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from bench.harness import BenchError, Result, at_most, rounds_of
 from brushloop.calibrate.board.pix2len import Plane, see_board
 from brushloop.calibrate.board.spec import BoardSpec
-from brushloop.collect.photograph.checks import Failure, check_capture, patch_is_blank
+from brushloop.collect.photograph.checks import Failure, Photograph
 from brushloop.collect.rig.config import PaperConfig, QualityConfig
 from brushloop.collect.rig.paper import Patch, Sheet
 from brushloop.drivers.geometry import brush_pose
@@ -374,19 +374,13 @@ def score(samples: Iterable[Sample | Blank], limits: QualityConfig, *, with_prev
     scores = Score()
     for sample in samples:
         if isinstance(sample, Blank):
-            seen = patch_is_blank(sample.image, sample.plane, sample.patch, limits=limits)
+            seen = Photograph(sample.image, sample.plane, limits).check_blank(sample.patch)
             scores.blanks_seen[sample.blank, seen.passed] += 1
             continue
         began = time.perf_counter()
-        verdict = check_capture(
-            sample.image,
-            sample.plane,
-            sample.patch,
-            depth_mm=sample.depth_mm,
-            limits=limits,
-            previous=sample.before if with_previous else None,
-            sheet_mm=sample.sheet_mm,
-        )
+        before = sample.before if with_previous else None
+        photograph = Photograph(sample.image, sample.plane, limits, sample.sheet_mm, before)
+        verdict = photograph.check_press(sample.patch, sample.depth_mm)
         scores.seconds.append(time.perf_counter() - began)
         scores.counts[sample.label, Failure(verdict.cause.name) if verdict.cause else None] += 1
     return scores

@@ -14,14 +14,7 @@ from brushloop.collect.engine.recorder import RunContext, StepContext, meanwhile
 from brushloop.collect.engine.snapshot import LastCapture
 from brushloop.collect.errors import BadPicture, NeedsOperator, StepError
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
-from brushloop.collect.photograph.checks import (
-    Failure,
-    Verdict,
-    check_capture,
-    check_drawing,
-    check_frame,
-    patch_is_blank,
-)
+from brushloop.collect.photograph.checks import Failure, Photograph, Verdict
 from brushloop.collect.photograph.frames import undistorted
 from brushloop.collect.protocols.steps import MARKING, CaptureStep
 from brushloop.collect.rig.config import PaperConfig
@@ -127,7 +120,7 @@ def _board(run: RunContext, image: Gray) -> tuple[Plane, tuple[Check, ...]]:
         _check_view(before, image, plane, run.rig.config.paper)
     run.view = plane
     limits = run.rig.config.quality
-    frame = check_frame(image, plane, limits)
+    frame = Photograph(image, plane, limits).check_frame()
     if limits.enabled and frame.cause is not None:
         raise BadPicture(frame.cause.reason)
     return plane, frame.checks
@@ -193,9 +186,8 @@ def _inked_patches(run: RunContext, image: Gray, begun: set[int]) -> list[str]:
     plane = run.image_plane(image)
     used = run.used_patches() - begun  # this attempt's own patch is not pressed yet
     free = [run.sheet.patch(index) for index in range(run.sheet.capacity) if index not in used]
-    limits, sheet_mm = run.rig.config.quality, run.rig.config.paper.size_mm
-    checks = [patch_is_blank(image, plane, patch, limits=limits, sheet_mm=sheet_mm) for patch in free]
-    return [check.reason for check in checks if not check.passed]
+    photograph = Photograph(image, plane, run.rig.config.quality, run.rig.config.paper.size_mm)
+    return [check.reason for check in map(photograph.check_blank, free) if not check.passed]
 
 
 async def photograph(context: StepContext) -> Gray:
@@ -280,16 +272,10 @@ async def _looked_at(
 
 
 def _judge(run: RunContext, step: CaptureStep, image: Gray, patch: Patch) -> Verdict:
-    config, judge = run.rig.config, check_drawing if step.drawn else check_capture
-    return judge(
-        image,
-        run.image_plane(image),
-        patch,
-        depth_mm=step.press.condition.depth_mm,
-        limits=config.quality,
-        previous=run.sound_frame,
-        sheet_mm=config.paper.size_mm,
-    )
+    config, plane = run.rig.config, run.image_plane(image)
+    photograph = Photograph(image, plane, config.quality, config.paper.size_mm, run.sound_frame)
+    judge = photograph.check_drawing if step.drawn else photograph.check_press
+    return judge(patch, step.press.condition.depth_mm)
 
 
 def _show(context: StepContext, step: CaptureStep, verdict: Verdict | None, image: Gray, patch: Patch) -> None:

@@ -1,7 +1,7 @@
 """The checks of a capture: a number, its limit, and what an operator should do; and the verdict that follows.
 
 A new check needs a name in `Failure`, a limit in `QualityConfig`, and a function here: listed in `MARK_CHECKS` if it
-judges the measured mark, called by `check_capture` if it judges the photograph or the ink.
+judges the measured mark, called by `Photograph.check_press` if it judges the photograph or the ink.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from brushloop.collect.photograph.measure import (
     Ink,
     Mark,
     Point,
-    Rect,
     around,
     measure_mark,
     mm2,
@@ -102,116 +101,110 @@ CROSSING_MM = 4.0
 """Length of ink across the edge of a patch, in mm; the end of one stroke that goes too far covers less."""
 
 
-def check_frame(image: Gray, plane: Plane, limits: QualityConfig) -> Verdict:
-    """Check exposure and blur of an (h, w) frame without ink, as before any press or for the board's picture."""
-    return Verdict((exposure(image, limits), *blurred(image, plane, limits)))
+@dataclass(frozen=True, slots=True)
+class Photograph:
+    """A photograph of the sheet, and the limits that it is judged by."""
 
+    image: Gray
+    """(h, w), without the distortion of the lens."""
+    plane: Plane
+    limits: QualityConfig
+    sheet_mm: tuple[float, float] | None = None
+    """Width and height: excludes the sheet's edge and the table beyond it."""
+    previous: Gray | None = None
+    """The last valid photograph before a press, from the same camera pose: it separates new ink from old, and reveals
+    a press that landed far off."""
 
-def check_capture(
-    image: Gray,
-    plane: Plane,
-    patch: Patch,
-    *,
-    depth_mm: float,
-    limits: QualityConfig,
-    previous: Gray | None = None,
-    sheet_mm: tuple[float, float] | None = None,
-    anchor_mm: Point | None = None,
-) -> Verdict:
-    """Judge one press of commanded depth `depth_mm` from the (h, w) photograph taken after it.
+    def check_frame(self) -> Verdict:
+        """Check exposure and blur, as before any press or for the board's picture."""
+        return Verdict((exposure(self.image, self.limits), *blurred(self.image, self.plane, self.limits)))
 
-    `previous` is the last valid photograph before the press, from the same camera pose: it separates new ink from old,
-    and reveals a press that landed far off. `sheet_mm` (width, height) excludes the sheet's edge and the table
-    beyond it. `anchor_mm` is the zero-touch point if it is not the patch's own. Checks that an earlier failure makes
-    meaningless are left out of the verdict.
-    """
-    frame = check_frame(image, plane, limits)
-    if not frame.passed:
-        return frame
-    anchor = patch.anchor_mm if anchor_mm is None else anchor_mm
-    inside = on_sheet(patch.rect_mm, sheet_mm)
+    def check_press(self, patch: Patch, depth_mm: float, anchor_mm: Point | None = None) -> Verdict:
+        """Judge one press of commanded depth `depth_mm`.
 
-    def ink_within(margin_mm: float) -> Ink:
-        """The ink in the patch and a margin around it: the stroke's own, other new ink, and old ink."""
-        window = around(patch.rect_mm, margin_mm, sheet_mm)
-        before = None if previous is None else take(previous, plane, window, measure.COARSE_PX_PER_MM)
-        return tell_apart(take(image, plane, window), before, inside, anchor, limits.ink_gate)
-
-    ink = ink_within(MARGIN_MM)
-    light = around(patch.rect_mm, LIGHT_MM, sheet_mm)
-    checks = [*frame.checks, cut(ink, plane, image.shape, anchor, limits), glare(image, plane, light, inside, limits)]
-    if not all(check.passed for check in checks):
+        `anchor_mm` is the zero-touch point if it is not the patch's own. Checks that an earlier failure makes
+        meaningless are left out of the verdict.
+        """
+        frame, limits = self.check_frame(), self.limits
+        if not frame.passed:
+            return frame
+        anchor = patch.anchor_mm if anchor_mm is None else anchor_mm
+        ink = self._ink(patch, MARGIN_MM, anchor)
+        checks = [*frame.checks, cut(ink, self.plane, self.image.shape, anchor, limits), self._glare(patch)]
+        if not all(check.passed for check in checks):
+            return Verdict.of(checks)
+        checks.append(neighbour(ink, limits))
+        enough = blank(ink.own_mm2, depth_mm, limits)
+        mark = measure_mark(ink, anchor)
+        if not enough.passed or mark is None:
+            away = (
+                None if self.previous is None else far_off(self._ink(patch, FAR_MM, anchor), anchor, depth_mm, limits)
+            )
+            return Verdict.of([*checks, away or enough])
+        checks += [enough, dry(mark, limits)]
+        if checks[-1].passed:
+            # The head, tip and tone of a dry brush's mark mean nothing.
+            checks += [smeared(mark, depth_mm, limits), *(check(mark, limits) for check in MARK_CHECKS)]
         return Verdict.of(checks)
-    checks.append(neighbour(ink, limits))
-    enough = blank(ink.own_mm2, depth_mm, limits)
-    mark = measure_mark(ink, anchor)
-    if not enough.passed or mark is None:
-        away = None if previous is None else far_off(ink_within(FAR_MM), anchor, depth_mm, limits)
-        return Verdict.of([*checks, away or enough])
-    checks += [enough, dry(mark, limits)]
-    if checks[-1].passed:
-        # The head, tip and tone of a dry brush's mark mean nothing.
-        checks += [smeared(mark, depth_mm, limits), *(check(mark, limits) for check in MARK_CHECKS)]
-    return Verdict.of(checks)
+
+    def check_drawing(self, patch: Patch, depth_mm: float) -> Verdict:
+        """Judge a figure that was drawn down to `depth_mm`.
+
+        Checks exposure and blur, that the patch holds ink that `previous` does not show, and that nothing new lies
+        across the patch's edge, as an arm still in the picture would. The shape is not judged: every figure has its
+        own.
+        """
+        frame, gate = self.check_frame(), self.limits.ink_gate
+        if not frame.passed:
+            return frame
+        inside = on_sheet(patch.rect_mm, self.sheet_mm)
+        inked = take(self.image, self.plane, inside).inked(gate)
+        if self.previous is not None:
+            inked = inked & ~take(self.previous, self.plane, inside).inked(gate)
+        edge = np.concatenate([inked[0], inked[-1], inked[1:-1, 0], inked[1:-1, -1]])
+        enough = blank(mm2(inked), depth_mm, self.limits)
+        return Verdict((*frame.checks, crossing(float(edge.sum()) / PX_PER_MM), enough))
+
+    def check_blank(self, patch: Patch) -> Check:
+        """Check that the patch is blank; `NEIGHBOUR` if it holds ink or is not completely seen."""
+        limits = self.limits
+        window = take(self.image, self.plane, on_sheet(patch.rect_mm, self.sheet_mm))
+        if (hidden_mm2 := mm2(~window.in_view)) > 0.0:
+            # A patch that lies partly outside the frame cannot be called blank.
+            reason = (
+                f"Patch {patch.index} is not completely in the picture, {hidden_mm2:.0f} mm^2 are hidden. "
+                "Move the camera or the sheet."
+            )
+            return _check(Failure.NEIGHBOUR, hidden_mm2, "mm^2", limits.foreign_mm2, reason, passed=False)
+        ink_mm2 = mm2(window.inked(limits.ink_gate))
+        what = f"Patch {patch.index} is not blank: {ink_mm2:.1f} mm^2 of ink."
+        reason = f"{what} Is this the sheet that the session says it is?"
+        return _check(Failure.NEIGHBOUR, ink_mm2, "mm^2", limits.foreign_mm2, reason)
+
+    def _ink(self, patch: Patch, margin_mm: float, anchor_mm: Point) -> Ink:
+        """The ink in the patch and a margin around it: the stroke's own, other new ink, and old ink."""
+        window = around(patch.rect_mm, margin_mm, self.sheet_mm)
+        inside = on_sheet(patch.rect_mm, self.sheet_mm)
+        before = None if self.previous is None else take(self.previous, self.plane, window, measure.COARSE_PX_PER_MM)
+        return tell_apart(take(self.image, self.plane, window), before, inside, anchor_mm, self.limits.ink_gate)
+
+    def _glare(self, patch: Patch) -> Check:
+        """No reflection in the patch; enough paper around it is looked at to measure the light."""
+        window, inside = around(patch.rect_mm, LIGHT_MM, self.sheet_mm), on_sheet(patch.rect_mm, self.sheet_mm)
+        raster = rectify(self.image, self.plane.homography, window, measure.COARSE_PX_PER_MM)
+        spots, scale = measure.glare(raster, self.limits.glare_share), measure.BRIGHT_PX_PER_MM
+        left, top = inside[0] - window[0], window[1] + window[3] - inside[1] - inside[3]
+        rows = slice(round(top * scale), round((top + inside[3]) * scale))
+        columns = slice(round(left * scale), round((left + inside[2]) * scale))
+        area_mm2 = float(spots[rows, columns].sum()) / scale**2
+        reason = f"{area_mm2:.0f} mm^2 of glare in the patch. Move the lamp, or wait until the ink no longer shines."
+        return _check(Failure.GLARE, area_mm2, "mm^2", self.limits.glare_mm2, reason)
 
 
-def check_drawing(
-    image: Gray,
-    plane: Plane,
-    patch: Patch,
-    *,
-    depth_mm: float,
-    limits: QualityConfig,
-    previous: Gray | None = None,
-    sheet_mm: tuple[float, float] | None = None,
-) -> Verdict:
-    """Judge a figure, drawn down to `depth_mm`, from the (h, w) photograph taken after it.
-
-    Checks exposure and blur, that the patch holds ink that `previous` does not show, and that nothing new lies across
-    the patch's edge, as an arm still in the picture would. The shape is not judged: every figure has its own.
-    `sheet_mm` is as in `check_capture`.
-    """
-    frame = check_frame(image, plane, limits)
-    if not frame.passed:
-        return frame
-    inside = on_sheet(patch.rect_mm, sheet_mm)
-    inked = take(image, plane, inside).inked(limits.ink_gate)
-    if previous is not None:
-        inked = inked & ~take(previous, plane, inside).inked(limits.ink_gate)
-    edge = np.concatenate([inked[0], inked[-1], inked[1:-1, 0], inked[1:-1, -1]])
-    return Verdict((*frame.checks, crossing(float(edge.sum()) / PX_PER_MM), blank(mm2(inked), depth_mm, limits)))
-
-
-def patch_is_blank(
-    image: Gray, plane: Plane, patch: Patch, *, limits: QualityConfig, sheet_mm: tuple[float, float] | None = None
-) -> Check:
-    """Check in an (h, w) photograph that the patch is blank; `NEIGHBOUR` if it holds ink or is not completely seen.
-
-    `sheet_mm` (width, height) excludes the sheet's edge and what lies beyond it.
-    """
-    window = take(image, plane, on_sheet(patch.rect_mm, sheet_mm))
-    hidden_mm2 = mm2(~window.in_view)
-    if hidden_mm2 > 0.0:
-        # A patch that lies partly outside the frame cannot be called blank.
-        reason = (
-            f"Patch {patch.index} is not completely in the picture, {hidden_mm2:.0f} mm^2 are hidden. "
-            "Move the camera or the sheet."
-        )
-        return _check(Failure.NEIGHBOUR, hidden_mm2, "mm^2", limits.foreign_mm2, reason, passed=False)
-    ink_mm2 = mm2(window.inked(limits.ink_gate))
-    reason = (
-        f"Patch {patch.index} is not blank: {ink_mm2:.1f} mm^2 of ink. Is this the sheet that the session says it is?"
-    )
-    return _below(Failure.NEIGHBOUR, ink_mm2, "mm^2", limits.foreign_mm2, reason)
-
-
-def _check(name: Failure, score: float, unit: str, threshold: float, reason: str, *, passed: bool) -> Check:
-    """A check whose `reason` counts only if it failed."""
-    return Check(name=name, score=score, threshold=threshold, unit=unit, passed=passed, reason="" if passed else reason)
-
-
-def _below(name: Failure, score: float, unit: str, limit: float, reason: str) -> Check:
-    return _check(name, score, unit, limit, reason, passed=score < limit)
+def _check(name: Failure, score: float, unit: str, limit: float, reason: str, *, passed: bool | None = None) -> Check:
+    """A check whose `reason` counts only if it failed; unless `passed` is given, the score must be below the limit."""
+    passed = score < limit if passed is None else passed
+    return Check(name=name, score=score, threshold=limit, unit=unit, passed=passed, reason="" if passed else reason)
 
 
 def _at_least(name: Failure, score: float, unit: str, limit: float, reason: str) -> Check:
@@ -237,7 +230,7 @@ def blurred(image: Gray, plane: Plane, limits: QualityConfig) -> tuple[Check, ..
         return ()
     sigma_mm = sigma_px * plane.mm_per_px
     reason = f"The picture is blurred by {sigma_mm:.2f} mm. Focus the lens, clean it, and see that nothing shakes."
-    return (_below(Failure.BLURRED, sigma_mm, "mm", limits.blur_mm, reason),)
+    return (_check(Failure.BLURRED, sigma_mm, "mm", limits.blur_mm, reason),)
 
 
 def cut(ink: Ink, plane: Plane, shape: tuple[int, ...], anchor_mm: Point, limits: QualityConfig) -> Check:
@@ -246,18 +239,6 @@ def cut(ink: Ink, plane: Plane, shape: tuple[int, ...], anchor_mm: Point, limits
     gap_mm = measure.edge_mm(points, plane, shape)
     reason = f"The stroke ends {max(gap_mm, 0.0):.1f} mm from the edge of the picture. Move the camera or the sheet."
     return _at_least(Failure.CUT, gap_mm, "mm", limits.edge_mm, reason)
-
-
-def glare(image: Gray, plane: Plane, window: Rect, cell_mm: Rect, limits: QualityConfig) -> Check:
-    """No reflection in the patch; `window` includes enough paper around it to measure the light."""
-    spots = measure.glare(rectify(image, plane.homography, window, measure.COARSE_PX_PER_MM), limits.glare_share)
-    scale = measure.BRIGHT_PX_PER_MM
-    left, top = cell_mm[0] - window[0], window[1] + window[3] - cell_mm[1] - cell_mm[3]
-    rows = slice(round(top * scale), round((top + cell_mm[3]) * scale))
-    columns = slice(round(left * scale), round((left + cell_mm[2]) * scale))
-    area_mm2 = float(spots[rows, columns].sum()) / scale**2
-    reason = f"{area_mm2:.0f} mm^2 of glare in the patch. Move the lamp, or wait until the ink no longer shines."
-    return _below(Failure.GLARE, area_mm2, "mm^2", limits.glare_mm2, reason)
 
 
 def neighbour(ink: Ink, limits: QualityConfig) -> Check:
@@ -269,13 +250,13 @@ def neighbour(ink: Ink, limits: QualityConfig) -> Check:
         else "something dripped or lies apart from the stroke. Wipe the brush on the rim after a dip"
     )
     reason = f"{area_mm2:.1f} mm^2 of ink in the patch are not the stroke's: {source}."
-    return _below(Failure.NEIGHBOUR, area_mm2, "mm^2", limits.foreign_mm2, reason)
+    return _check(Failure.NEIGHBOUR, area_mm2, "mm^2", limits.foreign_mm2, reason)
 
 
 def crossing(length_mm: float) -> Check:
     """No new ink across the edge of a figure's patch."""
     reason = f"New ink, or the arm, lies across {length_mm:.0f} mm of the patch's edge. Is the arm out of the picture?"
-    return _below(Failure.NEIGHBOUR, length_mm, "mm", CROSSING_MM, reason)
+    return _check(Failure.NEIGHBOUR, length_mm, "mm", CROSSING_MM, reason)
 
 
 def blank(own_mm2: float, depth_mm: float, limits: QualityConfig) -> Check:
@@ -297,7 +278,7 @@ def far_off(ink: Ink, anchor_mm: Point, depth_mm: float, limits: QualityConfig) 
 def dry(mark: Mark, limits: QualityConfig) -> Check:
     """Ink without streaks of bare paper."""
     reason = f"The brush was dry: the ink is streaky ({mark.uneven:.2f}). Dip again, deeper or longer."
-    return _below(Failure.DRY, mark.uneven, "of the mean", limits.uneven, reason)
+    return _check(Failure.DRY, mark.uneven, "of the mean", limits.uneven, reason)
 
 
 def misplaced(mark: Mark, limits: QualityConfig) -> Check:
@@ -305,7 +286,7 @@ def misplaced(mark: Mark, limits: QualityConfig) -> Check:
     along, aside = mark.head_mm
     off_mm = math.hypot(along - limits.head_mm, aside)
     reason = f"The stroke begins {off_mm:.1f} mm from where the tip should have touched. {_WHERE}"
-    return _below(Failure.MISPLACED, off_mm, "mm", limits.misplaced_mm, reason)
+    return _check(Failure.MISPLACED, off_mm, "mm", limits.misplaced_mm, reason)
 
 
 def smeared(mark: Mark, depth_mm: float, limits: QualityConfig) -> Check:
@@ -315,7 +296,7 @@ def smeared(mark: Mark, depth_mm: float, limits: QualityConfig) -> Check:
         f"The stroke is smeared: {mark.length_mm:.0f} by {mark.width_mm:.0f} mm at a depth of {depth_mm:g} mm. Did "
         "another client move the arm, or did the sheet slip?"
     )
-    return _below(Failure.SMEARED, excess_mm, "mm", limits.smeared_mm, reason)
+    return _check(Failure.SMEARED, excess_mm, "mm", limits.smeared_mm, reason)
 
 
 def faint(mark: Mark, limits: QualityConfig) -> Check:
@@ -327,13 +308,13 @@ def faint(mark: Mark, limits: QualityConfig) -> Check:
 def split(mark: Mark, limits: QualityConfig) -> Check:
     """One group of hairs, not two."""
     reason = f"The bristles are split: a gap of {mark.gap_mm:.1f} mm. Comb the brush together on the rim and dip again."
-    return _below(Failure.SPLIT, mark.gap_mm, "mm", limits.split_mm, reason)
+    return _check(Failure.SPLIT, mark.gap_mm, "mm", limits.split_mm, reason)
 
 
 def bent(mark: Mark, limits: QualityConfig) -> Check:
     """A mark that runs along the heading."""
     reason = f"The tip is bent: the stroke runs {mark.bent_deg:.0f} deg off. Wipe the tip straight and dip again."
-    return _below(Failure.BENT, mark.bent_deg, "deg", limits.bent_deg, reason)
+    return _check(Failure.BENT, mark.bent_deg, "deg", limits.bent_deg, reason)
 
 
 MARK_CHECKS = (misplaced, faint, split, bent)

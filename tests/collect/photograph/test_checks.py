@@ -6,7 +6,6 @@ from __future__ import annotations
 import csv
 from collections import Counter
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +20,7 @@ from pydantic import ValidationError
 from bench.brushes import DATA as SHARED
 from brushloop.calibrate.board.pix2len import Plane
 from brushloop.calibrate.stroke import PX_PER_MM
-from brushloop.collect.photograph.checks import (
-    Failure,
-    Verdict,
-    check_capture,
-    check_drawing,
-    check_frame,
-    patch_is_blank,
-)
+from brushloop.collect.photograph.checks import Failure, Photograph, Verdict
 from brushloop.collect.photograph.measure import Ink, Window, blur_px, glare, measure_mark, paper_level
 from brushloop.collect.rig.config import QualityConfig
 from brushloop.collect.rig.paper import Patch
@@ -50,6 +42,10 @@ def plane(height_px: int = 480) -> Plane:
 def paper(*, seed: int = 0) -> Gray:
     noise = np.random.default_rng(seed).normal(0.0, 1.5, (480, 640))
     return np.clip(200.0 + noise, 0.0, 255.0).astype(np.uint8)
+
+
+def of(image: Gray, **more: Any) -> Photograph:
+    return Photograph(image, plane(), LIMITS, **more)
 
 
 def stroke(image: Gray, x_mm: float, y_mm: float, length_mm: float = 18.0, level: int = 20) -> Gray:
@@ -78,13 +74,13 @@ def test_a_shake_along_one_direction_counts_as_blur_and_a_bare_sheet_has_none() 
     assert dragged is not None
     assert dragged > 3.0 * sharp
     assert blur_px(paper()) is None
-    assert check_frame(paper(), plane(), LIMITS).passed
+    assert of(paper()).check_frame().passed
 
 
 @pytest.mark.parametrize(("gain", "word"), [(0.2, "too dark"), (1.6, "too bright")])
 def test_exposure_is_described_in_words(gain: float, word: str) -> None:
     image = np.clip(stroke(paper(), 50.0, 27.0) * gain, 0.0, 255.0).astype(np.uint8)
-    verdict = check_frame(image, plane(), LIMITS)
+    verdict = of(image).check_frame()
     assert named(verdict) == "exposure"
     assert word in verdict.reason
     assert paper_level(paper()) == pytest.approx(200.0, abs=2.0)
@@ -108,7 +104,7 @@ def test_bare_paper_between_wide_marks_is_not_glare(width_mm: float) -> None:
 
 
 def press(image: Gray, depth_mm: float = 14.0, patch: Patch = PATCH, **more: Any) -> Verdict:
-    return check_capture(image, plane(), patch, depth_mm=depth_mm, limits=LIMITS, **more)
+    return of(image, **more).check_press(patch, depth_mm)
 
 
 def named(verdict: Verdict, among: Sequence[Failure] = tuple(Failure)) -> str:
@@ -151,7 +147,10 @@ def test_a_mark_at_the_edge_of_the_frame_is_cut_and_nothing_else_is_said_of_it()
 def test_a_figure_is_sound_where_its_patch_has_new_ink_and_blank_where_it_has_none() -> None:
     before = stroke(paper(seed=1), 50.0, 27.0)
     drawn = stroke(stroke(paper(), 50.0, 27.0), 52.0, 22.0)
-    judge = partial(check_drawing, plane=plane(), patch=PATCH, depth_mm=5.0, limits=LIMITS)
+
+    def judge(image: Gray, previous: Gray | None = None) -> Verdict:
+        return of(image, previous=previous).check_drawing(PATCH, 5.0)
+
     assert judge(drawn, previous=before).passed
     assert named(judge(stroke(paper(), 50.0, 27.0), previous=before)) == "blank"
     assert judge(paper()).cause == judge(paper(), previous=paper(seed=1)).cause
@@ -162,18 +161,18 @@ def test_a_figure_is_sound_where_its_patch_has_new_ink_and_blank_where_it_has_no
 
 
 def test_a_patch_that_is_not_wholly_seen_is_not_called_blank() -> None:
-    blank = partial(patch_is_blank, plane=plane(), limits=LIMITS)
-    assert "not completely in the picture" in blank(paper(), patch=Patch(3, -10.0, 15.0, 40.0, 24.0)).reason
-    assert "Patch 0 is not blank" in blank(stroke(paper(), 50.0, 27.0), patch=PATCH).reason
-    assert blank(paper(), patch=PATCH).passed
+    hidden = of(paper()).check_blank(Patch(3, -10.0, 15.0, 40.0, 24.0))
+    assert "not completely in the picture" in hidden.reason
+    assert "Patch 0 is not blank" in of(stroke(paper(), 50.0, 27.0)).check_blank(PATCH).reason
+    assert of(paper()).check_blank(PATCH).passed
 
 
 def test_the_edge_of_a_sheet_is_no_ink_in_the_patches_along_it() -> None:
     patch, sheet_mm = Patch(0, 20.0, 36.0, 40.0, 24.0), (80.0, 60.0)
     seen = paper()
     seen[: round(0.8 * PX)] = 20  # the dark table, where the sheet was thought to reach
-    assert not patch_is_blank(seen, plane(), patch, limits=LIMITS).passed
-    assert patch_is_blank(seen, plane(), patch, limits=LIMITS, sheet_mm=sheet_mm).passed
+    assert not of(seen).check_blank(patch).passed
+    assert of(seen, sheet_mm=sheet_mm).check_blank(patch).passed
     first = press(stroke(seen.copy(), 50.0, 48.0), 10.0, patch, sheet_mm=sheet_mm)
     assert next(check for check in first.checks if check.name == Failure.NEIGHBOUR).passed
 
@@ -227,15 +226,10 @@ def judge(row: dict[str, str], limits: QualityConfig = WHITENED) -> Verdict:
     assert image is not None
     x_mm, y_mm = 1.0 / float(row["px_per_mm_x"]), 1.0 / float(row["px_per_mm_y"])
     size_mm = image.shape[1] * x_mm, image.shape[0] * y_mm
-    return check_capture(
-        image.astype(np.uint8),
-        flat_plane((image.shape[1], image.shape[0]), (x_mm, y_mm)),
-        Patch(0, 0.0, 0.0, *size_mm),
-        depth_mm=max(float(row.get("depth_mid_mm_nominal") or DEPTH_MM), 1.0),
-        limits=limits,
-        sheet_mm=size_mm,
-        anchor_mm=(float(row["start_x_px"]) * x_mm, size_mm[1] - float(row["start_y_px"]) * y_mm),
-    )
+    photograph = Photograph(image.astype(np.uint8), flat_plane(image.shape[::-1], (x_mm, y_mm)), limits, size_mm)
+    depth_mm = max(float(row.get("depth_mid_mm_nominal") or DEPTH_MM), 1.0)
+    anchor_mm = float(row["start_x_px"]) * x_mm, size_mm[1] - float(row["start_y_px"]) * y_mm
+    return photograph.check_press(Patch(0, 0.0, 0.0, *size_mm), depth_mm, anchor_mm)
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the folder of real photographs is not here")

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from bench.quality import SPOTLESS_MM2, Bench, Blank, Sample, Score, score
-from brushloop.collect.photograph.checks import Failure, check_capture, patch_is_blank
+from brushloop.collect.photograph.checks import Failure, Photograph, Verdict
 from brushloop.collect.rig.config import QualityConfig
 
 pytestmark = pytest.mark.xdist_group("quality")  # drawn once
@@ -73,29 +73,26 @@ def test_without_a_still_from_before_the_stroke_itself_is_judged_the_same(drawn:
     assert sum(scores.counts[label, label] for label in bristles) >= len(scores.seconds) - 1
 
 
+def judged(sample: Sample, limits: QualityConfig) -> Verdict:
+    photograph = Photograph(sample.image, sample.plane, limits, previous=sample.before)
+    return photograph.check_press(sample.patch, sample.depth_mm)
+
+
 def test_a_verdict_shows_the_operator_what_was_seen_and_what_to_do(drawn: list[Sample | Blank]) -> None:
-    split = next(s for s in drawn if isinstance(s, Sample) and s.label is Failure.SPLIT)
-    verdict = check_capture(
-        split.image, split.plane, split.patch, depth_mm=split.depth_mm, limits=LIMITS, previous=split.before
-    )
+    verdict = judged(next(s for s in drawn if isinstance(s, Sample) and s.label is Failure.SPLIT), LIMITS)
     assert verdict.cause is not None
     assert verdict.cause.threshold == LIMITS.split_mm
     assert (verdict.cause.score or 0.0) > LIMITS.split_mm
-    assert "mm" in verdict.reason
-    assert "Comb the brush" in verdict.reason
+    assert "mm. Comb the brush" in verdict.reason
     [faint] = [check for check in verdict.checks if check.name == Failure.FAINT]
-    assert faint.passed
-    assert faint.reason == ""
+    assert (faint.passed, faint.reason) == (True, "")
 
 
 def test_limits_come_from_the_configuration(drawn: list[Sample | Blank]) -> None:
     sound = next(s for s in drawn if isinstance(s, Sample) and s.label is None)
-    strict = LIMITS.model_copy(update={"faint_tone": 0.99})
-    verdict = check_capture(
-        sound.image, sound.plane, sound.patch, depth_mm=sound.depth_mm, limits=strict, previous=sound.before
-    )
+    verdict = judged(sound, LIMITS.model_copy(update={"faint_tone": 0.99}))
     assert verdict.cause is not None
     assert verdict.cause.name == Failure.FAINT
     inked = next(p for p in drawn if isinstance(p, Blank) and not p.blank)
     lax = LIMITS.model_copy(update={"foreign_mm2": 900.0})
-    assert patch_is_blank(inked.image, inked.plane, inked.patch, limits=lax).passed
+    assert Photograph(inked.image, inked.plane, lax).check_blank(inked.patch).passed
