@@ -55,12 +55,9 @@ and down, in shares of the picture's width and height.
 """
 MOST_ROUNDS = 3.0
 """The sensor's rounds come faster with simulated time, up to this many times: what one process can send and read."""
-THINGS = (
-    *("pin", "upright", "board-corner", "sheet-corner", "well", "well-rim", "wash-pot", "wash-rim"),
-    *("park", "clear-view", "hold-board", "push-sensor"),
-)
 TOUCHED = ("pin", "board-corner", "sheet-corner", "well-rim", "wash-rim")
-"""Things that the tip touches; it is brought to the others by eye."""
+THINGS = (*TOUCHED, "upright", "well", "wash-pot", "park", "clear-view", "hold-board", "push-sensor")
+"""Those that the tip touches, and those to which it is brought by eye."""
 
 
 class UnknownLab(LoopbackRig):

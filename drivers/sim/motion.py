@@ -173,7 +173,7 @@ class MotionQueue:
         blend_mm: float = 0.0,
         fix: Matrix | None = None,
     ) -> bool:
-        """Append a line; return False if the last move already ends at the target.
+        """Append a line that takes at least `duration_s`; return False if the last move already ends at the target.
 
         `target` is a pose of the configured tool centre point, and `fix` leads from there to the true tip.
         """
@@ -186,7 +186,8 @@ class MotionQueue:
         end = target if fix is None else pose_of(matrix_of(target) @ fix)
         path = line(start, end, travel_mm, math.radians(turn_deg))
         unit, blend_mm = (1e-3, 0.0) if path.angular else (1.0, blend_mm)
-        self._append(path, speed_mm_s * unit, acc_mm_s2 * unit, now_s, duration_s, blend_mm)
+        speed = speed_mm_s * unit if duration_s == 0.0 else min(speed_mm_s * unit, path.length / duration_s)
+        self._append(path, speed, acc_mm_s2 * unit, now_s, blend_mm)
         return True
 
     def add_joints(self, joints: Joints, speed_rad_s: float, acc_rad_s2: float, now_s: float) -> bool:
@@ -296,19 +297,10 @@ class MotionQueue:
             for start, end in itertools.pairwise(places if length > 0.0 else ()):
                 self._on_path(start, end)
 
-    def _append(
-        self,
-        path: Path,
-        speed: float,
-        acc: float,
-        now_s: float,
-        least_s: float = 0.0,
-        blend_mm: float = 0.0,
-    ) -> None:
-        """Append a move at this speed, or slower so that it takes `least_s`."""
+    def _append(self, path: Path, cap: float, acc: float, now_s: float, blend_mm: float = 0.0) -> None:
+        """Append a move at no more than this speed."""
         here = self._knots[-1] if self.held else self._at(now_s)
         start = self._pieces[-1].stop if self._pieces else here.along
-        cap = min(speed, path.length / least_s) if least_s else speed
         piece = Piece(self._next_id, path, start, 0.0, path.length, cap, acc, blend_mm)
         self._next_id += 1
         rounded = self._rounded(piece, here.along)

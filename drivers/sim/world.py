@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.force.sri_m8123 import Wrench
@@ -52,25 +51,27 @@ TILTS_DEG = (0.0, 7.5, 15.0, 30.0)
 GRAVITY_M_S2 = 9.81
 ALONG_RAD = 1e-6
 LEVEL = (0.0, 0.0, 1.0)
+Push = Callable[[float, float], float]
+"""The paper's push on a brush: the normal force in N by depth in mm and tilt in deg, 0 in the air."""
 
 
-class Reaction:
+@functools.lru_cache(maxsize=8)
+def push_on(spec: BrushSpec) -> Push:
     """The paper's push on one brush.
 
-    It comes from the same spine as the ink, on the way down. Friction along the paper, the pull of the menisci and the
-    hysteresis on the way up are left out: only the normal force of a press remains.
+    It comes from the same spine as the ink, on the way down, and takes some tenths of a second to find. Friction along
+    the paper, the pull of the menisci and the hysteresis on the way up are left out: only the normal force remains.
     """
+    brush = Brush(spec)
+    deepest_mm = brush.deepest_mm(TILTS_DEG[-1])
+    rows = [brush.push_n(deepest_mm, tilt_deg) for tilt_deg in TILTS_DEG]
+    steps_mm = np.linspace(0.0, deepest_mm, rows[0].size)
 
-    def __init__(self, spec: BrushSpec) -> None:
-        self._spec = spec
+    def push_n(depth_mm: float, tilt_deg: float) -> float:
+        at_tilts = [float(np.interp(depth_mm, steps_mm, row)) for row in rows]
+        return float(np.interp(tilt_deg, TILTS_DEG, at_tilts)) if depth_mm > 0.0 else 0.0
 
-    def push_n(self, depth_mm: float, tilt_deg: float) -> float:
-        """Normal force of the paper on the bundle; 0 in the air. The first call takes some tenths of a second."""
-        if depth_mm <= 0.0:
-            return 0.0
-        steps_mm, rows = _pushes(self._spec)
-        at_tilts = np.array([np.interp(depth_mm, steps_mm, rows[k]) for k in range(len(TILTS_DEG))], np.float64)
-        return float(np.interp(tilt_deg, np.array(TILTS_DEG), at_tilts))
+    return push_n
 
 
 def leaning_with(pose: Pose, normal: tuple[float, float, float]) -> Pose:
@@ -97,15 +98,6 @@ def bent_toward(pose: Pose, tilt_deg: float, heading_deg: float, set_lean_deg: f
     if abs(off) < ALONG_RAD:
         return heading_deg
     return wrist_deg + math.degrees(math.atan2(tilt_deg * math.sin(off), tilt_deg * math.cos(off) + set_lean_deg))
-
-
-@functools.lru_cache(maxsize=8)
-def _pushes(spec: BrushSpec) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Depths (n,) in mm and the normal force (tilts, n) in N at each."""
-    brush = Brush(spec)
-    depth_mm = brush.deepest_mm(TILTS_DEG[-1])
-    rows = [brush.push_n(depth_mm, tilt_deg) for tilt_deg in TILTS_DEG]
-    return np.linspace(0.0, depth_mm, rows[0].size), np.asarray(rows)
 
 
 class SimClock:
@@ -161,7 +153,6 @@ class World:
         self.ink_load = 0.0
         table = config.table
         self.well = Well.round(table.well_radius_mm, table.ink_level_mm, table.well_depth_mm)
-        self.reaction = Reaction(config.brush)
         self.version = 0
         """Number of visible changes to the sheet so far."""
         self._contact: list[Pose] = []
@@ -177,6 +168,11 @@ class World:
         self.paper = Paper(*self.config.table.sheet_mm)
         self.version += 1
 
+    @functools.cached_property
+    def reaction(self) -> Push:
+        """The paper's push on the brush."""
+        return push_on(self.config.brush)
+
     def tool(self) -> Pose:
         """Current pose of the tip in the base frame."""
         return self.motion.pose(self.clock.now_s())
@@ -191,7 +187,7 @@ class World:
         x_mm, y_mm, depth_mm = self.on_sheet(tip)
         paper_n = 0.0
         if not self.is_over_well(x_mm, y_mm):
-            paper_n = self.reaction.push_n(depth_mm, lean(leaning_with(tip, normal))[0])
+            paper_n = self.reaction(depth_mm, lean(leaning_with(tip, normal))[0])
         push_n, weight_n = (paper_n * part for part in normal), (0.0, 0.0, config.hanging_kg * GRAVITY_M_S2)
         force_n = [a - b + c for a, b, c in zip(push_n, weight_n, self.push_n, strict=True)]
         about_x, about_y = (math.radians(v) for v in config.tool_lean_deg)

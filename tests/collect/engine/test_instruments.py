@@ -37,7 +37,7 @@ def slowly(lab: Lab) -> None:
 
 def in_mid_press(lab: Lab, monkeypatch: pytest.MonkeyPatch, fault: Fault) -> None:
     """The sensor has this fault as soon as the brush is 4 mm deep, once."""
-    push_n = lab.rig.world.reaction.push_n
+    push_n = lab.rig.world.reaction
     hung: list[int] = []
 
     def pushed_n(depth_mm: float, tilt_deg: float) -> float:
@@ -45,7 +45,7 @@ def in_mid_press(lab: Lab, monkeypatch: pytest.MonkeyPatch, fault: Fault) -> Non
             hung.append(lab.rig.faults.hang(fault))
         return push_n(depth_mm, tilt_deg)
 
-    monkeypatch.setattr(lab.rig.world.reaction, "push_n", pushed_n)
+    monkeypatch.setattr(lab.rig.world, "reaction", pushed_n)
 
 
 def presses(lab: Lab) -> int:
@@ -67,7 +67,7 @@ def test_force_and_ink_are_recorded_beside_the_poses(collected: Collected) -> No
 def test_something_hard_under_the_brush_stops_the_arm_at_once_and_burns_the_patch(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lab.rig.world.reaction, "push_n", lambda depth_mm, _tilt_deg: 9.0 if depth_mm > 4.0 else 0.0)
+    monkeypatch.setattr(lab.rig.world, "reaction", lambda depth_mm, _tilt_deg: 9.0 if depth_mm > 4.0 else 0.0)
     slowly(lab)
     with pytest.raises(ForceTooHigh, match="ceiling is 5 N"):
         lab.run()

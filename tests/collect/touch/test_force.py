@@ -18,7 +18,7 @@ from brushloop.collect.touch.camera import first_ink
 from brushloop.collect.touch.force import Contact, Reading, find_contact, touch_by_force
 from brushloop.collect.touch.heights import Reach
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.world import Reaction
+from brushloop.drivers.sim.world import Push, push_on
 
 HINGE_NOISE_N = 0.002
 
@@ -73,7 +73,7 @@ REACH = Reach(122.0, 120.0, 118.0)
 class Felt:
     """Rests over the loopback brush's own reaction, with the noise of the rig's sensor."""
 
-    reaction: Reaction
+    reaction: Push
     touch_z_mm: float
     rng: np.random.Generator
     lean_deg: float = 0.0
@@ -84,16 +84,16 @@ class Felt:
         depth_mm = (self.touch_z_mm - z_mm) * math.cos(math.radians(self.lean_deg))
         self.deepest_mm = max(self.deepest_mm, depth_mm)
         self.samples += samples
-        drawn = self.rng.normal(self.reaction.push_n(depth_mm, self.lean_deg), NOISE_N, samples)
+        drawn = self.rng.normal(self.reaction(depth_mm, self.lean_deg), NOISE_N, samples)
         return Reading(z_mm, float(drawn.mean()), samples, float(drawn.std(ddof=1)))
 
 
 @pytest.fixture(scope="module")
-def reaction() -> Reaction:
-    return Reaction(SimConfig().brush)
+def reaction() -> Push:
+    return push_on(SimConfig().brush)
 
 
-async def touched(reaction: Reaction, seed: int, config: ForceTouchConfig) -> tuple[float, Contact, Felt]:
+async def touched(reaction: Push, seed: int, config: ForceTouchConfig) -> tuple[float, Contact, Felt]:
     """(error in mm, contact, probe) of one touch at a random height, on a sheet that leans by up to 1 deg."""
     rng = np.random.default_rng(seed)
     truth = 120.0 + rng.uniform(-1.0, 1.0)
@@ -102,7 +102,7 @@ async def touched(reaction: Reaction, seed: int, config: ForceTouchConfig) -> tu
     return contact.z_mm - truth, contact, probe
 
 
-async def test_200_touches_lie_within_a_tenth_of_the_truth_at_3_sigma(reaction: Reaction) -> None:
+async def test_200_touches_lie_within_a_tenth_of_the_truth_at_3_sigma(reaction: Push) -> None:
     found = [await touched(reaction, seed, ForceTouchConfig()) for seed in range(200)]
     errors = np.array([error for error, _, _ in found])
     sys.stdout.write(
@@ -117,7 +117,7 @@ async def test_200_touches_lie_within_a_tenth_of_the_truth_at_3_sigma(reaction: 
 
 
 @pytest.mark.parametrize("moved_mm", [-0.7, -0.3, 0.3, 0.7])
-async def test_a_sheet_that_moved_since_the_last_touch_is_found(reaction: Reaction, moved_mm: float) -> None:
+async def test_a_sheet_that_moved_since_the_last_touch_is_found(reaction: Push, moved_mm: float) -> None:
     rng = np.random.default_rng(3)
     first = await touch_by_force(Felt(reaction, 120.0, rng).rest, REACH, ForceTouchConfig())
     moved = Felt(reaction, 120.0 + moved_mm, rng)
@@ -134,7 +134,7 @@ async def test_a_sheet_that_moved_since_the_last_touch_is_found(reaction: Reacti
     ],
 )
 async def test_a_touch_that_finds_nothing_begins_too_low_or_stays_unsure_is_refused(
-    reaction: Reaction, monkeypatch: pytest.MonkeyPatch, paper_z_mm: float, samples: int, said: str
+    reaction: Push, monkeypatch: pytest.MonkeyPatch, paper_z_mm: float, samples: int, said: str
 ) -> None:
     monkeypatch.setattr(force, "MOST_SAMPLES", samples)
     with pytest.raises(StepError, match=said):
@@ -145,11 +145,11 @@ FEW_SAMPLES = ForceTouchConfig(sigma_mm=0.3, fast_samples=20, medium_samples=40,
 
 
 @pytest.mark.parametrize("seed", range(19))
-async def test_rests_that_are_noisy_still_are_repeated_and_do_not_end_the_touch(reaction: Reaction, seed: int) -> None:
+async def test_rests_that_are_noisy_still_are_repeated_and_do_not_end_the_touch(reaction: Push, seed: int) -> None:
     assert abs((await touched(reaction, seed, FEW_SAMPLES))[0]) < 3.0 * FEW_SAMPLES.sigma_mm
 
 
-async def test_a_contact_in_the_air_is_not_believed(reaction: Reaction) -> None:
+async def test_a_contact_in_the_air_is_not_believed(reaction: Push) -> None:
     config, probe = ForceTouchConfig(), Felt(reaction, 120.0, np.random.default_rng(1))
 
     async def rest(z_mm: float, samples: int) -> Reading:
