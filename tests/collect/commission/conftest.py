@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from brushloop.collect.commission.visit import LeftOff, Taught, Tone, Value, Visit
+from brushloop.collect.commission.visit import LeftOff, Tone, Visit, WentBack
 from brushloop.collect.commission.wizard import Wizard
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.operator import Asker, Prompt
@@ -44,18 +44,24 @@ class Person(Asker):
         raise LeftOff
 
 
-def visit_of(person: Person, folder: Path) -> Visit:
-    """A visit on which the arm and its tip are known."""
-    visit = person.visit(folder / "rig.toml")
-    values: dict[str, Value] = {
-        "robot.host": "127.0.0.1",
-        "robot.port": 9,
-        "robot.framing": "sof",
-        "robot.tcp_offset_mm": [0.0, 0.0, 180.0],
-        "robot.tcp_rotation_deg": [0.0, 0.0, 0.0],
-    }
-    visit.keep({field: Taught(value, "typed") for field, value in values.items()})
-    return visit
+BACK = "<"
+
+
+class Answering(Person):
+    """Answers with one line or key after the other, an empty one for the default; `BACK` goes back, the end leaves."""
+
+    def __init__(self, *answers: str) -> None:
+        super().__init__()
+        self.answers = list(answers)
+
+    async def ask(self, prompt: Prompt) -> Any:
+        self.asked.append(prompt.question.split(":")[0].split(",")[0])
+        if not self.answers:
+            raise LeftOff
+        if (answer := self.answers.pop(0)) == BACK:
+            raise WentBack
+        answer = answer or prompt.default
+        return prompt.answer_to(answer) if prompt.read is None else prompt.read(answer)
 
 
 # In an unknown lab

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 from unittest.mock import AsyncMock
 
 import pytest
@@ -12,41 +11,23 @@ import pytest
 from brushloop.collect.commission.arm import ASK_ADDRESS
 from brushloop.collect.commission.brush import ASK_BUS, ASK_PORT, RADIUS, BrushStep, ForceStep, ask_depth, ask_length
 from brushloop.collect.commission.camera import ASK_SQUARES, CameraStep
-from brushloop.collect.commission.visit import LeftOff, Visit, WentBack
+from brushloop.collect.commission.visit import Taught, Visit
 from brushloop.collect.commission.wizard import Wizard
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.operator import Prompt
 from brushloop.drivers.errors import DeviceTimeout
 from brushloop.drivers.ink.station import InkStationConfig
-from tests.collect.commission.conftest import Person, visit_of
+from tests.collect.commission.conftest import BACK, Answering, Person
 
-BACK, HOW, GIVE, LINE = "<", "How do you want to go on?", "Give 0.5 ml", "Its serial line"
+HOW, GIVE, LINE = "How do you want to go on?", "Give 0.5 ml", "Its serial line"
 R, L, DEEPEST, NAME = "R", "L", "Deepest press that this brush can take; 45% of L is cautious", "Name of the brush"
 WELL, INK, CAN = "What keeps the ink well filled?", "Name of the ink", "CAN bus of the force sensor"
 
 
-class Typing(Person):
-    """Types one answer after the other; `<` goes back, the end of the list leaves."""
-
-    def __init__(self, *answers: str) -> None:
-        super().__init__()
-        self.answers = list(answers)
-
-    async def ask(self, prompt: Prompt) -> Any:
-        self.asked.append(prompt.question.split(":")[0].split(",")[0])
-        if not self.answers:
-            raise LeftOff
-        if (answer := self.answers.pop(0)) == BACK:
-            raise WentBack
-        answer = answer or prompt.default
-        return prompt.answer_to(answer) if prompt.read is None else prompt.read(answer)
-
-
-async def led(person: Typing, folder: Path) -> Visit:
-    """Steps before the brush are done; the person is led through brush and force."""
-    visit = visit_of(person, folder)
-    for step in ("arm", "camera", "tip", "sheet", "places"):
-        visit.save(visit.notebook.finished(step))
+async def led(person: Answering, folder: Path) -> Visit:
+    """The tip is known; the person is led through brush and force."""
+    visit = person.visit(folder / "rig.toml")
+    visit.keep({"robot.tcp_offset_mm": Taught([0.0, 0.0, 180.0], "measured")})
     with pytest.raises(CollectAborted):
         await Wizard(visit, (BrushStep(), ForceStep())).run()
     return visit
@@ -80,7 +61,7 @@ def station(monkeypatch: pytest.MonkeyPatch) -> AsyncMock:
 async def test_back_asks_the_question_before_and_no_other(
     answers: tuple[str, ...], asked: list[str], tmp_path: Path, station: AsyncMock
 ) -> None:
-    person = Typing(*answers)
+    person = Answering(*answers)
     visit = await led(person, tmp_path)
     assert person.asked == asked
     assert station.dose.await_count == answers.count("y")
@@ -102,7 +83,7 @@ async def test_a_step_that_was_refused_goes_on_where_the_person_wants(
     after: tuple[str, ...], asked: list[str], tmp_path: Path, station: AsyncMock
 ) -> None:
     station.connect.side_effect = [DeviceTimeout("ink", "connect", "no reply"), station.connect.return_value]
-    person = Typing("6", "48", "20", "", "i", "/dev/ttyUSB0", *after)
+    person = Answering("6", "48", "20", "", "i", "/dev/ttyUSB0", *after)
     await led(person, tmp_path)
     assert person.asked == [R, L, DEEPEST, NAME, WELL, LINE, HOW, *asked]
 
@@ -129,8 +110,8 @@ def test_a_line_that_cannot_be_the_value_is_refused_where_it_is_typed(asked: Pro
 
 
 async def test_a_step_that_is_taught_again_by_mistake_is_as_it_was_after_back(tmp_path: Path) -> None:
-    await led(Typing("6", "48", "20", "", "n", ""), tmp_path)
-    again = Typing(BACK)
+    await led(Answering("6", "48", "20", "", "n", ""), tmp_path)
+    again = Answering(BACK)
     visit = again.visit(tmp_path / "rig.toml")
     before = visit.notebook
     await Wizard(visit, (BrushStep(), ForceStep())).again("brush")

@@ -18,7 +18,7 @@ from brushloop.collect.commission.visit import Notebook, Visit
 from brushloop.collect.commission.wizard import Wizard
 from brushloop.collect.rig.config import load_rig
 from brushloop.drivers.sim.lab_facts import Trap
-from brushloop.sessions.events import SelfCheckResult, ZeroTouchResult
+from brushloop.sessions.events import ZeroTouchResult
 from tests.collect.commission.conftest import LIMITS, InLab, errors, first_day, in_lab, newest_session
 
 SMALL_PX = (800, 600)
@@ -46,16 +46,7 @@ IN_PASSING = {
 DELAY_MS = 170.0
 PROVEN = (
     ZeroTouchResult(method="force", touch_z_mm=100.0),
-    SelfCheckResult(
-        sheet=0,
-        patches=(),
-        commanded_mm=(),
-        found_mm=(),
-        offset_mm=(0.5, 0.2),
-        turn_deg=0.1,
-        scale=(1.0, 1.0),
-        residuals_mm=(),
-    ),
+    SimpleNamespace(offset_mm=(0.5, 0.2), turn_deg=0.1),
     [SimpleNamespace(retake=False, camera_delay_ms=DELAY_MS, camera_jitter_ms=20.0)],
 )
 """What a run of the proof may have measured."""

@@ -38,16 +38,6 @@ def around(count: int, tilt_deg: float = 30.0) -> list[Rotation]:
     return [leaning(90.0 * k + 20.0 * (k // 4), tilt_deg) for k in range(count)]
 
 
-offsets = st.tuples(st.floats(-40.0, 40.0), st.floats(-40.0, 40.0), st.floats(50.0, 400.0))
-
-
-@given(offsets, st.floats(15.0, 45.0))
-def test_a_tip_is_found_exactly_from_exact_touches(offset: tuple[float, float, float], tilt_deg: float) -> None:
-    fit = find_tip([flange_at(PIN_MM, turn, np.array(offset)) for turn in around(4, tilt_deg)])
-    assert np.allclose(fit.offset_mm, offset, atol=1e-6)
-    assert np.allclose(fit.pin_mm, PIN_MM, atol=1e-6)
-
-
 def test_the_error_that_is_stated_is_the_error_that_is_made() -> None:
     rng, offset = np.random.default_rng(3), np.array([4.0, -3.0, 180.0])
     made, stated = [], []
