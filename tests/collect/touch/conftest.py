@@ -16,7 +16,7 @@ from brushloop.collect.motion import Procedures, photograph_moves
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.devices import Rig, limits_of
 from brushloop.collect.touch.force import ForceTap
-from brushloop.drivers.devices import ForceSample, Frame, Identity, Pose, PoseSample, QueuedLine, Stamp
+from brushloop.drivers.devices import Frame, Identity, Pose, QueuedLine, Stamp
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.rig import rig_toml
@@ -27,7 +27,6 @@ from tests.rigs import SMALL_TABLE
 SMALL_VIEW = View(width_px=480, height_px=360, px_per_mm=2.8, centre_mm=(55.0, 40.0))
 WHOLE_VIEW = View(width_px=1024, height_px=768, px_per_mm=3.125)
 """Of a sheet of the usual size."""
-IDENTITY = Identity("bench", "world without wires", "", True)
 
 
 class OwnClock:
@@ -51,26 +50,25 @@ class Bench:
 
     sim: SimConfig
     folder: Path
-    world: World = field(init=False)
-    clock: OwnClock = field(default_factory=OwnClock)
     bent: Callable[[Pose], Pose] = lambda pose: pose
     """What the arm makes of a target: for arms that are mounted wrong."""
+    sent: list[Pose] = field(default_factory=list[Pose])
+    """Every target that the arm was sent."""
 
     def __post_init__(self) -> None:
+        self.clock = OwnClock()
         self.world = World(self.sim)
         self.world.clock = self.clock  # pyright: ignore[reportAttributeAccessIssue]
         self.scene = Scene(self.world)
         self.rng = np.random.default_rng(self.sim.seed)
         self.target = brush_pose(*self.sim.home_mm)
-        self.on_sample: Callable[[ForceSample], None] | None = None
-
-        text = rig_toml(self.sim)
-        text = re.sub(r"touch_z_mm = .*", "touch_z_mm = 120.0", text)
+        text = re.sub(r"touch_z_mm = .*", "touch_z_mm = 120.0", rig_toml(self.sim))
         (self.folder / "rig.toml").write_text(text)
         config = load_rig(self.folder / "rig.toml")
         self.limits = limits_of(config)
         devices: Any = self
-        self.rig = Rig(config, devices, devices, devices, IDENTITY, IDENTITY, force=devices)
+        identity = Identity("bench", "world without wires", "", True)
+        self.rig = Rig(config, devices, devices, devices, identity, identity, force=devices)
         self.effector = BenchHands(self)
         self.tap = BenchTap(self)
 
@@ -91,6 +89,7 @@ class Bench:
     async def move(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
         self.limits.check("robot", target, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
         self.target = target
+        self.sent.append(target)
         self.world.motion.add(self.bent(target), speed_mm_s, acc_mm_s2, self.clock.seconds)
         self.clock.seconds += 1e3
         self.world.motion.advance(self.clock.seconds)
@@ -103,22 +102,12 @@ class Bench:
     async def where(self) -> Pose:
         return self.target
 
-    async def take_up(self) -> Pose:
-        return self.target
-
-    def latest(self) -> PoseSample:
-        return PoseSample(Stamp(self.clock.now_ns()), self.target)
-
     # Camera
     async def fresh(self, after: Stamp) -> Frame:
         return Frame(Stamp(self.clock.now_ns()), after.host_ns, self.photograph())
 
     def photograph(self) -> NDArray[np.uint8]:
         return self.scene.render(tool=self.world.tool())
-
-    # ForceSensor
-    def listen(self, on_sample: Callable[[ForceSample], None] | None) -> None:
-        self.on_sample = on_sample
 
 
 class BenchTap(ForceTap):
@@ -164,12 +153,11 @@ def make_bench(tmp_path: Path) -> MakeBench:
         *,
         paper_z_mm: float = 120.0,
         seed: int = 1,
-        bent: Callable[[Pose], Pose] = lambda pose: pose,
         whole: bool = False,
     ) -> Bench:
         if whole:
-            return Bench(SimConfig(seed=seed, view=WHOLE_VIEW), tmp_path, bent=bent)
+            return Bench(SimConfig(seed=seed, view=WHOLE_VIEW), tmp_path)
         table = replace(SMALL_TABLE, slope_deg=slope_deg, paper_z_mm=paper_z_mm)
-        return Bench(SimConfig(seed=seed, table=table, view=SMALL_VIEW), tmp_path, bent=bent)
+        return Bench(SimConfig(seed=seed, table=table, view=SMALL_VIEW), tmp_path)
 
     return make

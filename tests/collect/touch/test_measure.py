@@ -15,7 +15,7 @@ import pytest
 from brushloop.collect.errors import ConfigError, NeedsOperator, StepError
 from brushloop.collect.operator import Asker, Prompt
 from brushloop.collect.protocols.steps import SelfCheckStep, ZeroTouchStep
-from brushloop.collect.rig.config import PaperConfig, RigConfig, TouchConfig
+from brushloop.collect.rig.config import PaperConfig, TouchConfig
 from brushloop.collect.rig.paper import PaperPlane, Sheet
 from brushloop.collect.touch import camera
 from brushloop.collect.touch.heights import Touch, at_one_point, plane_of
@@ -147,27 +147,21 @@ async def test_a_patch_that_does_not_fit_on_the_sheet_is_refused(make_bench: Mak
 
 
 class Operator(Asker):
-    """Jogs by the bench: down in large steps, then smaller ones, until the tip touches; or by `keys`, once each."""
+    """Jogs down in large steps, then smaller ones, until the tip touches; or to the end of the travel, and then says
+    `at_the_end`."""
 
-    def __init__(self, bench: Bench, *keys: str) -> None:
+    def __init__(self, bench: Bench, at_the_end: str = "") -> None:
         super().__init__(watched=True)
         self._bench = bench
-        self._keys = list(keys)
+        self._at_the_end = at_the_end
         self.questions: list[str] = []
 
     async def ask(self, prompt: Prompt) -> str:
         self.questions.append(prompt.question)
-        if self._keys:
-            return self._keys.pop(0)
+        if self._at_the_end:
+            return self._at_the_end if "end of the travel" in prompt.question else "1"
         gap_mm = -self._bench.world.on_sheet(self._bench.target)[2]
         return next((key for key, step in (("1", 1.0), ("2", 0.1), ("3", 0.02)) if gap_mm > step), "t")
-
-
-class ToTheEnd(Asker):
-    """Jogs down to the end of the travel, then says that the tip touches."""
-
-    async def ask(self, prompt: Prompt) -> str:
-        return "t" if "end of the travel" in prompt.question else "1"
 
 
 async def test_the_operator_jogs_until_it_touches(make_bench: MakeBench) -> None:
@@ -181,7 +175,7 @@ async def test_the_operator_jogs_until_it_touches(make_bench: MakeBench) -> None
 
 async def test_a_jog_ends_at_the_travel_limit_and_says_so(make_bench: MakeBench) -> None:
     bench = make_bench(paper_z_mm=110.0)
-    operator = Operator(bench, *"1" * 19, "x")
+    operator = Operator(bench, "x")
     with pytest.raises(NeedsOperator, match="touch 1 of 3"):
         await measured(bench, operator, method="jog")
     said = [("is -2.00 mm from" in question, "end of the travel" in question) for question in operator.questions]
@@ -222,55 +216,32 @@ def test_patches_that_may_be_inked_are_used_up_and_those_beside_touches_in_the_m
 
 
 TOUCH, CHECK = ZeroTouchStep(0), SelfCheckStep(0)
-POINTS: dict[str, Any] = {"points_mm": [(4.0, 4.0), (70.0, 4.0), (36.0, 36.0)], "touches": 1}
+FEW, MANY = [(4.0, 4.0), (70.0, 4.0), (36.0, 36.0)], [*((x, 4.0) for x in (4.0, 36.0, 68.0, 100.0)), (4.0, 60.0)]
 
 
-def noted(bench: Bench, config: RigConfig) -> list[Pose]:
-    """The rig with that configuration, and the targets that it is sent from now on."""
-    sent: list[Pose] = []
-    move = bench.move
-
-    async def note(target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
-        sent.append(target)
-        await move(target, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
-
-    bench.move = note  # pyright: ignore[reportAttributeAccessIssue]
-    bench.rig = replace(bench.rig, config=config)
-    return sent
-
-
-@pytest.mark.parametrize("method", ["taught", "force", "jog", "camera"])
-async def test_no_touch_leaves_what_was_checked(make_bench: MakeBench, method: str) -> None:
+@pytest.mark.parametrize(
+    ("method", "points_mm"), [*((method, FEW) for method in ("taught", "force", "jog", "camera")), ("jog", MANY)]
+)
+async def test_no_touch_leaves_what_was_checked(
+    make_bench: MakeBench, method: str, points_mm: list[tuple[float, float]]
+) -> None:
+    """An operator jogs to the end of the travel at each point: touches that each find the paper lower do not add up."""
     bench = make_bench((0.5, -0.5), paper_z_mm=119.4)
-    touch: dict[str, Any] = {"method": method, "residual_mm": 9.0, **POINTS}
+    touch: dict[str, Any] = {"method": method, "residual_mm": 9.0, "touches": 1, "points_mm": points_mm}
     config = bench.rig.config.model_copy(update={"touch": TouchConfig.model_validate(touch)})
-    sent = noted(bench, config)
-    await measured(bench, ToTheEnd(watched=True), **touch)
+    await measured(bench, Operator(bench, "t"), **touch)
     planned = moves_of(config, PaperPlane(config.paper.touch_z_mm), TOUCH)
     if method != "camera":  # whose spots of one patch lie beside each other
-        beside = [(a, b) for a, b in pairwise(sent) if math.hypot(b.x_mm - a.x_mm, b.y_mm - a.y_mm) > 1.0]
+        beside = [(a, b) for a, b in pairwise(bench.sent) if math.hypot(b.x_mm - a.x_mm, b.y_mm - a.y_mm) > 1.0]
         assert all(here.z_mm >= config.motion.safe_z_mm for here, _ in beside), "it was lifted before it travelled"
-    assert not not_checked(config, sent, planned.segments)
-    assert not not_sent(config, planned, sent)
-
-
-async def test_touches_that_each_find_the_paper_lower_do_not_add_up(make_bench: MakeBench) -> None:
-    """The operator jogs to the end of the travel at each of five points: no lower than the plan allowed for."""
-    bench = make_bench()
-    points = [(x, 4.0) for x in (4.0, 36.0, 68.0, 100.0)]
-    touch: dict[str, Any] = {"method": "jog", "residual_mm": 9.0, "touches": 1, "points_mm": [*points, (4.0, 60.0)]}
-    config = bench.rig.config.model_copy(update={"touch": TouchConfig.model_validate(touch)})
-    sent = noted(bench, config)
-    await measured(bench, ToTheEnd(watched=True), **touch)
-    planned = moves_of(config, PaperPlane(config.paper.touch_z_mm), TOUCH)
-    assert not not_checked(config, sent, planned.segments)
-    assert lowest_mm(sent) > 120.0 - config.touch.travel_mm - 2.1  # what a lean of 1 deg over 116 mm may be
+    assert not not_checked(config, bench.sent, planned.segments)
+    assert not not_sent(config, planned, bench.sent)
+    assert lowest_mm(bench.sent) > 120.0 - config.touch.travel_mm - 2.1  # what a lean of 1 deg over 116 mm may be
 
 
 async def test_the_self_check_presses_as_deep_as_was_checked(make_bench: MakeBench) -> None:
     bench = make_bench(whole=True)
-    config = bench.rig.config
-    sent, plane = noted(bench, config), PaperPlane(120.0)
+    config, plane, sent = bench.rig.config, PaperPlane(120.0), bench.sent
     sheet = Sheet(config.paper)
     patches = (sheet.patch(0), *partners(sheet, sheet.patch(0), set()))
     await self_check(bench.effector, triangle_on(patches, config.self_check), bench.effector.dip)
