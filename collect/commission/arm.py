@@ -34,6 +34,7 @@ FRAMINGS: tuple[Framing, ...] = ("sof", "bare")
 STILL_MM, STILL_DEG = 0.02, 0.01
 """An arm that is held still by hand moves by less than this between two readings."""
 STILL_S, PATIENCE_S = 0.1, 20.0
+Point = tuple[float, float, float]
 HAND_MM = 0.15
 """Smallest plausible error of a touch by hand, in one axis: a few touches may agree by chance."""
 
@@ -87,10 +88,16 @@ async def _flange(controller: Controller) -> Pose:
     return Pose(x, y, z, *turn)
 
 
-def tip_of(flange: Pose, offset_mm: Sequence[float]) -> tuple[float, float, float]:
+def tip_of(flange: Pose, offset_mm: Sequence[float]) -> Point:
     """Where the tip is while the flange is there, in the base frame."""
     x, y, z = (at + offset for at, offset in zip(flange.position_mm, turned(flange.quaternion, offset_mm), strict=True))
     return x, y, z
+
+
+def tips(notebook: Notebook) -> dict[str, Point]:
+    """The tip at everything that was touched, by name, in the base frame."""
+    offset_mm = notebook.get("robot.tcp_offset_mm")
+    return {name: tip_of(flange, offset_mm) for name, flange in notebook.touches.items()}
 
 
 async def touch(visit: Visit, thing: str, how: str, *, may_skip: bool = False) -> bool:

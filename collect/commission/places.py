@@ -9,9 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from brushloop.calibrate.files import read_gray
-from brushloop.collect.commission.arm import tip_of, touch
+from brushloop.collect.commission.arm import Point, tips, touch
 from brushloop.collect.commission.camera import shown_live, still, taught_camera
-from brushloop.collect.commission.sheet import Point, corners_of
+from brushloop.collect.commission.sheet import corners_of
 from brushloop.collect.commission.visit import YES, Notebook, Step, Taught, Visit, number_of, rig_of, yes_of
 from brushloop.collect.errors import ConfigError, NotAccepted
 from brushloop.collect.photograph.frames import ARM_SHARE, Thumbnail, changed_share, thumbnail
@@ -151,12 +151,6 @@ class PlacesStep(Step):
             values["ink.wash.pot_mm"] = at(list(to_paper(paper, wash_x, wash_y)))
             values["ink.wash.dip_z_mm"] = at(wash_z)
         return values
-
-
-def tips(notebook: Notebook) -> dict[str, Point]:
-    """The tip at everything that was touched, by name, in the base frame."""
-    offset_mm = notebook.get("robot.tcp_offset_mm")
-    return {name: tip_of(flange, offset_mm) for name, flange in notebook.touches.items()}
 
 
 def paper_of(notebook: Notebook) -> PaperConfig:

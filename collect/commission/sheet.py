@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from brushloop.calibrate.board.spec import BoardSpec, size_mm
-from brushloop.collect.commission.arm import HAND_MM, tip_of, touch
+from brushloop.collect.commission.arm import HAND_MM, Point, tips, touch
 from brushloop.collect.commission.camera import board_of
 from brushloop.collect.commission.visit import Notebook, Step, Taught, Visit
 from brushloop.collect.errors import NotAccepted
 from brushloop.collect.rig.paper import PaperPlane, fit_plane
 
 Floats = NDArray[np.float64]
-Point = tuple[float, float, float]
 CORNERS = ("lower left", "lower right", "upper right", "upper left")
 Corners = Sequence[Sequence[Point]]
 """The touches of each corner, in the order of `CORNERS`."""
@@ -116,9 +115,8 @@ def touch_point(fit: SheetFit) -> tuple[float, float]:
 
 def all_corners(notebook: Notebook, kind: str) -> Corners:
     """The tip at every touch of each corner, in the base frame. Raises `NotAccepted` where a corner was skipped."""
-    offset_mm, corners = notebook.get("robot.tcp_offset_mm"), [list[Point]() for _ in CORNERS]
-    for name, flange in notebook.touched(kind).items():
-        corners[CORNERS.index(name.split(" ", 1)[1])].append(tip_of(flange, offset_mm))
+    touched = {name: at for name, at in tips(notebook).items() if name.startswith(kind)}
+    corners = [[at for name, at in touched.items() if name.endswith(corner)] for corner in CORNERS]
     if missing := [f"{kind.removesuffix('-corner')} {CORNERS[k]}" for k in range(4) if not corners[k]]:
         raise NotAccepted(
             f"not touched: {', '.join(missing)}.",

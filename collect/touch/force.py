@@ -6,7 +6,7 @@ import asyncio
 import math
 import statistics
 from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,28 +44,40 @@ class Contact:
     spring: Spring
 
 
-def find_contact(
-    z_mm: Floats,
-    force_n: Floats,
-    samples: NDArray[np.int64],
-    sample_sd_n: float,
-    run: NDArray[np.int64],
-    spring: Spring | None = None,
-) -> Contact:
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """The arm at rest at a height, and the mean push there."""
+
+    z_mm: float
+    """The controller's height, not the commanded one."""
+    force_n: float
+    samples: int
+    sd_n: float
+    """Standard deviation of one sample."""
+    run: int = 0
+    """Number of the descent that it belongs to."""
+
+    @property
+    def least_n(self) -> float:
+        """The least force there that counts as a push."""
+        return max(THRESHOLD_N, FELT_SIGMAS * self.sd_n / math.sqrt(self.samples))
+
+
+def find_contact(readings: Sequence[Reading], spring: Spring | None = None) -> Contact:
     """Least squares of force = offset + stiffness * max(0, contact - z) through means at rest.
 
-    All arrays are (m,): height, mean force, number of samples in the mean, and descent (0, 1, ...) that it belongs to.
-    Each descent has its own offset, so that a slow drift of the sensor is not taken for force. `sample_sd_n` is the
-    standard deviation of one sample. `spring` is what earlier touches found; it counts as one more
-    observation. The join is solved exactly between neighbouring heights (D. J. Hudson, Fitting
-    segmented curves whose join points have to be estimated, J. Am. Stat. Assoc. 61, 1966).
+    Each descent has its own offset, so that a slow drift of the sensor is not taken for force. `spring` is what earlier
+    touches found; it counts as one more observation. The join is solved exactly between neighbouring heights (D. J.
+    Hudson, Fitting segmented curves whose join points have to be estimated, J. Am. Stat. Assoc. 61, 1966).
     Raises `StepError` where the force does not rise over at least two heights, or one if the stiffness is known.
     """
+    z_mm, force_n = np.array([r.z_mm for r in readings]), np.array([r.force_n for r in readings])
+    weights, run = np.array([float(r.samples) for r in readings]), np.array([r.run for r in readings])
+    variance_n2 = float(np.average([r.sd_n**2 for r in readings], weights=weights))
     heights = np.unique(z_mm)
     needed = 3 if spring is None else 2
-    if len(heights) < needed or sample_sd_n <= 0.0:
+    if len(heights) < needed or variance_n2 <= 0.0:
         raise StepError(f"rests at {len(heights)} heights give no contact, {needed} are needed")
-    weights = samples.astype(np.float64)
     descents = np.unique(run)[:, None] == run[None, :]
 
     def free_of_offsets(rows: Floats) -> Floats:
@@ -75,7 +87,7 @@ def find_contact(
         return np.asarray(rows - means @ descents, np.float64)
 
     # An observation of the stiffness alone, in units of one sample.
-    known = 0.0 if spring is None else (sample_sd_n / spring.sigma_n_mm) ** 2
+    known = 0.0 if spring is None else variance_n2 / spring.sigma_n_mm**2
     known_n_mm = 0.0 if spring is None else known * spring.n_mm
     force = free_of_offsets(force_n)
     # (j, m): one row for each height but the highest, taken as the uppermost below the join.
@@ -103,7 +115,7 @@ def find_contact(
     moved = free_of_offsets(
         np.stack((stiffness * (z_mm < contact), np.maximum(0.0, contact - z_mm))).astype(np.float64)
     )
-    variance = np.linalg.pinv((moved * weights) @ moved.T + np.diag((0.0, known)), hermitian=True) * sample_sd_n**2
+    variance = np.linalg.pinv((moved * weights) @ moved.T + np.diag((0.0, known)), hermitian=True) * variance_n2
     sigma_mm, sigma_n_mm = (math.sqrt(float(v)) for v in np.diag(variance))
     return Contact(contact, sigma_mm, Spring(stiffness, sigma_n_mm))
 
@@ -128,28 +140,10 @@ LATE_STEPS = 2
 """Steps by which the fast approach may feel a soft brush too late."""
 CLEAR_STEPS = 4
 """Number of rests in the air at the start of the medium approach."""
-ROUGH_RUN = 0
 SPRING_SHARE = 0.1
 """Largest standard error of the stiffness, as a share of it, with which a touch ends."""
 BESIDE_MM = 0.1
 """How far the last descent may have lain beside the contact: its rests must lie above and below it."""
-
-
-@dataclass(frozen=True, slots=True)
-class Reading:
-    """The arm at rest at a height, and the mean push there."""
-
-    z_mm: float
-    """The controller's height, not the commanded one."""
-    force_n: float
-    samples: int
-    sd_n: float
-    """Standard deviation of one sample."""
-
-    @property
-    def least_n(self) -> float:
-        """The least force there that counts as a push."""
-        return max(THRESHOLD_N, FELT_SIGMAS * self.sd_n / math.sqrt(self.samples))
 
 
 Rest = Callable[[float, int], Awaitable[Reading]]
@@ -165,14 +159,13 @@ async def touch_by_force(
 ) -> Contact:
     """Touch once; the brush is left down.
 
-    `spring` is the stiffness that the last touch found. With it and `near_z_mm`, the height of the last touch at this
+    `spring` is what earlier touches found of the stiffness. With `near_z_mm`, the height of the last touch at this
     point, only the slow descents are left to do. Raises `StepError` if nothing is felt over the whole travel, if
     something is felt at its start, or if the noise leaves the contact unknown.
     """
-    spring_before = None if spring is None else spring.next()
     lowest_z_mm, highest_z_mm = reach.lowest_z_mm, reach.start_z_mm
-    readings = list[tuple[Reading, int]]()
-    if near_z_mm is None or spring is None:
+    readings = list[Reading]()
+    if near_z_mm is None:
         first = await rest(reach.start_z_mm, config.fast_samples)
         if abs(first.force_n) > first.least_n:
             raise StepError(
@@ -181,19 +174,19 @@ async def touch_by_force(
             )
         fast = await _until_felt(rest, reach.start_z_mm - FAST_STEP_MM, lowest_z_mm, FAST_STEP_MM, config.fast_samples)
         start_z_mm = fast[-1].z_mm + LATE_STEPS * FAST_STEP_MM + CLEAR_STEPS * MEDIUM_STEP_MM
-        medium = await _until_felt(
+        readings = await _until_felt(
             rest, start_z_mm, lowest_z_mm, MEDIUM_STEP_MM, config.medium_samples, clear=CLEAR_STEPS, in_a_row=2
         )
-        readings += [(reading, ROUGH_RUN) for reading in medium]
         highest_z_mm = start_z_mm + FAST_STEP_MM
-        near_z_mm = fitted(readings, spring_before).z_mm
-    run = ROUGH_RUN
+        near_z_mm = fitted(readings, spring).z_mm
+    run = 0
     while True:
         run += 1
         for depth_mm, share in zip(SLOW_MM, SLOW_SHARES, strict=True):
             z_mm = max(near_z_mm - depth_mm, lowest_z_mm)
-            readings.append((await rest(z_mm, max(4, round(share * config.slow_samples))), run))
-        contact, samples = fitted(readings, spring_before), sum(reading.samples for reading, _ in readings)
+            reading = await rest(z_mm, max(4, round(share * config.slow_samples)))
+            readings.append(replace(reading, run=run))
+        contact, samples = fitted(readings, spring), sum(reading.samples for reading in readings)
         # The standard error is computed from the stiffness. If that is uncertain, or if the descent lay beside the
         # contact, the true error can be much larger.
         sure = contact.spring.sigma_n_mm <= SPRING_SHARE * contact.spring.n_mm
@@ -212,31 +205,20 @@ async def touch_by_force(
         near_z_mm = contact.z_mm
 
 
-def fitted(readings: Sequence[tuple[Reading, int]], spring: Spring | None) -> Contact:
+def fitted(readings: Sequence[Reading], spring: Spring | None) -> Contact:
     """Fit the hinge to the readings of the linear part; iterated, because that part depends on the hinge.
 
     More readings are kept where too few are left to give it: the descent lay too low, or they are noisy still.
     """
 
-    def fit(lowest_z_mm: float) -> Contact:
-        used = [(r, run) for r, run in readings if r.z_mm >= lowest_z_mm]
-        sd_n = math.sqrt(sum(r.samples * r.sd_n**2 for r, _ in used) / sum(r.samples for r, _ in used))
-        return find_contact(
-            np.array([r.z_mm for r, _ in used]),
-            np.array([r.force_n for r, _ in used]),
-            np.array([r.samples for r, _ in used]),
-            sd_n,
-            np.array([run for _, run in used]),
-            spring,
-        )
-
-    contact = fit(-math.inf)
+    contact = find_contact(readings, spring)
     for _ in range(3):
         lowest_z_mm = contact.z_mm - LINEAR_MM
-        if not any(lowest_z_mm <= reading.z_mm < contact.z_mm for reading, _ in readings):
+        used = [reading for reading in readings if reading.z_mm >= lowest_z_mm]
+        if not any(reading.z_mm < contact.z_mm for reading in used):
             break
         try:
-            contact = fit(lowest_z_mm)
+            contact = find_contact(used, spring)
         except StepError:
             break
     return contact

@@ -88,12 +88,6 @@ def at_one_point(touches: list[Touch], config: TouchConfig, guide: PaperPlane | 
     )
 
 
-def taught(paper: PaperConfig, rests_mm: float) -> ZeroTouchResult:
-    """The level plane at the taught height, which was visited and not measured; the arm rested at `rests_mm`."""
-    visited = at_one_point([Touch(*paper.touch_point_mm, rests_mm)], TouchConfig())
-    return ZeroTouchResult(method="taught", touch_z_mm=paper.touch_z_mm, residuals_mm=(0.0,), points=(visited,))
-
-
 def through(points: list[TouchedPoint], config: TouchConfig) -> ZeroTouchResult:
     """The plane through the points. Raises `StepError` if one lies too far from it, or it leans too much."""
     plane, residuals_mm = fit_plane([(point.x_mm, point.y_mm, point.z_mm) for point in points])

@@ -12,7 +12,7 @@ from brushloop.collect.rig.config import PaperConfig, TouchConfig
 from brushloop.collect.rig.paper import Sheet
 from brushloop.collect.touch.camera import COLUMNS, EXTENT_MM, PITCH_MM, FirstInkTouch, most_spots
 from brushloop.collect.touch.force import ForceTap, Spring, resting, touch_by_force
-from brushloop.collect.touch.heights import KnownHeights, Reach, Touch, at_one_point, taught, through
+from brushloop.collect.touch.heights import KnownHeights, Reach, Touch, at_one_point, through
 from brushloop.sessions.events import TouchedPoint, ZeroTouchResult
 
 Point = tuple[float, float]
@@ -36,7 +36,9 @@ async def measure_plane(
     """
     paper = procedures.rig.config.paper
     if config.method == "taught":
-        return taught(paper, await procedures.zero_touch())
+        visited = at_one_point([Touch(*paper.touch_point_mm, await procedures.zero_touch())], config)
+        # That height was visited, and not measured.
+        return ZeroTouchResult(method="taught", touch_z_mm=paper.touch_z_mm, residuals_mm=(0.0,), points=(visited,))
     points_mm = config.points_mm or [paper.touch_point_mm]
     if config.method == "force" and procedures.rig.force is None:
         raise StepError("zero touch by force needs a force sensor: [force] is missing")
@@ -71,7 +73,7 @@ async def _by_force_or_jog(
             near_z_mm = touches[-1].z_mm if touches else None
             contact = await touch_by_force(rest, reach, config.force, spring, near_z_mm)
             touches.append(Touch(*point, contact.z_mm, contact.sigma_mm))
-            spring = contact.spring
+            spring = contact.spring.next()
         await procedures.lift()
         points.append(at_one_point(touches, config))
         known.add(*point, points[-1].z_mm)

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from brushloop.calibrate.board.spec import BoardSpec
+from brushloop.collect.commission.arm import Point
 from brushloop.collect.commission.places import hull
-from brushloop.collect.commission.sheet import CORNERS, Point, check_board, corners_of, fit_sheet
+from brushloop.collect.commission.sheet import CORNERS, check_board, corners_of, fit_sheet
 from brushloop.collect.commission.tip import AxisFit, find_axis, find_tip, stray_touch
 from brushloop.collect.errors import NotAccepted
 from brushloop.drivers.devices import Pose

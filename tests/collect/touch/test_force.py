@@ -24,8 +24,7 @@ HINGE_NOISE_N = 0.002
 
 
 def contact_of(z_mm: np.ndarray, force_n: np.ndarray) -> Contact:
-    samples, one_descent = np.full(z_mm.size, 50), np.zeros(z_mm.size, np.int64)
-    return find_contact(z_mm, force_n, samples, HINGE_NOISE_N, one_descent)
+    return find_contact([Reading(*rest, 50, HINGE_NOISE_N) for rest in zip(z_mm, force_n, strict=True)])
 
 
 @given(
@@ -45,7 +44,9 @@ def test_an_offset_of_each_descent_is_no_force() -> None:
     z_mm = np.array([120.3, 120.2, 119.9, 119.7, 120.1, 119.9, 119.8])
     run = np.array([0, 0, 0, 0, 1, 1, 1])
     force_n = 0.003 * np.maximum(0.0, 120.0 - z_mm) + 0.01 * run  # drifts by more than the whole push
-    assert find_contact(z_mm, force_n, np.full(7, 100), HINGE_NOISE_N, run).z_mm == pytest.approx(120.0, abs=1e-6)
+    rests = zip(z_mm, force_n, run, strict=True)
+    readings = [Reading(z, push_n, 100, HINGE_NOISE_N, descent) for z, push_n, descent in rests]
+    assert find_contact(readings).z_mm == pytest.approx(120.0, abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -121,7 +122,7 @@ async def test_a_sheet_that_moved_since_the_last_touch_is_found(reaction: Push, 
     rng = np.random.default_rng(3)
     first = await touch_by_force(Felt(reaction, 120.0, rng).rest, REACH, ForceTouchConfig())
     moved = Felt(reaction, 120.0 + moved_mm, rng)
-    contact = await touch_by_force(moved.rest, REACH, ForceTouchConfig(), first.spring, first.z_mm)
+    contact = await touch_by_force(moved.rest, REACH, ForceTouchConfig(), first.spring.next(), first.z_mm)
     assert contact.z_mm == pytest.approx(120.0 + moved_mm, abs=0.13)
 
 
