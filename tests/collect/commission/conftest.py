@@ -33,6 +33,10 @@ class Person(Asker):
         self.asked: list[str] = []
         self.shown: list[tuple[Tone, str]] = []
 
+    @property
+    def trouble(self) -> str:
+        return " ".join(text for tone, text in self.shown if tone == "trouble")
+
     def visit(self, rig_path: Path, *, armed: bool = False) -> Visit:
         """A visit that asks this person, who remembers what every visit showed."""
         visit = Visit(rig_path, HostClock(), armed=armed)
@@ -131,10 +135,6 @@ class InLab(Person):
         kind, index, *corner = thing.split(" ", 2)
         answer = await self._in_lab(self.lab.bring(kind, int(index), *corner))
         return bool(answer["reached"])
-
-    @property
-    def trouble(self) -> str:
-        return " ".join(text.replace("\n", " ") for tone, text in self.shown if tone == "trouble")
 
     async def _in_lab(self, work: Any) -> Any:
         return await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(work, self.loop))

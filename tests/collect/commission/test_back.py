@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import AsyncMock
@@ -10,7 +11,7 @@ import pytest
 
 from brushloop.collect.commission.arm import ASK_ADDRESS
 from brushloop.collect.commission.brush import ASK_BUS, ASK_PORT, RADIUS, BrushStep, ForceStep, ask_depth, ask_length
-from brushloop.collect.commission.camera import ASK_SQUARES, CameraStep
+from brushloop.collect.commission.camera import ASK_SQUARES
 from brushloop.collect.commission.visit import Taught, Visit
 from brushloop.collect.commission.wizard import Wizard
 from brushloop.collect.errors import CollectAborted
@@ -82,10 +83,13 @@ async def test_back_asks_the_question_before_and_no_other(
 async def test_a_step_that_was_refused_goes_on_where_the_person_wants(
     after: tuple[str, ...], asked: list[str], tmp_path: Path, station: AsyncMock
 ) -> None:
-    station.connect.side_effect = [DeviceTimeout("ink", "connect", "no reply"), station.connect.return_value]
+    silent = DeviceTimeout("robot", "connect", "no reply in 1 s", condition="A stop was sent to the arm.")
+    silent.add_note("The arm may still be moving.")
+    station.connect.side_effect = [silent, station.connect.return_value]
     person = Answering("6", "48", "20", "", "i", "/dev/ttyUSB0", *after)
     await led(person, tmp_path)
     assert person.asked == [R, L, DEEPEST, NAME, WELL, LINE, HOW, *asked]
+    assert re.fullmatch(r"(?s)robot: connect: .* A stop was sent .* still be moving\.\nCheck power.*", person.trouble)
 
 
 @pytest.mark.parametrize(
@@ -119,18 +123,8 @@ async def test_a_step_that_is_taught_again_by_mistake_is_as_it_was_after_back(tm
     assert visit.notebook == before
 
 
-async def test_a_step_that_failed_says_in_what_state_the_arm_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    async def silent(*_: object) -> None:
-        error = DeviceTimeout("robot", "moveLine", "no reply in 1 s", condition="A stop was sent to the arm.")
-        error.add_note("The arm may still be moving.")
-        raise error
-
-    monkeypatch.setattr(CameraStep, "carry_out", silent)
+async def test_a_step_is_taught_again_only_where_all_before_it_are_done(tmp_path: Path) -> None:
     person = Person()
-    with pytest.raises(CollectAborted):
-        await Wizard(person.visit(tmp_path / "rig.toml"), (CameraStep(),)).run()
-    said = person.shown[0][1]
-    assert said.startswith("robot: moveLine: no reply in 1 s. A stop was sent to the arm.")
-    assert "The arm may still be moving." in said
+    with pytest.raises(CollectAborted, match="`force` depends on brush, which is not taught yet"):
+        await Wizard(person.visit(tmp_path / "rig.toml"), (BrushStep(), ForceStep())).again("force")
+    assert not person.asked

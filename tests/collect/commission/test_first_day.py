@@ -179,7 +179,7 @@ async def test_a_trap_is_named_with_the_way_out_and_the_first_day_goes_on_once_i
 def _words_on(person: InLab, trap: Trap) -> str:
     """What the wizard said that names the trap; empty if nothing does."""
     if trap in NAMED:
-        found = re.search(NAMED[trap], person.trouble)
+        found = re.search(NAMED[trap], person.trouble, re.DOTALL)
         return "" if found is None else found.group()
     return next((text for _, text in person.shown if IN_PASSING[trap] in text), "")
 
