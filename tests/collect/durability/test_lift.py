@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import itertools
 import random
 import subprocess
 import sys
@@ -9,12 +11,19 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
+from brushloop.collect.motion import Procedures
+from brushloop.collect.rig.config import load_rig
+from brushloop.collect.rig.devices import Rig, make_robot
+from brushloop.collect.rig.paper import Sheet
+from brushloop.drivers.host import HostClock
 from brushloop.drivers.loopback import ask
 from brushloop.drivers.sim.config import Table
 from brushloop.drivers.sim.faults import Phase
+from brushloop.sessions.records import Condition
 from tests.waiting import wait_until
 
 PAPER_MM = Table().paper_z_mm
@@ -25,6 +34,25 @@ PRESS_S = 6.0
 """The same for a whole press, its way there included."""
 BELOW_S = 3.0
 """From the beginning of the descent to the brush above the paper again."""
+
+
+async def press_for_ever(path: Path, seed: int) -> None:
+    """Press with only an arm, and say when the first press begins: the process that is killed."""
+    rng, config, clock = random.Random(seed), load_rig(path), HostClock()
+    robot = make_robot(config, clock, lambda _text: None)
+    nothing = cast(Any, None)
+    identity = await robot.connect()
+    procedures = Procedures(Rig(config, clock, robot, nothing, identity, nothing))
+    await robot.enable()
+    await procedures.retreat()
+    sys.stdout.write("pressing\n")
+    sys.stdout.flush()
+    sheet = Sheet(config.paper)
+    for number in itertools.count():
+        patch = sheet.patch(number % sheet.capacity)
+        await procedures.press(
+            patch, Condition(rng.uniform(5.0, 20.0), rng.uniform(0.0, 14.0)), rng.choice([0.0, 0.2, 0.5])
+        )
 
 
 class OwnRig:
@@ -52,7 +80,7 @@ def own_rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OwnRig]:
 
 def kill(rig: OwnRig, seed: int, when: Callable[[], None]) -> tuple[str, float]:
     """(phase of the arm at the kill, height above the paper in mm `WITHIN_S` later). `when` returns at the moment."""
-    command = [sys.executable, "-m", "tests.collect.durability.pressing", str(rig.toml), str(seed)]
+    command = [sys.executable, "-m", "tests.collect.durability.test_lift", str(rig.toml), str(seed)]
     killed = False
     while not killed:
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
@@ -104,3 +132,7 @@ def test_fifty_random_moments_of_presses(own_rig: OwnRig):
         assert above_mm > 0.5, f"kill {number}: the tip is {above_mm:.2f} mm above the paper"
     sys.stdout.write(f"50 kills: {dict(at)}, {deep} with the brush in the paper\n")
     assert deep >= 10
+
+
+if __name__ == "__main__":
+    asyncio.run(press_for_ever(Path(sys.argv[1]), int(sys.argv[2])))

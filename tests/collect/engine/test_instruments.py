@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -224,29 +223,19 @@ MS = 1_000_000
 SECOND = 1000 * MS
 
 
-@dataclass
-class Kept:
-    """A writer that keeps what it is given."""
-
-    messages: list[Outgoing] = field(default_factory=list[Outgoing])
-
-    def write(self, message: Outgoing) -> None:
-        self.messages.append(message)
-
-
 def delays_ms(ahead_ns: list[int], delays: list[int]) -> list[float]:
     """How much earlier than the host got it each force was taken, as recorded.
 
     The device's clock is this far ahead of the host's, and the samples took so many ms to arrive.
     """
-    kept = Kept()
-    recorder = Recorder(cast(Any, kept), HostClock())
+    kept: list[Outgoing] = []
+    recorder = Recorder(cast(Any, SimpleNamespace(write=kept.append)), HostClock())
     for number, (ahead, delay_ms) in enumerate(zip(ahead_ns, delays, strict=True)):
         taken_ns = 1_700_000_000 * SECOND + number * 10 * MS
         stamp = Stamp(taken_ns + delay_ms * MS, taken_ns + ahead, number)
         recorder.force(ForceSample(stamp, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0)))
-        assert kept.messages[-1].log_ns == stamp.host_ns
-    return [(message.log_ns - message.publish_ns) / MS for message in kept.messages]
+        assert kept[-1].log_ns == stamp.host_ns
+    return [(message.log_ns - message.publish_ns) / MS for message in kept]
 
 
 @pytest.mark.parametrize("ahead_s", [-1_700_000_000, -3, 0, 5])

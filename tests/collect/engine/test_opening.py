@@ -24,8 +24,7 @@ from brushloop.collect.walk import walk
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import rig_toml
-from brushloop.sessions.events import CaptureResult, Condition, Done, Press, PressResult
-from brushloop.sessions.journal import RunState
+from brushloop.sessions.events import CaptureResult, Condition, Press, PressResult
 from brushloop.sessions.records import Header, Source
 from brushloop.sessions.store import SessionStore
 from tests.collect.tui.fake import FakeEngine, picture
@@ -171,22 +170,17 @@ def test_the_start_screen_resumes_each_session_with_its_own_protocol(
 
 def test_a_sheet_stays_in_until_each_stroke_on_it_is_photographed() -> None:
     press = Press(stroke_id="first", condition=Condition(depth_mm=13.0, tilt_deg=5.0))
-    state = RunState()
-    store: Any = SimpleNamespace(state=state, fresh_sheet=lambda: None)
-    done: dict[str, Any] = {"t_ns": 1, "attempt": 1, "sheet": 0, "sha256": "", "counts": {}}
-    state.apply(Done(key="a", kind=StepKind.PRESS, file="0000-press-a.mcap", result=PressResult(press=press), **done))
+    results: dict[type, list[Any]] = {PressResult: [PressResult(press=press)], CaptureResult: []}
+    state = SimpleNamespace(sheet=0, results=results.__getitem__)
+    sheets: list[str] = []
+    store: Any = SimpleNamespace(state=state, fresh_sheet=lambda: sheets.append("fresh"))
     with pytest.raises(ConfigError, match="first is pressed on sheet 1 but not photographed"):
         put_in_sheet(store, 2)
-    state.apply(
-        Done(
-            key="b",
-            kind=StepKind.CAPTURE,
-            file="0001-capture-b.mcap",
-            result=CaptureResult(press=press, still=1),
-            **done,
-        )
-    )
+    results[CaptureResult].append(CaptureResult(press=press, still=1))
+    put_in_sheet(store, 1)
+    assert not sheets
     put_in_sheet(store, 2)
+    assert sheets == ["fresh"]
 
 
 def test_open_sessions_are_listed_oldest_first_without_the_closed(lab: Path) -> None:

@@ -17,12 +17,10 @@ import pytest
 from brushloop.collect.engine.control import State
 from brushloop.drivers.sim.faults import Phase
 from brushloop.sessions.errors import SessionError
-from brushloop.sessions.journal import replay
 from brushloop.sessions.mcap_writer import McapWriter
 from brushloop.sessions.recording import Recording
 from tests.journal_lines import read_lines
 from tests.rigs import Lab
-from tests.runs import wait_for_end
 
 
 @dataclass
@@ -57,22 +55,21 @@ def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
     return disk
 
 
-def run(bare_lab: Lab) -> tuple[BaseException | None, State]:
-    engine = bare_lab.started()
-    try:
-        wait_for_end(engine)
-    except Exception as error:
-        return error, engine.snapshot().state
-    return None, engine.snapshot().state
+def ended(bare_lab: Lab, says: str) -> None:
+    """A run ends, says so, and leaves the arm at rest clear of the paper."""
+    with pytest.raises(SessionError, match=says):
+        bare_lab.run()
+    assert bare_lab.engines[-1].snapshot().state is State.FAILED
+    assert bare_lab.at_rest
+    assert bare_lab.rig.faults.phase() in (Phase.PARKED, Phase.RESTING)
+    assert bare_lab.rig.world.tool().z_mm >= bare_lab.rig.config.table.paper_z_mm + 8.0
 
 
 def test_a_slow_disk_is_waited_for_and_loses_nothing(bare_lab: Lab, disk: Disk) -> None:
     disk.message_s, disk.sync_s = 0.012, 0.05  # a pose comes every 0.010 s
-    assert run(bare_lab) == (None, State.DONE)
-    folder = bare_lab.session
-    recorded = sum(replay(folder / "journal.jsonl").counts().values())
-    assert recorded == disk.written
-    assert len(list(Recording(folder).captures())) == 1
+    bare_lab.run()
+    assert sum(bare_lab.state.counts().values()) == disk.written
+    assert len(list(Recording(bare_lab.session).captures())) == 1
 
 
 def test_a_disk_that_does_not_keep_up_ends_the_run_and_says_so(
@@ -81,11 +78,7 @@ def test_a_disk_that_does_not_keep_up_ends_the_run_and_says_so(
     """A queue of five stands for the 20 000 messages that a slower disk would take minutes to fill."""
     monkeypatch.setattr("brushloop.sessions.mcap_writer.QUEUE_LIMIT", 5)
     disk.message_s = 0.1
-    error, state = run(bare_lab)
-    assert isinstance(error, SessionError)
-    assert "the disk does not keep up" in str(error)
-    assert state is State.FAILED
-    assert_stopped_clear_of_the_paper(bare_lab)
+    ended(bare_lab, "the disk does not keep up")
 
 
 @pytest.mark.parametrize("full_after", [0, 3, pytest.param(60, marks=pytest.mark.soak)])
@@ -93,26 +86,15 @@ def test_a_disk_that_fills_up_ends_the_run_and_with_room_the_same_command_goes_o
     bare_lab: Lab, disk: Disk, full_after: int
 ) -> None:
     disk.full_after = full_after
-    error, state = run(bare_lab)
-    assert isinstance(error, SessionError)
-    assert "No space left on device" in str(error)
-    assert state is State.FAILED
-    assert_stopped_clear_of_the_paper(bare_lab)
+    ended(bare_lab, "No space left on device")
     folder = bare_lab.session
     events = [line["event"] for line in read_lines(folder / "journal.jsonl")]
     # Where the last message of a step does not fit, the journal has no word for its end either: begun, not done.
     assert events.count("begin") == events.count("done") + 1
     assert events.count("void") <= 1
-    state_then = replay(folder / "journal.jsonl")
-    assert len(state_then.cut) + len(state_then.running) == 1
+    assert len(bare_lab.state.cut) + len(bare_lab.state.running) == 1
     assert len(list(folder.glob("*.part"))) == 1, "the evidence is kept"
 
     disk.full_after = None
-    assert run(bare_lab) == (None, State.DONE)
+    bare_lab.run()
     assert len(list(Recording(folder).captures())) == 1
-
-
-def assert_stopped_clear_of_the_paper(bare_lab: Lab) -> None:
-    assert bare_lab.at_rest
-    assert bare_lab.rig.faults.phase() in (Phase.PARKED, Phase.RESTING)
-    assert bare_lab.rig.world.tool().z_mm >= bare_lab.rig.config.table.paper_z_mm + 8.0
