@@ -81,8 +81,8 @@ def marked_bad(run: RunContext) -> list[str]:
 
 def review(run: RunContext) -> ReviewResult:
     """The REVIEW step: the strokes to press again."""
-    bad = enumerate(marked_bad(run), start=run.progress.first_free_index)
-    again = tuple(Again(stroke_id=name, index=index) for index, name in bad)
+    free = 1 + max((stroke.index for stroke in run.progress.plan), default=0)
+    again = tuple(Again(stroke_id=name, index=index) for index, name in enumerate(marked_bad(run), start=free))
     for stroke in again:
         run.progress.log(f"{stroke.stroke_id} was marked bad in the review and is pressed again")
     return ReviewResult(again=again)
@@ -229,7 +229,7 @@ async def capture(context: StepContext, step: CaptureStep) -> CaptureResult:
     patch = run.sheet.patch(press.patch)
     frame = await _fresh_frame(context)
     looking = _looked_at(context, step, frame, patch)
-    if run.progress.more_than(press.stroke_id):
+    if any(stroke.stroke_id != press.stroke_id for stroke in run.progress.left):
         image, verdict = await meanwhile(context.guard.guarded(run.procedures.set_out()), looking)
     else:
         image, verdict = await looking  # a dip for a retake goes to the well by itself

@@ -16,8 +16,8 @@ import threading
 from collections.abc import Callable, Generator
 from pathlib import Path
 
-from brushloop.collect.engine.control import FINAL, RunControl, State
-from brushloop.collect.engine.live import Telemetry, each_frame
+from brushloop.collect.engine.control import FINAL, State
+from brushloop.collect.engine.live import each_frame
 from brushloop.collect.engine.open_or_resume import Opening, find_resumable, open_store
 from brushloop.collect.engine.policy import resume_question
 from brushloop.collect.engine.recorder import uninterrupted
@@ -31,7 +31,7 @@ from brushloop.collect.errors import (
     describe,
     rest_is_unknown,
 )
-from brushloop.collect.operator import Asker, Choice, OperatorRequest, OperatorRequests, Prompt
+from brushloop.collect.operator import Asker, Choice, OperatorRequest, Prompt
 from brushloop.collect.rig.devices import Rig, connected
 from brushloop.collect.walk import check_protocol, sheet_of
 from brushloop.drivers.errors import DeviceError, NotConnected, Stale
@@ -70,16 +70,12 @@ class Engine:
         self._rig_config = opening.rig
         self._resumes = resumes
         layout = sheet_of(opening.rig, opening.protocol)
-        self._progress = Progress(opening.protocol, clock, layout, resumes)
+        progress = Progress(opening.protocol, clock, layout, resumes)
+        self._run = Run(opening, progress, Asker(watched=bool(self._request.on_screen), waiting=self._waiting))
         self._clock = clock
-        self._asker = Asker(watched=bool(self._request.on_screen), waiting=self._waiting)
-        self._telemetry = Telemetry()
-        self._requests = OperatorRequests()
-        self._control = RunControl()
         self._task: asyncio.Task[None] | None = None
         self._stopper: asyncio.Task[None] | None = None
         self._rig: Rig | None = None
-        self._run: Run | None = None
         self._store: SessionStore | None = None
         self._stop_failure: DeviceError | None = None
         self._rest_unknown = False
@@ -103,7 +99,7 @@ class Engine:
     def snapshot(self) -> Snapshot:
         """The state of the run; from any thread."""
         tip_mm = force_n = None
-        no_pose_s, state = 0.0, self._control.state
+        no_pose_s, state = 0.0, self._run.control.state
         if (rig := self._rig) is not None:
             try:
                 tip_mm = self._see_tip(rig)
@@ -114,42 +110,42 @@ class Engine:
             with contextlib.suppress(DeviceError):
                 force_n = math.hypot(*rig.force.latest().force_n) if rig.force is not None else None
         if force_n is not None:
-            self._telemetry.note_force(force_n, self._clock.now_ns())
-        return self._progress.snapshot(
+            self._run.telemetry.note_force(force_n, self._clock.now_ns())
+        return self._run.progress.snapshot(
             state=state,
             tip_mm=tip_mm,
             force_n=force_n,
-            prompt=self._asker.prompt,
-            target_mm=None if self._run is None else self._run.procedures.target_mm,
+            prompt=self._run.asker.prompt,
+            target_mm=None if rig is None else self._run.procedures.target_mm,
             parked=self._parked(),
             rest_unknown=self._rest_unknown,
-            trace_n=self._telemetry.trace_n(),
+            trace_n=self._run.telemetry.trace_n(),
             force_ceiling_n=None if self._rig_config.force is None else self._rig_config.force.max_n,
-            picture=self._telemetry.picture,
-            requests=self._requests.open,
+            picture=self._run.telemetry.picture,
+            requests=self._run.requests.open,
             no_pose_s=no_pose_s if no_pose_s >= SILENT_S and state not in FINAL else None,
         )
 
     def _see_tip(self, rig: Rig) -> tuple[float, float, float]:
-        self._telemetry.tip_mm = rig.robot.latest().pose.position_mm
-        return self._telemetry.tip_mm
+        self._run.telemetry.tip_mm = rig.robot.latest().pose.position_mm
+        return self._run.telemetry.tip_mm
 
     def _parked(self) -> bool:
-        tip_mm, motion = self._telemetry.tip_mm, self._rig_config.motion
+        tip_mm, motion = self._run.telemetry.tip_mm, self._rig_config.motion
         return not self._rest_unknown and tip_mm is not None and math.dist(tip_mm, motion.park_mm) < PARKED_MM
 
     def request(self, request: OperatorRequest) -> None:
         """Make or withdraw a request; requests are carried out between steps. From any thread."""
-        self._requests.toggle(request)
+        self._run.requests.toggle(request)
 
     def park(self) -> None:
         """End the run after this step with the arm lifted and parked; no more questions are asked. From any thread."""
-        self._control.park()
-        self._asker.abandon()
+        self._run.control.park()
+        self._run.asker.abandon()
 
     def answer(self, number: int, key: str) -> bool:
         """Answer question `number`; False if it is closed. From any thread."""
-        return self._asker.answer(number, key)
+        return self._run.asker.answer(number, key)
 
     def obey(self, signal_number: int) -> None:
         """On SIGHUP finish the step, lift and park: nobody is there to lift a brush that was stopped on the paper. On
@@ -158,21 +154,21 @@ class Engine:
 
     def pause(self) -> None:
         """Pause before the next step."""
-        self._control.pause()
+        self._run.control.pause()
 
     def resume(self) -> None:
         """Go on after a pause, or cancel one that has not begun."""
-        self._control.resume()
+        self._run.control.resume()
 
     def stop(self) -> None:
         """Stop the arm now and end the run; from any thread, in any state, any number of times."""
-        self._control.stop(self._stop_now)
+        self._run.control.stop(self._stop_now)
 
     def _stop_now(self) -> None:
         if self._stopper is None or self._stopper.done():
             self._stopper = asyncio.create_task(self._stop_arm(), name="stop")
         # Once everything is collected the arm is parked, and the merge must not be cut short.
-        if self._task is not None and not self._control.closing and not self._task.cancelling():
+        if self._task is not None and not self._run.control.closing and not self._task.cancelling():
             self._task.cancel()
 
     async def _stop_arm(self) -> None:
@@ -182,7 +178,7 @@ class Engine:
                 await self._rig.robot.stop()
             except DeviceError as error:
                 self._stop_failure = error
-                self._progress.log(describe(error), warning=True)
+                self._run.progress.log(describe(error), warning=True)
 
     def _run_thread(self) -> None:
         try:
@@ -195,7 +191,7 @@ class Engine:
 
     async def _main(self) -> None:
         self._task = asyncio.create_task(self._session(), name="session")
-        self._control.entered(self._task)
+        self._run.control.entered(self._task)
         try:
             await self._task
         except asyncio.CancelledError:
@@ -210,7 +206,7 @@ class Engine:
         finally:
             if self._stopper is not None:
                 await self._stopper
-            self._control.left()
+            self._run.control.left()
             if self._store is not None:
                 self._store.release()
 
@@ -227,42 +223,34 @@ class Engine:
         raise stopped
 
     async def _session(self) -> None:
-        self._progress.doing("connect")
-        async with connected(self._rig_config, self._clock, self._progress.log) as rig:
+        run = self._run
+        run.progress.doing("connect")
+        async with connected(self._rig_config, self._clock, run.progress.log) as rig:
+            run.connected(rig)
             self._rig = rig
             await self._permitted(rig)
-            store = self._store = open_store(self._opening, self._resumes, rig, self._clock)
+            store = self._store = run.store = open_store(self._opening, self._resumes, rig, self._clock)
             dry, live = self._request.dry_run_mm is not None, self._opening.live
             try:
-                strokes = self._progress.opened(store)
+                strokes = run.progress.opened(store)
                 begun = f"resumed with {strokes} strokes" if strokes else "session"
-                self._progress.log(BEGUN_DRY if dry else f"{begun}: {store.folder}")
+                run.progress.log(BEGUN_DRY if dry else f"{begun}: {store.folder}")
                 if (self._request.armed or not rig.simulated) and not dry and not self._rig_config.self_check.enabled:
-                    self._progress.log(UNCHECKED, warning=True)
+                    run.progress.log(UNCHECKED, warning=True)
                 if live is not None:
-                    self._progress.log(f"live view: {live.url}")
-                shows = ([self._telemetry.frame] if self._request.on_screen else []) + ([live.frame] if live else [])
-                self._run = Run(
-                    self._opening,
-                    rig,
-                    store,
-                    self._progress,
-                    self._control,
-                    self._asker,
-                    self._requests,
-                    self._telemetry,
-                )
+                    run.progress.log(f"live view: {live.url}")
+                shows = ([run.telemetry.frame] if self._request.on_screen else []) + ([live.frame] if live else [])
                 async with each_frame(rig.camera, shows):
-                    await self._run.carry_out()
-                self._control.begin_closing()
-                self._progress.doing("merge and verify")
+                    await run.carry_out()
+                run.control.begin_closing()
+                run.progress.doing("merge and verify")
                 final = await uninterrupted(store.close)
-                self._progress.log(OVER_DRY if dry else f"closed: {final}")
-                self._progress.over()
+                run.progress.log(OVER_DRY if dry else f"closed: {final}")
+                run.progress.over()
             finally:
                 with contextlib.suppress(DeviceError):
                     self._see_tip(rig)
-        self._control.end(State.DONE)
+        run.control.end(State.DONE)
 
     async def _permitted(self, rig: Rig) -> None:
         """Ask whether a session may be resumed, however it was asked for, and whether real hardware may move, unless
@@ -272,40 +260,40 @@ class Engine:
         """
         robot, real = rig.config.robot, not rig.robot_identity.simulated
         hardware = f"{rig.robot_identity.model} at {robot.host}:{robot.port} is real hardware"
-        if self._resumes is not None and self._asker.attended:
+        if self._resumes is not None and self._run.asker.attended:
             ended = replay(self._resumes / JOURNAL_NAME).ended
             prompt = resume_question(self._resumes.name, ended, f"{hardware}. " if real else "")
         elif self._request.armed or not real:
             return
-        elif self._asker.attended:
+        elif self._run.asker.attended:
             prompt = Prompt(f"{hardware}. May it move?", (ARM, LEAVE), LEAVE.key)
         else:
             raise ConfigError(
                 "rig.toml", "robot", f"{hardware}: look at the cell, keep a hand at the emergency stop, then add --arm"
             )
-        if await self._asker.ask_or_default(prompt) == prompt.default:
+        if await self._run.asker.ask_or_default(prompt) == prompt.default:
             raise CollectAborted("it was not confirmed that the arm may move; nothing was powered and nothing moved")
 
     @contextlib.contextmanager
     def _waiting(self) -> Generator[None]:
         """While a question waits, the run is asking."""
-        self._control.move_to(State.ASKING)
+        self._run.control.move_to(State.ASKING)
         try:
-            with self._progress.meanwhile("wait for an answer"):
+            with self._run.progress.meanwhile("wait for an answer"):
                 yield
         finally:
-            self._control.go_on()
+            self._run.control.go_on()
 
     def _end(self, state: State, error: Exception) -> None:
         """End with `error`, whose message says so if the arm may move or the brush may be down. The session keeps it
         for the person who resumes."""
-        tip_mm, config = self._telemetry.tip_mm, self._rig_config
+        tip_mm, config = self._run.telemetry.tip_mm, self._rig_config
         if self._rest_unknown:
             error.add_note(NOT_AT_REST)
         if tip_mm is not None and (self._rest_unknown or tip_mm[2] < config.motion.safe_z_mm - PARKED_MM):
             error.add_note(brush_may_be_down(tip_mm[2] - config.paper.touch_z_mm))
-        self._control.end(state)
-        self._progress.over(describe(error))
+        self._run.control.end(state)
+        self._run.progress.over(describe(error))
         if self._store is not None:
             with contextlib.suppress(SessionError):
                 self._store.ended(describe(error))

@@ -120,12 +120,7 @@ CLOCK_STEP_NS = 1_000_000_000
 class Recorder:
     """Writer of one attempt, with one method for each kind of message."""
 
-    def __init__(
-        self,
-        writer: SegmentWriter,
-        clock: Clock,
-        show: Callable[[Outgoing], None] | None = None,
-    ) -> None:
+    def __init__(self, writer: SegmentWriter, clock: Clock, show: Callable[[Outgoing], None] | None = None) -> None:
         """`show` is called with every message as well; it must neither block nor raise."""
         self._writer = writer
         self._show = show
@@ -230,14 +225,14 @@ class RunContext:
     """
 
     opening: Opening
-    rig: Rig
-    store: SessionStore
     progress: Progress
-    control: RunControl
     asker: Asker
-    requests: OperatorRequests
-    telemetry: Telemetry
+    control: RunControl = field(default_factory=RunControl)
+    requests: OperatorRequests = field(default_factory=OperatorRequests)
+    telemetry: Telemetry = field(default_factory=Telemetry)
     """Gets every force."""
+    rig: Rig = field(init=False)
+    store: SessionStore = field(init=False)
     procedures: Procedures = field(init=False)
     sheet: Sheet = field(init=False)
     view: Plane = field(init=False)
@@ -254,9 +249,10 @@ class RunContext:
     light: float | None = None
     """Light of the ink station as it was set; None without one."""
 
-    def __post_init__(self) -> None:
-        self.procedures = Procedures(self.rig)
-        self.sheet = sheet_of(self.rig.config, self.opening.protocol)
+    def connected(self, rig: Rig) -> None:
+        """Work with this rig from now on."""
+        self.rig, self.procedures = rig, Procedures(rig)
+        self.sheet = sheet_of(rig.config, self.opening.protocol)
 
     def used_patches(self) -> set[int]:
         """Patches of the current sheet on which any mark was started, or which zero touch may ink."""

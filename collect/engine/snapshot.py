@@ -171,9 +171,7 @@ class Snapshot:
 
 def eta_text(now: Snapshot) -> str:
     """`ETA 12:05`, or nothing while no stroke has been timed."""
-    if now.eta_s is None:
-        return ""
-    return f"ETA {minutes_text(now.eta_s)}"
+    return "" if now.eta_s is None else f"ETA {minutes_text(now.eta_s)}"
 
 
 def minutes_text(seconds: float) -> str:
@@ -198,7 +196,11 @@ class Progress:
         """`layout` is that of the sheet; it determines the order of the strokes. `resumes` is the session's folder."""
         self._clock = clock
         self._lock = threading.Lock()
-        self._planned = self._plan = self._left = protocol.planned(layout)
+        self._planned = protocol.planned(layout)
+        self.plan = self._planned
+        """Every stroke, those that were marked bad in a review replaced by their repetition."""
+        self.left = self._planned
+        """Those that neither count nor are left out."""
         self._layout = layout
         self._store: SessionStore | None = None
         self._started_ns = clock.now_ns()
@@ -207,7 +209,7 @@ class Progress:
         self._now = Snapshot(
             session_id="" if resumes is None else resumes.name,
             folder="" if resumes is None else str(resumes),
-            strokes_planned=len(self._plan),
+            strokes_planned=len(self.plan),
             grid=self._grid([], [], [], at_work=False),
         )
 
@@ -230,18 +232,9 @@ class Progress:
         yield
         self.doing(before)
 
-    @property
-    def first_free_index(self) -> int:
-        """The lowest index above those of all strokes so far, where the steps of repeated strokes begin."""
-        return 1 + max((stroke.index for stroke in self._plan), default=0)
-
-    def more_than(self, stroke_id: str) -> bool:
-        """Whether a stroke other than this one is still to be made."""
-        return any(stroke.stroke_id != stroke_id for stroke in self._left)
-
     def planned(self, index: int) -> Planned:
         """The stroke whose steps have this index."""
-        return next(stroke for stroke in self._plan if stroke.index == index)
+        return next(stroke for stroke in self.plan if stroke.index == index)
 
     def show(self, last: LastCapture) -> None:
         """Show the newest capture."""
@@ -261,8 +254,6 @@ class Progress:
         """Note that the run is over, and why if it ended early."""
         self._over_ns = self._clock.now_ns()
         self._change(error=error)
-        if self._store is not None:
-            self.count()
 
     def snapshot(self, **values: Any) -> Snapshot:
         """One consistent snapshot, with the `values` that only the engine knows."""
@@ -318,7 +309,7 @@ class Progress:
                 case _:
                     pass
         ended = kept.keys() | {press.stroke_id for press in left_out}
-        self._plan, self._left = plan, [stroke for stroke in plan if stroke.stroke_id not in ended]
+        self.plan, self.left = plan, [stroke for stroke in plan if stroke.stroke_id not in ended]
         sheet, layout = state.sheet, self._layout
         on_sheet = () if layout is None else tuple(marks.get((sheet, patch)) for patch in range(layout.capacity))
         self._change(
@@ -337,7 +328,7 @@ class Progress:
     ) -> tuple[CellCount, ...]:
         """The strokes of each condition. `at_work`: the first of those left is being made or photographed."""
         counts = [Counter(press.condition for press in presses) for presses in (kept, bad, left_out)]
-        strokes = iter(self._left)
+        strokes = iter(self.left)
         current = next(strokes, None) if at_work else None
         following = next(strokes, None)
         return tuple(
@@ -350,12 +341,12 @@ class Progress:
                 current is not None and asked == current.condition,
                 following is not None and asked == following.condition,
             )
-            for asked, planned in sorted(Counter(stroke.condition for stroke in self._plan).items())
+            for asked, planned in sorted(Counter(stroke.condition for stroke in self.plan).items())
         )
 
     def _eta_s(self, times_ns: Sequence[int]) -> float | None:
         """Remaining time, from the times of this process's captures that count."""
-        if not self._left:
+        if not self.left:
             return 0.0
         timed = len(times_ns) - 1
-        return len(self._left) * (times_ns[-1] - times_ns[0]) / 1e9 / timed if timed > 0 else None
+        return len(self.left) * (times_ns[-1] - times_ns[0]) / 1e9 / timed if timed > 0 else None

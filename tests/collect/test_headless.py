@@ -160,7 +160,8 @@ def test_the_snapshot_says_for_how_long_no_pose_has_come(tmp_path: Path) -> None
     request = CollectRequest(tmp_path / "rig.toml", tmp_path / "protocol.toml")
     engine = Engine(Opening(request, config, grid, {}), None, clock)
     assert engine.snapshot().no_pose_s is None, "not connected yet"
-    engine._rig = Rig(config, clock, robot, devices, WHO, WHO)
+    engine._run.connected(rig := Rig(config, clock, robot, devices, WHO, WHO))
+    engine._rig = rig
     assert engine.snapshot().no_pose_s is None, "no pose yet"
     robot._telemetry._take(brush_pose(300.0, 0.0, 200.0))
 
@@ -172,7 +173,7 @@ def test_the_snapshot_says_for_how_long_no_pose_has_come(tmp_path: Path) -> None
     robot._telemetry._take(brush_pose(300.0, 0.0, 200.0))
     assert engine.snapshot().no_pose_s is None, "it sends again"
     clock.seconds += 30.0
-    engine._control.end(State.FAILED)
+    engine._run.control.end(State.FAILED)
     assert engine.snapshot().no_pose_s is None, "a run that is over has let the arm go"
 
 

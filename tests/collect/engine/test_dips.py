@@ -4,14 +4,12 @@ and the dip's extras, across the rim after each dip and into water before every 
 from __future__ import annotations
 
 import asyncio
-import math
 from typing import Any
 
 import pytest
 
 from brushloop.collect.engine import brush as brush_steps
 from brushloop.collect.engine import capture as capturing
-from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.recorder import meanwhile
 from brushloop.collect.engine.snapshot import Progress
 from brushloop.collect.errors import BadPicture, CollectAborted, ConfigError
@@ -22,7 +20,6 @@ from brushloop.drivers.devices import Pose
 from brushloop.sessions.events import PressResult
 from brushloop.sessions.recording import Recording
 from tests.collect.sent import noting
-from tests.journal_lines import read_lines
 from tests.rigs import Lab
 from tests.runs import ended_by, until, wait_for_end
 
@@ -86,52 +83,33 @@ def test_a_brush_that_waited_with_its_ink_dips_again(
 # The arm goes where the next dip begins; the decision on a photograph still comes before the dip
 
 
-def events(lab: Lab) -> list[tuple[str, str]]:
-    lines = list(read_lines(lab.session / "journal.jsonl"))
-    kinds = {line["key"]: str(line["kind"]) for line in lines if line["event"] == "begin"}
-    return [(str(line["event"]), kinds[line["key"]]) for line in lines if "key" in line]
-
-
-def away_from_park_mm(engine: Engine) -> float:
-    tip_mm = engine.snapshot().tip_mm
-    return 0.0 if tip_mm is None else math.dist(tip_mm, engine._rig_config.motion.park_mm)
-
-
-def test_a_capture_is_judged_on_the_way_to_the_well_and_decided_before_the_dip(
+def test_the_arm_sets_out_for_the_next_dip_while_a_capture_is_judged_and_dips_after_the_decision(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    engine, look = lab.engine(), capturing._looked_at
+    engine, look, went = lab.engine(), capturing._looked_at, list[str]()
+    for name in ("set_out", "dip", "press", "capture"):
+        method = getattr(Procedures, name)
+
+        async def noted(*arguments: Any, _name: str = name, _method: Any = method) -> Any:
+            went.append(_name)
+            return await _method(*arguments)
+
+        monkeypatch.setattr(Procedures, name, noted)
 
     async def once_under_way(*arguments: Any) -> Any:
         async with asyncio.timeout(10.0):
-            while engine.snapshot().strokes_done == 0 and away_from_park_mm(engine) < 20.0:
+            while engine.snapshot().strokes_done == 0 and engine.snapshot().parked:
                 await asyncio.sleep(0.001)
-        return await look(*arguments)
+        seen = await look(*arguments)
+        went.append("judged")
+        return seen
 
     monkeypatch.setattr(capturing, "_looked_at", once_under_way)
     engine.start()
     wait_for_end(engine)
-    assert engine.snapshot().strokes_done == 2
-    assert engine.snapshot().parked, "the arm does not wait over the well for a dip that does not come"
-    recorded = events(lab)
-    after_captures = [recorded[at + 1] for at, one in enumerate(recorded[:-1]) if one == ("begin", "capture")]
-    assert after_captures == [("done", "capture")] * 2
-
-
-def test_every_stroke_has_one_dip_and_the_arm_does_not_set_out_after_the_last(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    went: list[str] = []
-    for name in ("set_out", "dip", "press", "capture"):
-        method = getattr(Procedures, name)
-
-        async def noted(*arguments: Any, _name: str = name, _method: Any = method, **options: Any) -> Any:
-            went.append(_name)
-            return await _method(*arguments, **options)
-
-        monkeypatch.setattr(Procedures, name, noted)
-    lab.run()
-    assert went[went.index("dip") :] == ["dip", "press", "capture", "set_out", "dip", "press", "capture"]
+    first, last = ["dip", "press", "capture", "set_out", "judged"], ["dip", "press", "capture", "judged"]
+    assert went[went.index("dip") :] == first + last, "nor does the arm set out after the last stroke"
+    assert engine.snapshot().parked
 
 
 def test_a_stop_while_a_capture_is_judged_costs_a_photograph_and_no_press(
@@ -149,7 +127,7 @@ def test_a_stop_while_a_capture_is_judged_costs_a_photograph_and_no_press(
         until(engine, lambda _: judging.is_set())
         engine.stop()
         ended_by(engine, CollectAborted)
-    assert events(lab)[-2:] == [("begin", "capture"), ("void", "capture")]
+    assert [begin.kind for begin, _ in lab.state.cut] == ["capture"]
 
     again = lab.run()
     assert again.snapshot().strokes_done == 2
