@@ -14,7 +14,6 @@ from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.devices import Pose, QueuedLine
 from brushloop.drivers.errors import (
     ConnectionLost,
-    LimitExceeded,
     MotionFailed,
     MotionRefused,
     ProtocolViolation,
@@ -94,17 +93,6 @@ async def test_never_more_lines_are_queued_than_allowed(arm: AuboArcs, cabinet: 
     cabinet.cabinet.resume()
     await task
     assert cabinet.taken == len(arc())
-
-
-@pytest.mark.parametrize(
-    "bad", [brush_pose(250.0, -230.0, 60.0), brush_pose(250.0, -230.0, 260.0, tilt_deg=20.0)], ids=["floor", "cone"]
-)
-async def test_one_pose_outside_the_limits_and_nothing_is_sent(arm: AuboArcs, cabinet: Cabinet, bad: Pose):
-    with pytest.raises(LimitExceeded):
-        await arm.follow([*line(5), bad], **WAY)
-    with pytest.raises(ValueError, match="no poses"):
-        await arm.follow([], **WAY)
-    assert cabinet.taken == 0
 
 
 async def loses_its_connection(arm: AuboArcs, _: Cabinet) -> None:

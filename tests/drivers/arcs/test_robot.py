@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import pytest
 
@@ -206,58 +206,46 @@ async def test_nothing_moves_while_there_is_no_way_to_stop_it(arm: AuboArcs, cab
     assert to_go_mm(cabinet) == pytest.approx(200.0)
 
 
-async def test_a_line_that_was_still_on_its_way_is_stopped_too(
-    arm: AuboArcs, cabinet: Cabinet, monkeypatch: pytest.MonkeyPatch
-):
-    send = arm._motion.connection.call
-
-    async def late(method: str, params: object = None) -> object:
-        if method.endswith("moveLine"):
-            asyncio.get_running_loop().call_later(0.25, lambda: asyncio.ensure_future(send(method, params)))
-            raise DeviceTimeout("robot", "moveLine", "no reply in 1 s")
-        return await send(method, params)
-
-    monkeypatch.setattr(stopping, "RESTS_NEEDED", 20)  # the line comes within the time that rest is asked for
-    monkeypatch.setattr(arm._motion.connection, "call", late)
-    with pytest.raises(DeviceTimeout):
-        await arm.move(FAR, **SLOW)
-    assert cabinet.rests
-    assert to_go_mm(cabinet) > 100.0
-
-
 class SlowNetwork:
-    """A connection's writer behind a network that delivers everything 0.25 s later, in order."""
+    """A connection's writer behind a network that delivers everything later, in order."""
 
-    def __init__(self, writer: asyncio.StreamWriter) -> None:
+    def __init__(self, writer: asyncio.StreamWriter, delay_s: float) -> None:
         self._writer = writer
+        self._delay_s = delay_s
 
     def write(self, data: bytes) -> None:
-        asyncio.get_running_loop().call_later(0.25, self._writer.write, data)
+        asyncio.get_running_loop().call_later(self._delay_s, self._writer.write, data)
 
     def __getattr__(self, name: str) -> object:
         return getattr(self._writer, name)
 
 
-async def test_a_stop_waits_for_a_line_that_is_on_its_way(
-    arm: AuboArcs, cabinet: Cabinet, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("delay_s", [0.25, 1.2], ids=["a stop overtakes it", "it counts as lost"])
+async def test_a_line_that_is_still_on_its_way_is_stopped_too(
+    arm: AuboArcs, cabinet: Cabinet, monkeypatch: pytest.MonkeyPatch, delay_s: float
 ):
     connection, sent = arm._motion.connection, asyncio.Event()
     send = connection.call
 
-    async def delayed(method: str, params: object = None) -> object:
+    async def delayed(method: str, params: Mapping[str, object] | None = None) -> object:
         if method.endswith("moveLine"):
             assert connection._stream is not None
             reader, writer = connection._stream
-            monkeypatch.setattr(connection, "_stream", (reader, SlowNetwork(writer)))
+            monkeypatch.setattr(connection, "_stream", (reader, SlowNetwork(writer, delay_s)))
             sent.set()
         return await send(method, params)
 
     monkeypatch.setattr(connection, "call", delayed)
     move = asyncio.create_task(arm.move(FAR, **SLOW))
     await sent.wait()
-    await arm.stop()  # overtakes the line
-    stopped_mm = to_go_mm(cabinet)
-    with pytest.raises(MotionError):
+    if delay_s < 1.0:
+        await arm.stop()
+    else:
+        monkeypatch.setattr(stopping, "RESTS_NEEDED", 20)  # the line comes within the time that rest is asked for
+    with pytest.raises((MotionError, DeviceTimeout)):
         await move
+    stopped_mm = to_go_mm(cabinet)
+    await asyncio.sleep(2.0)
+    assert cabinet.rests
     assert to_go_mm(cabinet) == pytest.approx(stopped_mm)
     assert stopped_mm > 100.0
