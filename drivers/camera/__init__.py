@@ -125,13 +125,14 @@ class Backlog:
         usual_ns = max(sorted(self._periods)[len(self._periods) // 2], 1)
         stalled = gap_ns > max(3 * usual_ns, self._latency_ns)
         if stalled:
-            self._waiting = 1 + gap_ns // usual_ns  # no more frames can have waited than came in the gap
-        if self._waiting and gap_ns < BURST_SHARE * usual_ns:
+            self._waiting = gap_ns // usual_ns  # no more frames can have waited than came in the gap
+        elif self._waiting and gap_ns < BURST_SHARE * usual_ns:
             self._waiting -= 1
             return True
+        else:
+            self._waiting = 0
         # A pause counts as a period too: where every frame comes after one, it is the period that was misjudged.
         self._periods.append(gap_ns)
-        self._waiting = self._waiting - 1 if stalled else 0
         return stalled
 
 
@@ -169,9 +170,32 @@ class OpenCvCamera:
 
         Raises `DeviceTimeout`, `ConnectionLost`.
         """
-        if self._grabber is None:
+        grabber = self._grabber
+        if grabber is None:
             raise NotConnected(DEVICE, "fresh", "not connected")
-        return await self._grabber.fresh(after.host_ns)
+        after_ns, until_s = after.host_ns, time.monotonic() + self._table.timeout_s
+        skipped_before = grabber.skipped.copy()
+        while True:
+            newest = grabber.newest
+            if grabber.closing.is_set():
+                raise ConnectionLost(DEVICE, "fresh", "closed while waiting")
+            if newest is not None and newest.exposed_after_ns >= after_ns:
+                image = await asyncio.to_thread(looked_at, newest.picture)
+                if not isinstance(image, FrameFault):
+                    return Frame(newest.stamp, newest.exposed_after_ns, image)
+                grabber.skipped[image] += 1
+                after_ns = newest.exposed_after_ns + 1
+            elif grabber.ended is not None:
+                raise grabber.ended
+            if time.monotonic() >= until_s:
+                raise DeviceTimeout(
+                    DEVICE,
+                    "fresh",
+                    f"no valid new frame from {self._table.source} in {self._table.timeout_s:g} s"
+                    + grabber.why_none(grabber.skipped.copy() - skipped_before),
+                    remedy="Check cable, light and stream; the arm does not move meanwhile.",
+                )
+            await asyncio.sleep(POLL_S)
 
     async def close(self) -> None:
         """End the grabber and wait for it; a read that hangs is left to the daemon thread."""
@@ -198,44 +222,19 @@ class _Grabber:
         self._table = table
         self._clock = clock
         self._on_notice = on_notice
-        self._newest: _Arrival | None = None
-        self._skipped: Counter[FrameFault] = Counter()
+        self.newest: _Arrival | None = None
+        self.skipped: Counter[FrameFault] = Counter()
         """Frames that were passed over, by the thread or when somebody looked at them."""
         self._lost_ns: int | None = None
         """Since when a live source has been gone."""
-        self._ended: DeviceError | None = None
+        self.ended: DeviceError | None = None
         self.closing = threading.Event()
         """Ends the thread after its current read."""
         self.thread = threading.Thread(target=self._grab, name="camera grabber", daemon=True)
         self.settings: dict[str, float] = {}
         self.simulated = False
 
-    async def fresh(self, after_ns: int) -> Frame:
-        """The first valid frame exposed after `after_ns`. Raises `DeviceTimeout`, `ConnectionLost`."""
-        until_s, skipped_before = time.monotonic() + self._table.timeout_s, self._skipped.copy()
-        while True:
-            newest = self._newest
-            if self.closing.is_set():
-                raise ConnectionLost(DEVICE, "fresh", "closed while waiting")
-            if newest is not None and newest.exposed_after_ns >= after_ns:
-                image = await asyncio.to_thread(looked_at, newest.picture)
-                if not isinstance(image, FrameFault):
-                    return Frame(newest.stamp, newest.exposed_after_ns, image)
-                self._skipped[image] += 1
-                after_ns = newest.exposed_after_ns + 1
-            elif self._ended is not None:
-                raise self._ended
-            if time.monotonic() >= until_s:
-                raise DeviceTimeout(
-                    DEVICE,
-                    "fresh",
-                    f"no valid new frame from {self._table.source} in {self._table.timeout_s:g} s"
-                    + self._why(self._skipped.copy() - skipped_before),
-                    remedy="Check cable, light and stream; the arm does not move meanwhile.",
-                )
-            await asyncio.sleep(POLL_S)
-
-    def _why(self, skipped: Counter[FrameFault]) -> str:
+    def why_none(self, skipped: Counter[FrameFault]) -> str:
         """Why no valid frame came, in brackets; empty if that is not known."""
         if self._lost_ns is not None:
             return " (the stream ended and is opened again)"
@@ -269,9 +268,9 @@ class _Grabber:
                 self._on_notice("camera: the stream ended and is opened again")
                 self.closing.wait(REOPEN_AFTER_S)
         except DeviceError as error:
-            self._ended = error
+            self.ended = error
         except BaseException as error:
-            self._ended = DeviceError(DEVICE, "read", f"the grabber failed: {error!r}")
+            self.ended = DeviceError(DEVICE, "read", f"the grabber failed: {error!r}")
             raise
 
     def _read_all(self, source: JpegStream | Capture, opening_ns: int) -> None:
@@ -290,9 +289,9 @@ class _Grabber:
             torn = source.patches and not repeated and is_patched(picture, before)
             before = picture
             if source.live and (late or repeated):
-                self._skipped[FrameFault.LATE if late else FrameFault.FROZEN] += 1
+                self.skipped[FrameFault.LATE if late else FrameFault.FROZEN] += 1
             elif torn:
-                self._skipped[FrameFault.TORN] += 1
+                self.skipped[FrameFault.TORN] += 1
             else:
-                seq = self._newest.stamp.seq + 1 if self._newest is not None else 0
-                self._newest = _Arrival(Stamp(arrival_ns, None, seq), exposed_ns, picture)
+                seq = self.newest.stamp.seq + 1 if self.newest is not None else 0
+                self.newest = _Arrival(Stamp(arrival_ns, None, seq), exposed_ns, picture)

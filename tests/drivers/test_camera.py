@@ -96,8 +96,7 @@ async def camera(feed: Feed, sources: list[Feed]) -> AsyncIterator[OpenCvCamera]
     camera = OpenCvCamera(table, feed, feed.notices.append)
     feed.show(SOUND)
     await camera.connect()
-    assert camera._grabber is not None
-    camera._grabber._table = table.model_copy(update={"timeout_s": 2.0})
+    camera._table = table.model_copy(update={"timeout_s": 2.0})
     yield camera
     feed.show(None)
     await camera.close()
@@ -141,7 +140,7 @@ async def test_a_frame_is_decoded_only_when_somebody_looks(
     monkeypatch.setattr(camera_module, "looked_at", lambda picture: (looks.append(picture), looked_at(picture))[1])
     jpegs = [jpeg_of(page()) for _ in range(5)]
     feed.show(*jpegs)
-    await until(lambda: camera._grabber._newest.picture is jpegs[-1], "the pictures")  # type: ignore[union-attr]
+    await until(lambda: camera._grabber.newest.picture is jpegs[-1], "the pictures")  # type: ignore[union-attr]
     assert not looks
     await camera.fresh(Stamp(0))
     assert looks == jpegs[-1:]
@@ -158,7 +157,7 @@ async def test_a_stream_that_ends_is_opened_again_and_both_are_reported(
     sources.append(second)
     await until(lambda: len(feed.notices) == 2, "the stream to be opened")
     second.show(picture := page())
-    await until(lambda: camera._grabber._newest.picture is picture, "a picture")  # type: ignore[union-attr]
+    await until(lambda: camera._grabber.newest.picture is picture, "a picture")  # type: ignore[union-attr]
     assert np.array_equal((await camera.fresh(Stamp(0))).image, picture)
     assert feed.notices[0] == "camera: the stream ended and is opened again"
     assert feed.notices[1].startswith("camera is back after")

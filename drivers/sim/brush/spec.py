@@ -95,9 +95,6 @@ class SimFileError(Exception):
     exit_code: ClassVar[int] = 2
 
     def __init__(self, path: Path, field: str, what: str) -> None:
-        self.path = path
-        self.field = field
-        self.what = what
         super().__init__(f"{path}: {field}: {what}" if field else f"{path}: {what}")
 
 
