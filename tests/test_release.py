@@ -16,7 +16,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-ROOT = Path(__file__).parent.parent
+from tests.blocks import ROOT, blocks_of
 
 
 def run(*command: object, cwd: Path, **environment: str) -> str:
@@ -114,7 +114,6 @@ def test_the_demo_runs_from_the_wheel_in_a_project_with_folders_of_our_names(bru
     assert "loopback rig" in report.read_text(encoding="utf-8")
 
 
-DOCUMENTED = re.compile(r"<!-- tested by tests/test_release\.py -->\n```(\w+)\n(.*?)```", re.DOTALL)
 OF_A_TWIN = """
 import tomllib
 
@@ -125,7 +124,8 @@ def test_the_twin_presses(brushloop_twin):
 
 @pytest.mark.soak  # builds and installs
 def test_a_labs_own_tests_get_a_rig_and_its_twin(brushloop: Path, tmp_path: Path) -> None:
-    documented = dict(DOCUMENTED.findall((ROOT / "docs" / "loopback-brush.md").read_text()))
+    blocks = blocks_of(ROOT / "docs" / "loopback-brush.md")
+    documented = {block.kind: block.text for block in blocks if "tests/test_release.py" in block.remark}
     (tmp_path / "twin.toml").write_text('name = "our brush, simulated"\n[brush]\nfriction = 0.3\n')
     (tmp_path / "pytest.ini").write_text(documented["ini"])
     (tmp_path / "test_ours.py").write_text(documented["python"] + OF_A_TWIN)

@@ -217,7 +217,7 @@ def edited(line, chosen):
     return line[:at] + digit + line[at + 1 :]
 
 
-def may_be_sound(whole, folder, before, damage):
+def may_be_sound(whole, before):
     """Where nothing is damaged: all as it was, or a journal that ends earlier, as after a kill, and files for it."""
     if {name: data for name, data in before.items() if data is not None} == contents(whole.folder):
         return True
@@ -247,18 +247,13 @@ def contents(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file() and path.name != ".lock"}
 
 
-def check(make, whole, root, chosen):
+def damaged_copy(whole, root, chosen, damage):
     folder = root / whole.folder.name
     shutil.copytree(whole.folder, folder)
-    damage = Damage()
     ways = [bytes_of] if whole.lone else [lines_of] * 5 + [bytes_of] * 4 + [exchanged]
     for way in chosen.choice([[chosen.choice(ways)]] * 3 + [[ways[0], ways[0]], [bytes_of, bytes_of]]):
         way(whole, folder, chosen, damage)
-    try:
-        return judged(make, whole, folder, damage)
-    except Exception as error:
-        error.add_note("; ".join(damage.words))
-        raise
+    return folder
 
 
 def judged(make, whole, folder, damage):
@@ -267,7 +262,7 @@ def judged(make, whole, folder, damage):
         name = f"{folder.name}.mcap"
         assert read_of(folder / name) in (None, read_of(whole.folder / name)), "something changed was read"
     verdict = verify_session(folder)
-    assert not verdict.sound or may_be_sound(whole, folder, before, damage), "verify says sound"
+    assert not verdict.sound or may_be_sound(whole, before), "verify says sound"
     assert contents(folder) == before, "verify changed something"
     try:
         report = repair_session(folder, make.clock())
@@ -304,12 +299,12 @@ def run(make, whole, root, seed, count):
     ends = Counter()
     chosen = random.Random(seed)
     for number in range(count):
-        place = root / str(number)
-        place.mkdir()
+        place, damage = root / str(number), Damage()
         try:
-            ends[check(make, whole, place, chosen)] += 1
+            folder = damaged_copy(whole, place, chosen, damage)
+            ends[judged(make, whole, folder, damage)] += 1
         except Exception as error:
-            error.add_note(f"seed {seed}, number {number}")
+            error.add_note(f"seed {seed}, number {number}: {'; '.join(damage.words)}")
             raise
         shutil.rmtree(place)
     return ends
