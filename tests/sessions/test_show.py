@@ -7,6 +7,7 @@ from typer.testing import CliRunner
 
 from brushloop.sessions.cli import app
 from brushloop.sessions.events import CaptureResult, PressResult, StepKind
+from brushloop.sessions.imports import ImportOptions
 from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.recording import mark_bad_or_good
 from brushloop.sessions.show import Summary, details, summaries
@@ -89,12 +90,8 @@ def test_the_command_prints_it_and_json_holds_all_of_it(collected):
 def root(make, tmp_path, out, photos, run):
     """`sessions/` with one session of every state, and two folders that are none."""
     root = out.parent
-    make.photographs(
-        photos,
-        {"file": "a.png", "px_per_mm": "10", "depth_mm": "13", "tilt_deg": "5"}
-        | {"start_x_px": "1", "start_y_px": "1"},
-    )
-    run()
+    make.photographs(photos, {"file": "a.png"})
+    run(ImportOptions("drag", px_per_mm=10.0))
     make.session(root / "2026-01-02-grid-01", 3, closed=True)
     make.session(root / "2026-01-02-grid-02", 1)
     (root / "notes").mkdir()
