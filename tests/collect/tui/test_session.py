@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 from textual.pilot import Pilot
 
-from bench.harness import Process, started
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.snapshot import Snapshot
 from brushloop.collect.tui.app import OperatorApp
@@ -19,9 +18,14 @@ from brushloop.collect.tui.review_screen import ReviewScreen
 from brushloop.collect.tui.run_screen import RunScreen
 from brushloop.collect.tui.start_screen import SessionBrowser, StartScreen
 from brushloop.collect.tui.widgets import AskScreen
+from brushloop.drivers.arcs.controller import SafetyMode
+from brushloop.drivers.sim.brush.footprint import Flaw
+from brushloop.drivers.sim.config import SimConfig, View
+from brushloop.drivers.sim.rig import LoopbackRig
 from brushloop.sessions.recording import Recording, remarks_of
 from brushloop.sessions.verify import verify_session
 from tests.collect.tui.fake import has_picture, shown
+from tests.rigs import in_thread
 from tests.runs import wait_for_end
 from tests.waiting import PATIENCE_S
 
@@ -103,21 +107,22 @@ enabled = true
 
 
 @pytest.fixture
-def rig(tmp_path: Path) -> Iterator[Process]:
-    """A rig with its files: a camera sharp enough to judge by, and a force sensor that may have to wait for the rest of
-    a busy machine."""
-    rig_toml = tmp_path / "rig.toml"
-    with started("tests.collect.tui.rig_process", str(rig_toml), str(RATE)) as rig:
-        text = rig_toml.read_text(encoding="utf-8").replace("latency_ms = 250.0", "latency_ms = 1500.0")
+def rig(tmp_path: Path) -> Iterator[LoopbackRig]:
+    """A rig with its files: a camera half as sharp as by default, sharp enough to judge by, and a force sensor that may
+    have to wait for the rest of a busy machine. No mark splits by itself."""
+    view = View(width_px=1024, height_px=768, px_per_mm=3.125, fps=5.0)
+    with in_thread(LoopbackRig(SimConfig(rate=RATE, view=view, force_noise_n=0.0005))) as (rig, _):
+        rig.world.flaws.update(dict.fromkeys(range(100), (Flaw.SPLIT, 0.0)))
+        text = rig.toml().replace("latency_ms = 250.0", "latency_ms = 1500.0")
         text = text.replace("stale_ms = 1000.0", "stale_ms = 2000.0\nbias_s = 0.25")
-        rig_toml.write_text(text + MEASURED, encoding="utf-8")
+        (tmp_path / "rig.toml").write_text(text + MEASURED, encoding="utf-8")
         grid = 'kind = "grid"\ndepths_mm = [11.0, 15.0]\ntilts_deg = [0.0, 10.0]\nrepeats = 1\n'
         (tmp_path / "protocol.toml").write_text(grid, encoding="utf-8")
         yield rig
 
 
 @pytest.mark.timeout(400)
-async def test_a_day_at_the_rig(rig: Process, tmp_path: Path) -> None:
+async def test_a_day_at_the_rig(rig: LoopbackRig, tmp_path: Path) -> None:
     browser = SessionBrowser(tmp_path / "sessions", tmp_path / "rig.toml", tmp_path / "protocol.toml")
     app = OperatorApp(browser.engine, browser=browser)
     async with app.run_test(size=(80, 24)) as pilot:
@@ -132,7 +137,7 @@ async def test_a_day_at_the_rig(rig: Process, tmp_path: Path) -> None:
         await operator.accept("Camera, board, scale")
         await operator.accept("Zero touch and plane")
         await operator.reads("Self-check: all within limits")
-        rig.ask("split")
+        rig.world.flaws[len(rig.world.presses)] = (Flaw.SPLIT, 1.0)
         await operator.accept("Self-check")
 
         # a stroke comes out badly: the question has its picture, and the answer presses it again
@@ -145,9 +150,9 @@ async def test_a_day_at_the_rig(rig: Process, tmp_path: Path) -> None:
         # a protective stop in the middle of a press holds the run until a person has released it
         await operator.until(lambda: operator.now().strokes_done > bad.strokes_done, "waited for the retake")
         await operator.until(lambda: operator.now().step.startswith("press"), "waited for a press")
-        rig.ask("stop")
+        rig.arcs.cabinet.safety_stop()
         await operator.reads("ProtectiveStop")
-        rig.ask("release")
+        rig.arcs.cabinet.power.safety = SafetyMode.NORMAL
         await operator.press("g")
         await operator.on(RunScreen)
 
