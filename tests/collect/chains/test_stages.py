@@ -59,7 +59,7 @@ class Chain:
     def validated(self, request: ValidateRequest, _progress: object) -> ValidationOutput:
         self.ran.append("validate")
         if self.validate_fails:
-            raise CalibrationError(request.places[0], "cannot be validated")
+            raise CalibrationError(str(request.places[0]), "cannot be validated")
         report = Path(request.places[0]) / "validation" / "report.html"
         report.parent.mkdir()
         report.write_text("report")
@@ -262,12 +262,8 @@ def test_practice_comes_first_and_learning_ends_when_all_is_settled(
     settled_after: int,
     rounds: int,
 ) -> None:
-    class Rig:
-        class brush:  # noqa: N801
-            radius_mm, length_mm = 6.0, 48.0
-
+    (tmp_path / "rig.toml").write_text(RIG)
     commands = Commands(settled_after, monkeypatch)
-    monkeypatch.setattr(writing, "load_rig", lambda _: Rig)
     monkeypatch.setattr(writing, "collected_session", lambda *_: tmp_path / "session")
     request = WritingRequest(
         "子", tmp_path / "rig.toml", tmp_path / "out", tmp_path, repeats=10, learn=3, practice=True

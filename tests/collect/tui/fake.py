@@ -30,7 +30,6 @@ from brushloop.collect.errors import CollectAborted
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
 from brushloop.collect.photograph.checks import Verdict
 from brushloop.collect.tui.app import OperatorApp
-from brushloop.collect.tui.commission_app import CommissionApp
 from brushloop.collect.tui.review_screen import Review, ReviewCapture, ReviewScreen
 from brushloop.collect.tui.start_screen import SessionBrowser
 from brushloop.drivers.host import HostClock
@@ -48,18 +47,18 @@ ERROR = (
 )
 
 
-def grid_of(done: int, heights: tuple[float, ...] = HEIGHTS_MM) -> tuple[CellCount, ...]:
-    places = [(h, a) for h in heights for a in TILTS_DEG]
-    return tuple(CellCount(Condition(h, a), min(max(done - 2 * n, 0), 2), 2) for n, (h, a) in enumerate(places))
+def grid_of(done: int) -> list[CellCount]:
+    conditions = [Condition(h, a) for h in HEIGHTS_MM for a in TILTS_DEG]
+    return [CellCount(asked, min(max(done - 2 * n, 0), 2), 2) for n, asked in enumerate(conditions)]
 
 
 def marked_grid() -> tuple[CellCount, ...]:
-    """Every sign once: a bad take, one left out, one now, one next."""
-    cells = list(grid_of(13))
+    """Every sign once: a bad take, one left out, one now, one next; the more important of two."""
+    cells = grid_of(13)
     cells[1] = replace(cells[1], bad=2)
     cells[3] = replace(cells[3], done=1, left_out=1, bad=3)
-    cells[6] = replace(cells[6], now=True)
-    cells[8] = replace(cells[8], next=True)
+    cells[6] = replace(cells[6], now=True, bad=1)
+    cells[8] = replace(cells[8], next=True, bad=1)
     return tuple(cells)
 
 
@@ -77,32 +76,23 @@ def blot(size: int = 128) -> np.ndarray[Any, np.dtype[np.bool_]]:
 
 
 def checks(*, split: bool = False) -> Verdict:
+    score, reason = (0.42, "The tip is split.") if split else (0.02, "")
     return Verdict(
         (
             Check(name="exposure", score=201.0, unit="of 255", threshold=250.0, passed=True),
             Check(name="blurred", score=0.11, unit="mm", threshold=0.25, passed=True),
             Check(name="dry", score=0.06, threshold=0.125, passed=True),
-            Check(
-                name="split",
-                score=0.42 if split else 0.02,
-                unit="mm",
-                threshold=0.3,
-                passed=not split,
-                reason="The tip is split." if split else "",
-            ),
+            Check(name="split", score=score, unit="mm", threshold=0.3, passed=not split, reason=reason),
         )
     )
-
-
-def press(stroke_id: str, depth_mm: float, tilt_deg: float) -> Press:
-    return Press(stroke_id=stroke_id, condition=Condition(depth_mm, tilt_deg))
 
 
 def capture(*, kept: bool = True) -> LastCapture:
     binary = blot()
     photo = np.where(binary, 45, 205).astype(np.uint8).repeat(4, axis=0).repeat(4, axis=1)
     model = mark_of(FittedPress(6.0, 48.0), Condition(15.0, 5.0))
-    return LastCapture(press("H15-a5-r01", 15.0, 5.0), 41, kept, checks(split=not kept), photo, binary, model)
+    press = Press(stroke_id="H15-a5-r01", condition=Condition(15.0, 5.0))
+    return LastCapture(press, 41, kept, checks(split=not kept), photo, binary, model)
 
 
 def camera_picture() -> Picture:
@@ -121,7 +111,7 @@ def picture(**changes: Any) -> Snapshot:
         step="press H15-a5-r02",
         strokes_done=13,
         strokes_planned=30,
-        grid=grid_of(13),
+        grid=tuple(grid_of(13)),
         voids=1,
         elapsed_s=185.0,
         eta_s=242.0,
@@ -173,7 +163,6 @@ TOUCHED = Prompt(
     "x",
     number=2,
 )
-PAUSED = picture(state=State.PAUSED, step="paused", tip_mm=None)
 FAILED = picture(state=State.FAILED, error=ERROR, messages=("capture 13: blob 212 mm2, sharp", f"warning: {ERROR}"))
 
 
@@ -403,7 +392,3 @@ class Asking:
             if kind == "run":
                 raise CollectAborted("stopped") from None
             raise
-
-
-def commission_app_of(asking: Asking) -> CommissionApp:
-    return CommissionApp(asking.visit, asking)

@@ -17,7 +17,7 @@ from brushloop.collect.commission.visit import LeftOff, WentBack
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.tui.commission_app import CommissionApp, Steps
 from brushloop.collect.tui.widgets import AskScreen
-from tests.collect.tui.fake import Asking, commission_app_of, shown
+from tests.collect.tui.fake import Asking, shown
 from tests.waiting import PATIENCE_S
 
 SIZE = (80, 24)
@@ -31,7 +31,7 @@ async def until(condition: Callable[[], bool]) -> None:
 
 @asynccontextmanager
 async def running(asking: Asking) -> AsyncIterator[tuple[CommissionApp, Pilot[None]]]:
-    app = commission_app_of(asking)
+    app = CommissionApp(asking.visit, asking)
     async with app.run_test(size=SIZE) as pilot:
         await until(lambda: app.first_day.is_mounted and (app.first_day.prompt is not None or not asking.kinds))
         await pilot.pause()

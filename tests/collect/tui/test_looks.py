@@ -11,6 +11,7 @@ from textual.pilot import Pilot
 
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.snapshot import Snapshot
+from brushloop.collect.tui.commission_app import CommissionApp
 from tests.collect.tui.fake import (
     FAILED,
     SPLIT,
@@ -21,7 +22,6 @@ from tests.collect.tui.fake import (
     a_review,
     app_of,
     capture,
-    commission_app_of,
     full_picture,
 )
 
@@ -98,7 +98,8 @@ def test_review(
 
 
 def test_first_day(snap_compare: Callable[..., bool]) -> None:
-    app = commission_app_of(Asking("bring"))
+    asking = Asking("bring")
+    app = CommissionApp(asking.visit, asking)
 
     async def asked(pilot: Pilot[None]) -> None:
         while app.first_day.prompt is None:

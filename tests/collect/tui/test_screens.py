@@ -18,18 +18,15 @@ from textual.widget import Widget
 from textual.widgets import Static
 
 from brushloop.collect.engine.control import State
-from brushloop.collect.engine.snapshot import CellCount
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.operator import Choice, Prompt
 from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.capture_screen import COLOURS, CaptureScreen, over_photograph
 from brushloop.collect.tui.pictures import CellPicture, braille, look_for_pixels, picture_widget, strip_of
-from brushloop.collect.tui.run_screen import RunScreen, cell_text, spark
+from brushloop.collect.tui.run_screen import RunScreen, spark
 from brushloop.collect.tui.widgets import AskScreen
 from brushloop.sessions.recording import remarks_of
-from brushloop.sessions.records import Condition
 from tests.collect.tui.fake import (
-    PAUSED,
     FakeBrowser,
     FakeEngine,
     a_review,
@@ -70,25 +67,6 @@ async def test_what_did_not_change_is_not_drawn_again(monkeypatch: pytest.Monkey
         for _ in range(3):
             await run.look()
         assert drawn == []
-
-
-CELL = CellCount(Condition(11.0, 0.0), 1, 2)
-
-
-@pytest.mark.parametrize(
-    ("cell", "text"),
-    [
-        (None, "-"),
-        (CELL, "1/2 "),
-        (replace(CELL, done=2), "2/2 ✓"),
-        (replace(CELL, now=True, bad=1), "1/2 ▶"),
-        (replace(CELL, next=True, bad=1), "1/2 ›"),
-        (replace(CELL, done=2, bad=1), "2/2 !"),
-        (replace(CELL, left_out=1, bad=3), "1/2 ×"),
-    ],
-)
-def test_every_state_of_a_condition_has_a_sign_as_well_as_a_colour(cell: CellCount | None, text: str) -> None:
-    assert cell_text(cell).plain == text
 
 
 def test_a_force_is_drawn_to_scale_and_noise_does_not_fill_its_place() -> None:
@@ -229,7 +207,7 @@ async def test_other_files_can_be_typed_and_letters_of_stop_keys_too() -> None:
 
 
 async def test_no_note_is_typed_while_a_run_is_in_progress(tmp_path: Path) -> None:
-    async with watched(PAUSED, (120, 40)) as run:
+    async with watched(picture(state=State.PAUSED), (120, 40)) as run:
         run.app.push_screen(review := a_review(tmp_path, run.app))
         text = await ready(run.app, run.pilot)
         for words in ("red button", "s STOP"):
