@@ -208,9 +208,6 @@ class OperatorApp(PlainApp):
         if self._main.is_mounted:
             self._main.show(self._now)
         self._ask(self.engine, self._main, self._now)
-        keys_depend_on = [(now.state, now.last is None, bool(now.folder)) for now in (before, self._now)]
-        if keys_depend_on[0] != keys_depend_on[1]:
-            self.refresh_bindings()
         if self._now.state is not before.state:
             over = self._now.state in FINAL | {State.STOPPING}
             if over and isinstance(self.screen, AskScreen) and self.screen.own:

@@ -58,9 +58,8 @@ def difference(captured: NDArray[np.bool_], predicted: NDArray[np.bool_]) -> NDA
 
     from brushloop.calibrate.report import overlay
 
-    return np.rint(255.0 * overlay(np.asarray(captured, np.float32), np.asarray(predicted, np.float32))).astype(
-        np.uint8
-    )
+    inks = (np.asarray(mask, np.float32) for mask in (captured, predicted))
+    return np.rint(255.0 * overlay(*inks)).astype(np.uint8)
 
 
 def checks_content(checks: Sequence[Check]) -> Content:

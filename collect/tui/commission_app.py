@@ -255,12 +255,8 @@ class CommissionApp(PlainApp):
         return super().stops(event) and not (typing and event.is_printable)
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
-        """Disable the keys that would do nothing now."""
-        match action:
-            case "stop":
-                return not self.steps.finished
-            case _:
-                return super().check_action(action, parameters)
+        """Whether there is something to stop."""
+        return not self.steps.finished if action == "stop" else super().check_action(action, parameters)
 
     def action_stop(self) -> None:
         """Stop whatever is under way, and say so at once."""

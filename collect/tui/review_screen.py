@@ -57,8 +57,6 @@ from brushloop.sessions.messages import decode_gray, decode_still
 from brushloop.sessions.recording import add_remark, merged_file, remarks_of
 from brushloop.sessions.records import Condition, Quality, Stroke, Topic
 
-NO_FIT = "no fit yet: run `brushloop fit`"
-
 
 @dataclass(frozen=True, slots=True)
 class ReviewCapture:
@@ -152,7 +150,7 @@ class Review:
         pictures = self.pictures(capture)
         try:
             if (path := current(self.folder, FITS)) is None:
-                return pictures, NO_FIT
+                return pictures, "no fit yet: run `brushloop fit`"
             fit = load_artefact(path, BrushFit)
         except CalibrationError as error:
             return pictures, str(error)
@@ -177,10 +175,8 @@ class Review:
         whole = LastCapture(result.press, result.still, result.kept, verdict, image)
         if stroke is None or stroke.cell_mm is None or self._rig is None:
             return whole  # a take that does not count has no stroke record
-        if (lens := self._rig.lens) is not None:
-            if image.shape[::-1] != lens.size_px:
-                return whole  # the lens was calibrated for another size
-            image = lens.undistort(image)
+        if self._rig.lens is not None:
+            image = self._rig.lens.undistort(image)
         try:
             self._plane = see_board(image, self._rig.board)
         except CalibrationError:

@@ -13,6 +13,7 @@ from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical, VerticalScroll
 from textual.content import Content
+from textual.reactive import reactive
 from textual.screen import Screen
 from textual.widgets import DataTable, Footer
 
@@ -143,6 +144,9 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
         Binding("b", "mark_last", "Bad", tooltip="the last capture: pressed again at the end; b takes it back"),
     ]
 
+    keys_depend_on = reactive((State.IDLE, True, False), bindings=True)
+    """What decides which keys do something now; a change of it shows others."""
+
     def __init__(self, engine: Engine) -> None:
         super().__init__()
         self.engine = engine
@@ -257,6 +261,7 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
     def show(self, now: Snapshot) -> None:
         """Draw what differs from the previous snapshot."""
         before, self._now = self._now, now
+        self.keys_depend_on = now.state, now.last is None, bool(now.folder)
         source, session = one_line(now.source) or "not known yet", one_line(now.session_id) or "no session yet"
         self._title.show(Content.assemble((f" source: {source} ", "$text on $accent"), f"  {session}"))
         self._show_state(now)
