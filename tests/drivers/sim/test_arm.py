@@ -17,9 +17,13 @@ from hypothesis import strategies as st
 
 from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.devices import Pose
-from brushloop.drivers.geometry import brush_pose, distance, from_wire
+from brushloop.drivers.geometry import brush_pose, distance, from_wire, to_wire
+from brushloop.drivers.sim.cabinet import Cabinet, methods
+from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.kinematics import HOME, LIMITS_DEG, forward, inverse, pose_of
 from brushloop.drivers.sim.motion import MotionQueue
+from brushloop.drivers.sim.world import SimClock, World
+from tests.simulated_time import SimulatedTime
 
 joints = st.tuples(*(st.floats(-2.8, 2.8) for _ in range(6)))
 
@@ -63,6 +67,10 @@ def queue(travelled: Stretches) -> MotionQueue:
 
 @pytest.fixture
 def cornered(queue: MotionQueue) -> MotionQueue:
+    return with_corner(queue)
+
+
+def with_corner(queue: MotionQueue) -> MotionQueue:
     """Two lines at a right angle, of which the first may be left 20 mm before its end."""
     queue.add(CORNER, V, A, 0.0, blend_mm=20.0)
     queue.add(BEYOND, V, A, 0.0)
@@ -79,10 +87,7 @@ def speeds(walk: np.ndarray, dt_s: float = DT_S) -> np.ndarray:
 
 
 def assert_on_the_corners_path(walk: np.ndarray) -> None:
-    free = MotionQueue(START, lambda *_: None)
-    free.add(CORNER, V, A, 0.0, blend_mm=20.0)
-    free.add(BEYOND, V, A, 0.0)
-    path = walked(free, 4.0)
+    path = walked(with_corner(MotionQueue(START, lambda *_: None)), 4.0)
     for point in walk[::30]:
         assert np.linalg.norm(path - point, axis=1).min() < 0.4
 
@@ -168,11 +173,60 @@ def test_a_path_held_anywhere_goes_on_along_itself(
 
 # ---------------------------------------------------------------- the cabinet
 
+CABINETS_OWN = ("RuntimeMachine", "RegisterControl", "SystemInfo")
+
+
+class Bench:
+    """A cabinet whose time the test lets pass, and a caller. The tool is configured as it is."""
+
+    def __init__(self) -> None:
+        self.time = SimulatedTime()
+        self.world = World(SimConfig(), SimClock(real_s=self.time.seconds))
+        self.cabinet = Cabinet(self.world)
+        self.table = methods(self.cabinet)
+        self.ask("RobotConfig.setTcpOffset", offset=tool(180.0))
+
+    def ask(self, method: str, **params: Any) -> Any:
+        name = method if method.split(".")[0] in CABINETS_OWN else f"rob1.{method}"
+        return self.table[name](params)
+
+    def line(self, target: Pose, v: float = 0.1, **more: float) -> int:
+        return self.ask("MotionControl.moveLine", pose=to_wire(target), a=1.0, v=v, **more)
+
+    def run(self) -> None:
+        self.ask("RobotManage.poweron")
+        self.time.pass_s(1.5)
+        self.ask("RobotManage.startup")
+        self.time.pass_s(1.5)
+
+    @property
+    def safety(self) -> str:
+        return self.ask("RobotState.getSafetyModeType")
+
+    @property
+    def exec_id(self) -> int:
+        return self.ask("MotionControl.getExecId")
+
+    def off_mm(self, pose: Pose) -> float:
+        return distance(self.world.tool(), pose)[0]
+
+
+@pytest.fixture
+def off() -> Bench:
+    return Bench()
+
+
+@pytest.fixture
+def on(off: Bench) -> Bench:
+    off.run()
+    return off
+
+
 HERE = brush_pose(250.0, -230.0, 260.0)
 NEAR = brush_pose(350.0, -230.0, 260.0)
 
 
-def test_motion_is_refused_until_running_and_in_a_safety_stop(off: Any):
+def test_motion_is_refused_until_running_and_in_a_safety_stop(off: Bench):
     assert off.line(NEAR) == -1
     off.run()
     off.cabinet.power.safety = SafetyMode.SAFEGUARD_STOP
@@ -182,52 +236,52 @@ def test_motion_is_refused_until_running_and_in_a_safety_stop(off: Any):
 
 
 @pytest.mark.parametrize("wrong", [{"v": 0.0}, {"v": math.nan}, {"blend_radius": 0.0005}, {"blend_radius": 2.0}])
-def test_a_move_with_a_wrong_argument_is_refused(on: Any, wrong: dict[str, float]):
+def test_a_move_with_a_wrong_argument_is_refused(on: Bench, wrong: dict[str, float]):
     assert on.line(NEAR, **wrong) == -5
     assert on.exec_id == -1
 
 
-def test_moves_queue_up_to_a_limit_and_the_same_pose_is_ignored(on: Any):
+def test_moves_queue_up_to_a_limit_and_the_same_pose_is_ignored(on: Bench):
     assert on.line(HERE) == 13
     codes = [on.line(brush_pose(250.0 + k, -230.0, 260.0)) for k in range(1, 67)]
     assert (codes.count(0), codes.count(2)) == (64, 2)
     assert on.ask("MotionControl.getQueueSize") == 64
-    on.clock.s += 100.0
+    on.time.pass_s(100.0)
     assert on.ask("MotionControl.getQueueSize") == 0
 
 
-def test_a_protective_stop_keeps_the_path_until_a_person_unlocks_and_someone_resumes(on: Any):
+def test_a_protective_stop_keeps_the_path_until_a_person_unlocks_and_someone_resumes(on: Bench):
     on.line(NEAR)
-    on.clock.s += 0.5
+    on.time.pass_s(0.5)
     on.cabinet.safety_stop(SafetyMode.PROTECTIVE_STOP)
-    on.clock.s += 1.0
+    on.time.pass_s(1.0)
     rest_mm = on.off_mm(NEAR)
     assert (on.safety, on.exec_id) == ("ProtectiveStop", 0)
     assert (on.line(HERE), on.ask("RuntimeMachine.resume")) == (1, 1)
     on.cabinet.release()
-    on.clock.s += 5.0
+    on.time.pass_s(5.0)
     assert (on.safety, on.exec_id) == ("Normal", 0)
     assert on.off_mm(NEAR) == rest_mm
     on.ask("RuntimeMachine.resume")
-    on.clock.s += 5.0
+    on.time.pass_s(5.0)
     assert on.off_mm(NEAR) == 0.0
 
 
-def test_a_joint_move_is_straight_in_joints_and_ends_where_it_should(on: Any):
+def test_a_joint_move_is_straight_in_joints_and_ends_where_it_should(on: Bench):
     before = on.ask("RobotState.getJointPositions")
     assert on.ask("MotionControl.moveJoint", q=list(HOME), a=1.0, v=0.5) == 0
-    on.clock.s += 0.8
+    on.time.pass_s(0.8)
     now = on.ask("RobotState.getJointPositions")
     shares = [(b - a) / (c - a) for a, b, c in zip(before, now, HOME, strict=True) if abs(c - a) > 1e-3]
     assert min(shares) > 0.0
     assert max(shares) - min(shares) < 1e-6
-    on.clock.s += 20.0
+    on.time.pass_s(20.0)
     assert on.ask("RobotState.getJointPositions") == pytest.approx(HOME, abs=1e-5)
     assert on.ask("MotionControl.moveJoint", q=list(HOME), a=1.0, v=0.5) == 13
     assert on.line(HERE) == 0
 
 
-def test_nothing_less_takes_the_place_of_an_emergency_stop(on: Any):
+def test_nothing_less_takes_the_place_of_an_emergency_stop(on: Bench):
     on.cabinet.safety_stop(SafetyMode.ROBOT_EMERGENCY_STOP)
     for mode in (SafetyMode.PROTECTIVE_STOP, SafetyMode.SAFEGUARD_STOP):
         on.cabinet.safety_stop(mode)
@@ -235,9 +289,9 @@ def test_nothing_less_takes_the_place_of_an_emergency_stop(on: Any):
 
 
 @pytest.mark.parametrize("mode", [SafetyMode.ROBOT_EMERGENCY_STOP, SafetyMode.SAFEGUARD_STOP])
-def test_only_a_person_ends_a_stop_that_drops_the_path(on: Any, mode: SafetyMode):
+def test_only_a_person_ends_a_stop_that_drops_the_path(on: Bench, mode: SafetyMode):
     on.line(NEAR)
-    on.clock.s += 0.5
+    on.time.pass_s(0.5)
     on.cabinet.safety_stop(mode)
     powered = mode is SafetyMode.SAFEGUARD_STOP
     assert on.ask("RobotState.isPowerOn") is powered
@@ -257,29 +311,29 @@ def tool(length_mm: float, x_mm: float = 0.0) -> list[float]:
     return [x_mm / 1e3, 0.0, length_mm / 1e3, 0.0, 0.0, 0.0]
 
 
-def press(on: Any, depth_mm: float) -> None:
+def press(on: Bench, depth_mm: float) -> None:
     """As an operator would teach it: down to the paper and `depth_mm` deeper, by the configured tool."""
     z_mm = on.world.config.table.paper_z_mm
     for z in (SHEET.z_mm, z_mm - depth_mm, SHEET.z_mm):
         on.line(brush_pose(SHEET.x_mm, SHEET.y_mm, z), v=0.2)
-        on.clock.s += 10.0
+        on.time.pass_s(10.0)
     on.world.tool()  # the world goes on when someone looks
 
 
 @pytest.mark.parametrize(("configured_mm", "depth_mm"), [(180.0, 10.0), (175.0, 15.0)])
-def test_an_offset_that_is_too_short_presses_deeper_by_as_much(on: Any, configured_mm: float, depth_mm: float):
+def test_an_offset_that_is_too_short_presses_deeper_by_as_much(on: Bench, configured_mm: float, depth_mm: float):
     assert on.ask("RobotConfig.setTcpOffset", offset=tool(configured_mm)) == 0
     press(on, 10.0)
     [pressed] = on.world.presses
     assert pressed.depth_mm == pytest.approx(depth_mm, abs=1e-6)
 
 
-def test_the_tip_goes_round_a_wrong_tool_centre_point(on: Any):
+def test_the_tip_goes_round_a_wrong_tool_centre_point(on: Bench):
     """A turn about the configured point swings a tip that is elsewhere."""
     on.ask("RobotConfig.setTcpOffset", offset=tool(180.0, x_mm=10.0))
     here = from_wire(on.ask("RobotState.getTcpPose"))
     before = on.world.tool()
     assert on.line(brush_pose(*here.position_mm, heading_deg=90.0), v=1.0) == 0
-    on.clock.s += 20.0
+    on.time.pass_s(20.0)
     assert distance(from_wire(on.ask("RobotState.getTcpPose")), here)[0] < 1e-6
     assert distance(on.world.tool(), before)[0] == pytest.approx(10.0 * math.sqrt(2.0))

@@ -13,8 +13,8 @@ from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.config import SimConfig, Table
 from brushloop.drivers.sim.faults import Device, FaultBoard, Phase, fault_of, phase_of
-from brushloop.drivers.sim.world import World
-from tests.drivers.sim.conftest import StoppedClock
+from brushloop.drivers.sim.world import SimClock, World
+from tests.simulated_time import SimulatedTime
 
 
 class Scripted(FaultBoard):
@@ -138,12 +138,12 @@ JOURNEY = (
 
 
 def phases(poses: Iterable[Pose], table: Table = TABLE) -> Iterator[tuple[Phase, Phase]]:
-    world = World(SimConfig(table=table))
-    world.clock = clock = StoppedClock()  # type: ignore[assignment]
+    time = SimulatedTime()
+    world = World(SimConfig(table=table), SimClock(real_s=time.seconds))
     for pose in poses:
-        world.motion.add(pose, 200.0, 1000.0, clock.s)
+        world.motion.add(pose, 200.0, 1000.0, world.clock.now_s())
         setting_out = phase_of(world)
-        clock.s += 100.0
+        time.pass_s(100.0)
         yield setting_out, phase_of(world)
 
 
