@@ -176,14 +176,13 @@ def sim(
 
     from brushloop.drivers.sim.brush.spec import load_brush
     from brushloop.drivers.sim.config import SimConfig, View
-    from brushloop.drivers.sim.lab import LabRefused, UnknownLab, trap_of
+    from brushloop.drivers.sim.lab import LabRefused, UnknownLab
     from brushloop.drivers.sim.rig import LoopbackRig, serve
 
     if unknown is not None:
         if write_rig is not None or brush != Path("loopback"):
             raise LabRefused("--unknown: can only be combined with --trap, --control, --rate and --idle-exit")
-        lab = UnknownLab(unknown, None if trap is None else trap_of(trap), rate=rate)
-        asyncio.run(serve(lab, say, idle_exit_s=idle_exit, control=control))
+        asyncio.run(serve(UnknownLab(unknown, trap, rate=rate), say, idle_exit_s=idle_exit, control=control))
         return
     if trap is not None:
         raise LabRefused("--trap: needs --unknown SEED")

@@ -148,14 +148,6 @@ class Cabinet:
         fix = self._fix
         return tip if fix is None else pose_of(matrix_of(tip) @ inverted(fix))
 
-    def tcp(self) -> Pose:
-        """Pose of the configured tool centre point now."""
-        return self.configured(self.world.tool())
-
-    def joints(self) -> Joints:
-        """Joint positions for the present pose of the tip."""
-        return self.motion.joints(self.now_s())
-
     def fk(self, p: Params) -> list[Any]:
         """[pose of the configured tool centre point, return code]."""
         return [to_wire(pose_of(forward(numbers("forwardKinematics", p["q"])) @ self._tool)), 0]
@@ -305,8 +297,8 @@ def methods(cabinet: Cabinet) -> dict[str, Callable[[Params], Any]]:
         "RobotState.getSafetyModeType": lambda _: power.safety.value,
         "RobotState.isPowerOn": lambda _: power.joint_state != "Poweroff",
         "RobotState.isSteady": lambda _: motion.steady(now_s()),
-        "RobotState.getTcpPose": lambda _: to_wire(cabinet.tcp()),
-        "RobotState.getJointPositions": lambda _: cabinet.joints(),
+        "RobotState.getTcpPose": lambda _: to_wire(cabinet.configured(cabinet.world.tool())),
+        "RobotState.getJointPositions": lambda _: motion.joints(now_s()),
         "RobotState.getJointState": lambda _: [power.joint_state] * 6,
         "RobotAlgorithm.forwardKinematics": cabinet.fk,
         "RobotAlgorithm.inverseKinematics": cabinet.ik,

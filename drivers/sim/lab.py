@@ -60,6 +60,12 @@ THINGS = (*TOUCHED, "upright", "well", "wash-pot", "park", "clear-view", "hold-b
 """Those that the tip touches, and those to which it is brought by eye."""
 
 
+class LabRefused(Exception):
+    """No such lab can be served."""
+
+    exit_code: ClassVar[int] = 2
+
+
 class UnknownLab(LoopbackRig):
     """`async with UnknownLab(seed) as lab:` serves until the block ends; `hand` asks the person for something.
 
@@ -67,10 +73,13 @@ class UnknownLab(LoopbackRig):
     """
 
     def __init__(
-        self, seed: int, trap: Trap | None = None, *, rate: float = 1.0, picture_px: tuple[int, int] = PICTURE_PX
+        self, seed: int, trap: str | None = None, *, rate: float = 1.0, picture_px: tuple[int, int] = PICTURE_PX
     ) -> None:
+        """Raises `LabRefused` for an unknown trap."""
+        if trap is not None and trap not in [*Trap]:
+            raise LabRefused(f"--trap is {trap!r}, allowed: {', '.join(Trap)}")
         clean = draw(seed, rate, picture_px)
-        self.facts, self._mended = (clean, clean) if trap is None else trapped(clean, trap)
+        self.facts, self._mended = (clean, clean) if trap is None else trapped(clean, Trap(trap))
         """The lab as it is now, and once the mistake is corrected."""
         config, [other_port] = self.facts.config, {*CAMERA_PORTS} - {self.facts.camera_port}
         force_hz = config.force_hz * min(max(rate, 1.0), MOST_ROUNDS)
@@ -176,7 +185,7 @@ class UnknownLab(LoopbackRig):
             self.arcs.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
         if self.facts.config != was.config:
             self.reconfigure(self.facts.config)
-        done, self._trap = f"I have seen to it: {self._trap.value}.", None
+        done, self._trap = f"I have seen to it: {self._trap}.", None
         return done
 
     def aim(self, to: str, index: int, name: str) -> Pose:
@@ -278,16 +287,3 @@ def _withdrawn(tip: Pose) -> Pose:
     back_mm = turned(unit(tip.quaternion), (0.0, 0.0, -LIFT_MM))
     x, y, z = (a + b for a, b in zip(tip.position_mm, back_mm, strict=True))
     return Pose(x, y, z, *tip.quaternion)
-
-
-class LabRefused(Exception):
-    """No such lab can be served."""
-
-    exit_code: ClassVar[int] = 2
-
-
-def trap_of(name: str) -> Trap:
-    """The trap with this name. Raises `LabRefused` for an unknown one."""
-    if name not in [*Trap]:
-        raise LabRefused(f"--trap is {name!r}, allowed: {', '.join(Trap)}")
-    return Trap(name)

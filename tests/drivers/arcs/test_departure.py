@@ -62,9 +62,10 @@ async def test_a_brush_that_is_not_square_to_the_flange_is_pressed_upright(make_
     expected = [0.004, -0.007, 0.18, math.radians(2.0), math.radians(-1.5), 0.0]
     assert cabinet.cabinet.tcp_offset == pytest.approx(expected)
     await arm.move(NEAR, **QUICK)
-    flange = from_wire(cabinet.cabinet.fk({"q": [*cabinet.cabinet.joints()]})[0])
+    joints = cabinet.cabinet.motion.joints(cabinet.cabinet.now_s())
+    flange = from_wire(cabinet.cabinet.fk({"q": [*joints]})[0])
     assert distance(flange, NEAR)[0] < 0.1
-    assert lean(pose_of(forward(cabinet.cabinet.joints())))[0] == pytest.approx(2.5, abs=0.05)
+    assert lean(pose_of(forward(joints)))[0] == pytest.approx(2.5, abs=0.05)
 
 
 @pytest.mark.parametrize(

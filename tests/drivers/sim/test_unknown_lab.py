@@ -29,7 +29,7 @@ FAST = 500.0
 
 def lab_of(seed: int, trap: str | None = None) -> UnknownLab:
     """A lab that does not serve: hand, arm and scene are there, the sockets are not."""
-    return UnknownLab(seed, trap, rate=FAST, picture_px=SMALL_PX)  # type: ignore[arg-type]
+    return UnknownLab(seed, trap, rate=FAST, picture_px=SMALL_PX)
 
 
 @pytest.mark.parametrize("seed", range(8))
