@@ -84,9 +84,7 @@ def plan(
 
     if picture is not None:
         _check_output("--picture", picture, *PICTURES)
-    rig, wanted = load_rig(config), load_protocol(protocol)
-    if arm or not rig.robot.on_this_machine:
-        rig = rig.settled(arm)
+    rig, wanted = load_rig(config).settled(arm), load_protocol(protocol)
     check_protocol(config, protocol, rig, wanted)
     planned = make_plan(rig, wanted)
     asked = None

@@ -54,7 +54,7 @@ class Region(Path):
         x_mm, y_mm, size_x_mm, size_y_mm = rect_mm
         places = dict.fromkeys((x, y) for x in (x_mm, x_mm + size_x_mm) for y in (y_mm, y_mm + size_y_mm))
         heights = (lowest_z_mm, config.motion.safe_z_mm)
-        return cls([touching(config, *place, z_mm) for z_mm in heights for place in places], speed_mm_s)
+        return cls([upright(config, *place, z_mm) for z_mm in heights for place in places], speed_mm_s)
 
 
 Segment = Move | Path
@@ -69,24 +69,22 @@ def retreat_moves(config: RigConfig, here: Pose) -> list[Move]:
     """From any pose: up along the tool axis to safe height if below it, upright, then to the park position."""
     motion = config.motion
     moves: list[Move] = []
-    x_mm, y_mm, z_mm = here.position_mm
     if here.z_mm < motion.safe_z_mm:
         tilt_deg, heading_deg = lean(here)
-        rise_mm = motion.safe_z_mm - here.z_mm
-        out_mm = rise_mm * math.tan(math.radians(tilt_deg))
-        x_mm += out_mm * math.cos(math.radians(heading_deg))
-        y_mm += out_mm * math.sin(math.radians(heading_deg))
-        qx, qy, qz, qw = here.quaternion
-        z_mm = motion.safe_z_mm
-        moves.append(Move(Pose(x_mm, y_mm, z_mm, qx, qy, qz, qw), motion.press_speed_mm_s))
+        out_mm = (motion.safe_z_mm - here.z_mm) * math.tan(math.radians(tilt_deg))
+        x_mm = here.x_mm + out_mm * math.cos(math.radians(heading_deg))
+        y_mm = here.y_mm + out_mm * math.sin(math.radians(heading_deg))
+        here = Pose(x_mm, y_mm, motion.safe_z_mm, *here.quaternion)
+        moves.append(Move(here, motion.press_speed_mm_s))
     # Turn upright before travelling: turning along a long line would sweep the ferrule around.
-    moves.append(Move(_upright_in_base(config, x_mm, y_mm, z_mm), motion.travel_speed_mm_s))
-    return moves + park_moves(config)
+    turned = brush_pose(*here.position_mm, heading_deg=config.paper.yaw_deg)
+    return [*moves, Move(turned, motion.travel_speed_mm_s), *park_moves(config)]
 
 
 def park_moves(config: RigConfig) -> list[Move]:
     """To the place where the arm waits, out of the camera's view."""
-    return [Move(_upright_in_base(config, *config.motion.park_mm), config.motion.travel_speed_mm_s)]
+    parked = brush_pose(*config.motion.park_mm, heading_deg=config.paper.yaw_deg)
+    return [Move(parked, config.motion.travel_speed_mm_s)]
 
 
 def over_sheet_move(config: RigConfig) -> Move:
@@ -205,7 +203,7 @@ def over(config: RigConfig, x_mm: float, y_mm: float) -> Move:
 
 def near(config: RigConfig, x_mm: float, y_mm: float, z_mm: float) -> Move:
     """From travel height down to where a slow approach begins."""
-    return Move(touching(config, x_mm, y_mm, z_mm), config.motion.press_speed_mm_s)
+    return Move(upright(config, x_mm, y_mm, z_mm), config.motion.press_speed_mm_s)
 
 
 def up(config: RigConfig, x_mm: float, y_mm: float) -> Move:
@@ -229,25 +227,18 @@ def mark_moves(config: RigConfig, plane: PaperPlane, x_mm: float, y_mm: float) -
     """One mark of the self-check: over the place, down near the paper, slowly to its depth, and up."""
     surface_z_mm = plane.touch_z_mm(x_mm, y_mm)
     down = near(config, x_mm, y_mm, surface_z_mm + CHECK_APPROACH_MM)
-    mark = Move(touching(config, x_mm, y_mm, surface_z_mm - config.self_check.depth_mm), CHECK_SPEED_MM_S)
+    mark = Move(upright(config, x_mm, y_mm, surface_z_mm - config.self_check.depth_mm), CHECK_SPEED_MM_S)
     return [over(config, x_mm, y_mm), down, mark, up(config, x_mm, y_mm)]
 
 
 # Poses
 
 
-def touching(config: RigConfig, x_mm: float, y_mm: float, z_mm: float) -> Pose:
-    """Like `upright`, but no higher than travel height."""
-    return upright(config, x_mm, y_mm, min(z_mm, config.motion.safe_z_mm))
-
-
 def upright(config: RigConfig, x_mm: float, y_mm: float, z_mm: float) -> Pose:
-    """The upright brush over a point of the paper frame, its tip at a height of the base frame."""
-    return _upright_in_base(config, *to_base(config.paper, x_mm, y_mm), z_mm)
-
-
-def _upright_in_base(config: RigConfig, x_mm: float, y_mm: float, z_mm: float) -> Pose:
-    return brush_pose(x_mm, y_mm, z_mm, heading_deg=config.paper.yaw_deg)
+    """The upright brush over a point of the paper frame, its tip at a height of the base frame; no higher than travel
+    height."""
+    z_mm = min(z_mm, config.motion.safe_z_mm)
+    return brush_pose(*to_base(config.paper, x_mm, y_mm), z_mm, heading_deg=config.paper.yaw_deg)
 
 
 DEPTH_TOLERANCE_MM = 0.1
@@ -324,7 +315,7 @@ class Procedures:
 
     async def lower(self, x_mm: float, y_mm: float, z_mm: float, speed_mm_s: float) -> float:
         """Go to a height over a point of the sheet; returns the height at which the arm rests, in mm."""
-        await self.go(Move(touching(self._config, x_mm, y_mm, z_mm), speed_mm_s))
+        await self.go(Move(upright(self._config, x_mm, y_mm, z_mm), speed_mm_s))
         return (await self.rig.robot.where()).z_mm
 
     async def lift(self) -> None:
@@ -375,8 +366,8 @@ class Procedures:
 
         Returns the depth at which the brush landed, in mm.
         """
-        moves = stroke_moves(self._config, self.plane, patch, drawn.strokes[number], drawn.speed_mm_s)
-        *down, path, lift, up = moves
+        points, speed_mm_s = drawn.strokes[number], drawn.speed_mm_s
+        *down, path, lift, up = stroke_moves(self._config, self.plane, patch, points, speed_mm_s)
         await self.go(*down)
         depth_mm = -self.plane.above_mm(self._config.paper, await self.rig.robot.where())
         await self.go(path, lift, up)
