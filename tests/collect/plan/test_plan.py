@@ -346,30 +346,6 @@ def made(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> list[Made]:
     return steps
 
 
-def run(lab: Lab, protocol: str, extra: str = EXTRAS) -> None:
-    """To its end; whoever jogs says at once that the tip touches."""
-    lab.edit_rig("", extra)
-    (lab.folder / "protocol.toml").write_text(protocol, encoding="utf-8")
-    answered_alike(lab.engine(on_screen=True), "t")
-
-
-def hold_against_the_plan(lab: Lab, made: list[Made]) -> None:
-    rig_path, path = lab.folder / "rig.toml", lab.folder / "protocol.toml"
-    config, protocol = load_rig(rig_path), load_protocol(path)
-    check_protocol(rig_path, path, config, protocol)
-    last = [one for one in made if one.step.kind is StepKind.CAPTURE][-1:]
-    for one in made:
-        patches = one.context.patches
-        planned = moves_of(config, one.plane, one.step, patches, dips=one.dips)
-        # Where the ink had to wait, a press dips again.
-        again = inking_moves(config, one.dips) if one.step.kind in MARKING else []
-        assert not not_checked(config, one.sent, [*planned.segments, *again]), one.step
-        if one not in last:  # after the last capture the arm does not set out for a dip
-            assert not not_sent(config, planned, one.sent), one.step
-        checked = {rounded(pose) for pose, _, _ in all_poses(config, protocol, one.plane, every_patch=True)}
-        assert {rounded(pose) for pose, _ in planned.poses} <= checked, one.step
-
-
 def rounded(pose: Pose) -> tuple[float, ...]:
     return tuple(round(v, 6) for v in (*pose.position_mm, *pose.quaternion))
 
@@ -378,6 +354,19 @@ def rounded(pose: Pose) -> tuple[float, ...]:
     "kind", [pytest.param(kind, marks=pytest.mark.soak if kind in LIKE_A_GRID else ()) for kind in KINDS]
 )
 def test_what_a_run_sends_the_plan_has_checked(lab: Lab, made: list[Made], kind: str) -> None:
-    run(lab, KINDS[kind])
-    hold_against_the_plan(lab, made)
+    rig_path, path = lab.folder / "rig.toml", lab.folder / "protocol.toml"
+    lab.edit_rig("", EXTRAS)
+    wanted, config = protocol(lab.folder, KINDS[kind]), load_rig(rig_path)
+    check_protocol(rig_path, path, config, wanted)
+    answered_alike(lab.engine(on_screen=True), "t")  # whoever jogs says at once that the tip touches
+    last = [one for one in made if one.step.kind is StepKind.CAPTURE][-1:]
+    for one in made:
+        planned = moves_of(config, one.plane, one.step, one.context.patches, dips=one.dips)
+        # Where the ink had to wait, a press dips again.
+        again = inking_moves(config, one.dips) if one.step.kind in MARKING else []
+        assert not not_checked(config, one.sent, [*planned.segments, *again]), one.step
+        if one not in last:  # after the last capture the arm does not set out for a dip
+            assert not not_sent(config, planned, one.sent), one.step
+        checked = {rounded(pose) for pose, _, _ in all_poses(config, wanted, one.plane, every_patch=True)}
+        assert {rounded(pose) for pose, _ in planned.poses} <= checked, one.step
     assert {one.step.kind for one in made} >= {StepKind.ZERO_TOUCH, StepKind.BOARD}
