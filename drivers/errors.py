@@ -109,7 +109,6 @@ class LimitExceeded(DeviceError, ValueError):
         self, device: str, field: str, value: float, low: float, high: float, unit: str, *, remedy: str = ""
     ) -> None:
         self.field = field
-        self.value = value
         what = f"{field} = {value:.3f} {unit} is outside [{low:.3f}, {high:.3f}] {unit}"
         super().__init__(device, "check", what, remedy=remedy)
 
@@ -135,10 +134,9 @@ class MotionFailed(MotionError):
 
 
 class RobotNotSafe(MotionError):
-    """The safety mode forbids motion; `mode` is the controller's name for it."""
+    """The safety mode forbids motion; the message has the controller's name for it."""
 
     def __init__(self, device: str, op: str, mode: str, condition: str, remedy: str) -> None:
-        self.mode = mode
         super().__init__(device, op, f"safety mode is {mode}", condition=condition, remedy=remedy)
 
 
@@ -153,14 +151,12 @@ class NotPowered(MotionError):
 
 
 class ArmMoved(MotionError):
-    """The arm is not where it was left but `off_mm` and `off_deg` away; `moving` is True if it still moves."""
+    """The arm is not where it was left; `moving` is True if it still moves."""
 
     condition = "Another client or a person moved it; nothing was sent to it."
     remedy = "Nothing may stand in the way of the brush: the first motion is back along the tool axis."
 
     def __init__(self, device: str, op: str, off_mm: float, off_deg: float, *, moving: bool = False) -> None:
-        self.off_mm = off_mm
-        self.off_deg = off_deg
         self.moving = moving
         what = f"the arm is {off_mm:.1f} mm and {off_deg:.1f} deg from where it was left"
         if moving:

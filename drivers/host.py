@@ -8,14 +8,14 @@ other systems it is a lock on a file that every user may open, in a folder share
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import errno
 import os
 import socket
 import struct
 import sys
 import time
-from collections.abc import Coroutine, Generator
+from collections.abc import Coroutine
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -75,25 +75,23 @@ class Claimed(Exception):
     """Another process holds the name; the message says which one, if that is known."""
 
 
-@contextlib.contextmanager
-def claimed(name: str) -> Generator[None]:
-    """Hold `name` on this machine until the block, or the process, ends. Raises `Claimed`."""
-    with _named_socket(name) if sys.platform == "linux" else _file(name):
-        yield
+def claimed(name: str) -> AbstractContextManager[object]:
+    """Claim `name` on this machine, and hold it until the block, or the process, ends. Raises `Claimed`."""
+    return _named_socket(name) if sys.platform == "linux" else _file(name)
 
 
-@contextlib.contextmanager
-def _named_socket(name: str) -> Generator[None]:
+def _named_socket(name: str) -> socket.socket:
     address = f"\0{name}"
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as claim:
-        try:
-            claim.bind(address)
-        except OSError as error:
-            if error.errno != errno.EADDRINUSE:
-                raise
-            raise Claimed(_holder(address)) from None
-        claim.listen(WAITING)
-        yield
+    claim = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        claim.bind(address)
+    except OSError as error:
+        claim.close()
+        if error.errno != errno.EADDRINUSE:
+            raise
+        raise Claimed(_holder(address)) from None
+    claim.listen(WAITING)
+    return claim
 
 
 def _holder(address: str) -> str:
@@ -114,11 +112,9 @@ def _holder(address: str) -> str:
     return f"process {pid} of {user}" if pid else UNNAMED
 
 
-@contextlib.contextmanager
-def _file(name: str) -> Generator[None]:
+def _file(name: str) -> AbstractContextManager[object]:
     folder = Path(os.environ.get("PROGRAMDATA", "C:/ProgramData")) if os.name == "nt" else Path("/tmp")
     try:
-        with FileLock(folder / f"{name}.lock", timeout=0, mode=0o666):
-            yield
+        return FileLock(folder / f"{name}.lock", timeout=0, mode=0o666).acquire()
     except Timeout:
         raise Claimed(UNNAMED) from None

@@ -131,9 +131,8 @@ def test_both_ends_of_a_range_are_inside_and_a_step_beyond_and_what_is_no_number
         check(**{field: bound})
     tilted = field == "tilt"
     for value in [high + 1e-3] if tilted else [low - 1e-3, high + 1e-3, math.nan, math.inf, -math.inf]:
-        with pytest.raises(LimitExceeded, match=f"{field} = .*Nothing has moved") as caught:
+        with pytest.raises(LimitExceeded, match=f"{field} = {value:.3f} .*Nothing has moved"):
             check(**{field: value})
-        assert (caught.value.field, caught.value.value) == (field, pytest.approx(value, nan_ok=True))
 
 
 @pytest.mark.parametrize("quaternion", [(math.nan,) * 4, (0.0,) * 4])

@@ -73,13 +73,12 @@ async def test_a_brush_that_is_not_square_to_the_flange_is_pressed_upright(make_
     [
         *((method, -5, MotionRefused, method) for method in ("setTcpOffset", "setPayload", "setCollisionLevel")),
         *(
-            # a return code is no proof
-            ("setTcpOffset", code, SettingsChanged, r"tool offset is \(0, 0, 0\) mm, .*, not \(0, 0, 180\) mm")
+            ("setTcpOffset", code, SettingsChanged, r"tool offset is \(0, 0, 0\) mm, .*, not \(0, 0, 180\)")
             for code in (0, 13)
         ),
     ],
 )
-async def test_what_the_controller_does_not_take_keeps_the_power_off(
+async def test_what_the_controller_does_not_take_whatever_it_returns_keeps_the_power_off(
     make_arm: MakeArm, cabinet: Cabinet, method: str, code: int, error: type[Exception], words: str
 ):
     cabinet.answers(f"RobotConfig.{method}", code)
@@ -111,9 +110,8 @@ async def test_an_arm_that_was_moved_is_not_sent_anywhere_until_it_is_taken_up(
     await send(other, ELSEWHERE)
     sent = cabinet.taken
     for refused in (arm.move(LOW, **QUICK), arm.follow([LOW, ABOVE], blend_mm=1.0, **QUICK), arm.confirm()):
-        with pytest.raises(ArmMoved, match=r"109\.\d mm and 10\.0 deg from where it was left") as caught:
+        with pytest.raises(ArmMoved, match=r"109\.\d mm and 10\.0 deg from where it was left"):
             await refused
-        assert caught.value.off_deg == pytest.approx(10.0, abs=0.01)
     assert cabinet.taken == sent
     assert distance(await arm.take_up(), ELSEWHERE)[0] < 0.05
     await arm.move(LOW, **QUICK)
