@@ -18,23 +18,15 @@ from brushloop.sessions.events import Condition, Press
 from tests.waiting import PATIENCE_S
 
 
-def test_stop_is_possible_from_every_state_that_is_not_over() -> None:
-    for state in State:
-        if state not in FINAL | {State.STOPPING}:
-            assert State.STOPPING in TRANSITIONS[state], state
-
-
-def test_nothing_leaves_a_final_state() -> None:
-    assert all(not TRANSITIONS[state] for state in FINAL)
-
-
-def test_every_state_can_be_reached() -> None:
+def test_every_state_can_be_reached_and_stopped_from_until_a_final_one_which_nothing_leaves() -> None:
     reached, frontier = {State.IDLE}, [State.IDLE]
     while frontier:
         new = TRANSITIONS[frontier.pop()] - reached
         reached |= new
         frontier += new
     assert reached == set(State)
+    assert all(State.STOPPING in TRANSITIONS[state] for state in set(State) - FINAL - {State.STOPPING})
+    assert not any(TRANSITIONS[state] for state in FINAL)
 
 
 def test_a_way_that_the_table_does_not_have_is_a_defect() -> None:

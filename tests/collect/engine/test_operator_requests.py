@@ -13,7 +13,6 @@ from brushloop.collect.protocols.steps import Step, ZeroTouchStep
 from brushloop.drivers.errors import DeviceTimeout
 from brushloop.sessions.events import BoardResult, StepResult, ZeroTouchResult
 from brushloop.sessions.recording import Recording, mark_bad_or_good
-from tests.journal_lines import read_lines
 from tests.rigs import Lab
 from tests.runs import answer, ended_by, until, wait_for_end
 
@@ -106,18 +105,6 @@ def test_the_paper_is_found_again_by_jog_between_two_strokes(lab: Lab) -> None:
     assert methods == ["taught", "jog"]
 
 
-def failing(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
-    """Zero touch between strokes ends with this error."""
-    perform = Run.perform
-
-    async def performed(self: Run, step: Step) -> StepResult:
-        if isinstance(step, ZeroTouchStep) and step.between_strokes:
-            raise error
-        return await perform(self, step)
-
-    monkeypatch.setattr(Run, "perform", performed)
-
-
 @pytest.mark.parametrize(
     ("error", "asks"),
     [
@@ -128,7 +115,14 @@ def failing(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
 def test_a_jog_between_strokes_that_fails_leaves_the_paper_where_it_was(
     lab: Lab, monkeypatch: pytest.MonkeyPatch, error: Exception, asks: str
 ) -> None:
-    failing(monkeypatch, error)
+    perform = Run.perform
+
+    async def performed(self: Run, step: Step) -> StepResult:
+        if isinstance(step, ZeroTouchStep) and step.between_strokes:
+            raise error
+        return await perform(self, step)
+
+    monkeypatch.setattr(Run, "perform", performed)
     engine = lab.engine(on_screen=True)
     engine.request(OperatorRequest.JOG)
     engine.start()
@@ -153,11 +147,8 @@ def test_a_height_that_is_not_taken_and_a_jog_that_is_given_up_leave_the_paper_w
     assert now.strokes_done == 2
     methods = [result.method for result in lab.state.results(ZeroTouchResult)]
     assert methods == ["taught"]
-    voids = [line["why"] for line in read_lines(lab.session / "journal.jsonl") if line["event"] == "void"]
-    assert voids[-2:] == [
-        "the new height was not accepted.",
-        "the operator gave up at touch 1 of 3",
-    ]
+    voids = [why for _, why in lab.state.cut]
+    assert voids[-2:] == ["the new height was not accepted.", "the operator gave up at touch 1 of 3"]
 
 
 def test_who_gives_the_jog_of_the_set_up_up_is_asked_and_may_jog_again(lab: Lab) -> None:

@@ -165,18 +165,6 @@ def test_an_arm_that_was_left_outside_its_limits_is_not_moved_until_it_is_jogged
     assert engine.snapshot().strokes_done == 2
 
 
-def test_with_another_tool_offset_nothing_is_pressed(lab: Lab) -> None:
-    engine = lab.engine()
-    start_and_pause(engine)
-    second_client(lab, engine, **SHORTER)
-    pressed = len(lab.rig.world.presses)
-    engine.resume()
-    ended_by(engine, SettingsChanged, r"tool offset is \(0, 0, 170\) mm, \(0, 0, 0\) deg, not \(0, 0, 180\)")
-    assert len(lab.rig.world.presses) == pressed
-    now = engine.snapshot()
-    assert (now.state, now.strokes_done, now.rest_unknown) == (State.FAILED, 1, False)
-
-
 def test_a_tool_offset_that_changes_after_the_last_look_leaves_a_void_and_no_stroke(lab: Lab) -> None:
     """Between the driver's look and the controller's own reading of the line there is always a moment."""
     lab.write_protocol("[11.0]", "[0.0]")
