@@ -51,13 +51,15 @@ async def each_frame(camera: OpenCvCamera, shows: Sequence[Callable[[Frame], Non
                     await asyncio.to_thread(show, frame)
             await asyncio.sleep(FRAME_PERIOD_S)
 
-    task = asyncio.create_task(watch(), name="camera picture") if shows else None
+    if not shows:
+        yield
+        return
+    task = asyncio.create_task(watch(), name="camera picture")
     try:
         yield
     finally:
-        if task is not None:
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
 
 
 def _no_wider(image: NDArray[np.uint8], width_px: int) -> NDArray[np.uint8]:

@@ -95,7 +95,11 @@ class Run(RunContext):
             await self._between(step)
             try:
                 result = await self.perform(step)
-                answer = await self._ask_about(result) if asked else GO_ON
+                answer = GO_ON
+                if asked:
+                    answer = await self.asker.ask_or_default(accept_question(result, self.rig.config))
+                if answer == STOP.key:
+                    await self._park()
                 if answer == GO_ON:
                     self.done.add(step.key)
                     return result
@@ -169,13 +173,6 @@ class Run(RunContext):
             if arm_at_fault(error):
                 await self._ask(error)
         await self._retreat()
-
-    async def _ask_about(self, result: StepResult) -> str:
-        """Let a person accept what a set-up step measured. Raises `Parked` if the answer is to stop."""
-        answer = await self.asker.ask_or_default(accept_question(result, self.rig.config))
-        if answer == STOP.key:
-            await self._park()
-        return answer
 
     async def _ask(self, error: StepError | DeviceError) -> None:
         """Let a person decide after `error`; raise an error if nobody watches or the answer is to stop."""

@@ -74,7 +74,6 @@ class SheetMap:
     number: int
     """From 1."""
     columns: int
-    rows: int
     marks: tuple[Mark | None, ...]
     """None for a blank patch."""
 
@@ -320,7 +319,7 @@ class Progress:
             given_up=len(left_out),
             eta_s=self._eta_s(times_ns),
             ink_level=ink_level,
-            sheet=None if layout is None else SheetMap(sheet + 1, layout.columns, layout.rows, on_sheet),
+            sheet=None if layout is None else SheetMap(sheet + 1, layout.columns, on_sheet),
         )
 
     def _grid(

@@ -66,7 +66,7 @@ def sheet_of(used: int) -> SheetMap:
     marks: list[Mark | None] = [Mark.KEPT] * used
     marks[2], marks[5], marks[0] = Mark.BAD, Mark.VOID, Mark.CHECK
     marks[-1] = Mark.NOW
-    return SheetMap(1, 6, 7, (*marks, *([None] * (42 - used))))
+    return SheetMap(1, 6, (*marks, *([None] * (42 - used))))
 
 
 def blot(size: int = 128) -> np.ndarray[Any, np.dtype[np.bool_]]:
