@@ -64,20 +64,14 @@ class CameraTable(BaseModel, frozen=True, extra="forbid"):
 # ---------------------------------------------------------------- where frames come from
 
 PROPERTIES = {
-    "width": "CAP_PROP_FRAME_WIDTH",
-    "height": "CAP_PROP_FRAME_HEIGHT",
-    "exposure": "CAP_PROP_EXPOSURE",
-    "gain": "CAP_PROP_GAIN",
-    "white_balance_k": "CAP_PROP_WB_TEMPERATURE",
-    "focus": "CAP_PROP_FOCUS",
+    "width": ("CAP_PROP_FRAME_WIDTH", "", 0.0),
+    "height": ("CAP_PROP_FRAME_HEIGHT", "", 0.0),
+    "exposure": ("CAP_PROP_EXPOSURE", "CAP_PROP_AUTO_EXPOSURE", 1.0),  # V4L2's menu: 1 is manual, 3 aperture priority
+    "gain": ("CAP_PROP_GAIN", "", 0.0),
+    "white_balance_k": ("CAP_PROP_WB_TEMPERATURE", "CAP_PROP_AUTO_WB", 0.0),
+    "focus": ("CAP_PROP_FOCUS", "CAP_PROP_AUTOFOCUS", 0.0),
 }
-"""OpenCV's name of each setting in `Locked`."""
-AUTOMATIC = {
-    "exposure": ("CAP_PROP_AUTO_EXPOSURE", 1.0),  # V4L2's menu: 1 is manual, 3 aperture priority
-    "white_balance_k": ("CAP_PROP_AUTO_WB", 0.0),
-    "focus": ("CAP_PROP_AUTOFOCUS", 0.0),
-}
-"""What sets them by itself, and the value that switches it off."""
+"""OpenCV's name of each setting in `Locked`, what sets it by itself, and the value that switches that off."""
 SETTING_TOLERANCE = 0.01
 """Relative difference up to which a setting that is read back counts as applied."""
 MAX_JPEG_BYTES = 64 * 1024 * 1024
@@ -192,11 +186,11 @@ class Capture:
 
         wanted: dict[str, float] = locked.model_dump(exclude_none=True)
         for name, value in wanted.items():
-            if name in AUTOMATIC:
-                automatic, off = AUTOMATIC[name]
+            number, automatic, off = PROPERTIES[name]
+            if automatic:
                 self._capture.set(getattr(cv2, automatic), off)
-            self._capture.set(getattr(cv2, PROPERTIES[name]), value)
-        settings = {name: float(self._capture.get(getattr(cv2, PROPERTIES[name]))) for name in wanted}
+            self._capture.set(getattr(cv2, number), value)
+        settings = {name: float(self._capture.get(getattr(cv2, PROPERTIES[name][0]))) for name in wanted}
         for name, value in wanted.items():
             if abs(settings[name] - value) > SETTING_TOLERANCE * max(abs(value), 1.0):
                 raise DeviceError(
@@ -220,7 +214,7 @@ def found_settings(device: int, settle_s: float) -> dict[str, float]:
         until_s = time.monotonic() + settle_s
         while time.monotonic() < until_s and capture.read()[0]:
             pass
-        settings = {name: float(capture.get(getattr(cv2, number))) for name, number in PROPERTIES.items()}
+        settings = {name: float(capture.get(getattr(cv2, number))) for name, (number, *_) in PROPERTIES.items()}
     finally:
         capture.release()
     return {name: value for name, value in settings.items() if value > 0.0 or (name == "exposure" and value < -0.5)}

@@ -17,7 +17,7 @@ import pytest
 from numpy.typing import NDArray
 
 from brushloop.drivers import camera as camera_module
-from brushloop.drivers.camera import Backlog, CameraTable, FrameFault, Locked, OpenCvCamera, looked_at
+from brushloop.drivers.camera import Backlog, CameraTable, FrameFault, Locked, OpenCvCamera, found_settings, looked_at
 from brushloop.drivers.camera.source import Capture, JpegStream, is_repeated, open_source
 from brushloop.drivers.devices import Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout
@@ -394,6 +394,8 @@ async def test_settings_are_locked_read_back_and_reported(monkeypatch: pytest.Mo
     automatic_off = device.calls.index((cv2.CAP_PROP_AUTO_EXPOSURE, 1.0))
     assert automatic_off < device.calls.index((cv2.CAP_PROP_EXPOSURE, 150.0))
     await camera.close()
+    read_back = {"width": 640.0, "height": 480.0, "exposure": 150.0, "gain": 4.0, "focus": 30.0}
+    assert await asyncio.to_thread(found_settings, 0, 0.0) == read_back, "it has no white balance"
     with pytest.raises(DeviceError, match="exposure = 156 was asked for, but 160 is read back"):
         await camera_at("0", locked=Locked(exposure=156.0)).connect()
 
