@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import urlsplit
 
 from brushloop.collect.commission.visit import Notebook, Step, Taught, Visit, line_of
+from brushloop.collect.rig.check import tool_length
 from brushloop.collect.rig.doctor import Finding, Scrubber, numbers_only, transcript, write_archive
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, Controller, only_asking
 from brushloop.drivers.arcs.settings import read_back
@@ -28,8 +28,6 @@ NAMES = {
     "ink.device.port": "<port>",
 }
 """Values that identify the lab, and the placeholder for each."""
-LONGEST_TOOL_MM, SHORTEST_TOOL_MM = 600.0, 10.0
-"""Plausible distances from the flange to the tip of a brush."""
 FRAMINGS: tuple[Framing, ...] = ("sof", "bare")
 STILL_MM, STILL_DEG = 0.02, 0.01
 """An arm that is held still by hand moves by less than this between two readings."""
@@ -116,13 +114,13 @@ async def touch(visit: Visit, thing: str, how: str, *, may_skip: bool = False) -
     return True
 
 
-async def find_framing(host: str, port: int) -> tuple[Framing, str]:
-    """The framing that the controller answers, and who it is. Raises the first framing's `DeviceError`."""
+async def find_framing(host: str, port: int) -> Framing:
+    """The framing that the controller answers. Raises the first framing's `DeviceError`."""
     errors = list[DeviceError]()
     for framing in FRAMINGS:
         try:
-            async with only_asking(host, port, framing) as controller:
-                return framing, await _name(controller)
+            async with only_asking(host, port, framing):
+                return framing
         except (DeviceTimeout, ProtocolViolation) as error:
             errors.append(error)
     raise errors[0]
@@ -150,22 +148,19 @@ class ArmStep(Step):
         """Ask for the address and read everything else. Raises `DeviceError`."""
         host, port = address_of(await visit.value(ADDRESS, ASK_ADDRESS))
         visit.working(f"asking {host}:{port} who it is")
-        framing, name = await find_framing(host, port)
+        framing = await find_framing(host, port)
         async with only_asking(host, port, framing) as controller:
-            settings = await read_back(controller)
+            name, settings = await _name(controller), await read_back(controller)
             mode, safety = await controller.mode(), await controller.safety()
         visit.say(
             f"{host}:{port} answers in the {framing} framing: {name}",
             f"robot mode {mode}, safety {safety}",
             f"set on the pendant: {'; '.join(f'{setting} {value}' for setting, value in settings.words().items())}",
         )
-        tool_mm = math.hypot(*settings.tool.position_mm)
-        if tool_mm and not SHORTEST_TOOL_MM <= tool_mm <= LONGEST_TOOL_MM:
-            visit.say(
-                f"The pendant's tool is {tool_mm:.3g} mm long: perhaps metres were typed where millimetres are taken, "
-                "or millimetres where metres are. It is measured in the third step and replaced.",
-                tone="warning",
-            )
+        tool = tool_length(settings.tool.position_mm)
+        if any(settings.tool.position_mm) and tool.verdict == "contradicts":
+            why = f"The pendant's tool is {tool.value} long ({tool.allowed}). {tool.remedy}"
+            visit.say(why, "It is measured in the third step and replaced.", tone="warning")
         if safety not in MOVING_ALLOWED:
             visit.say(
                 f"The safety mode is {safety}: the arm cannot be guided by hand until it is released.",

@@ -47,7 +47,6 @@ MARGIN_MM = 25.0
 BELOW_MM = 2.0
 """Room below the deepest press and the dip, for a sheet that is found a little lower."""
 BOX = tuple(f"robot.limits.{axis}_mm" for axis in "xyz")
-AGREED = "aside.agreed_box"
 SPEEDS = {
     "robot.limits.tilt_deg": number_of("Widest lean of the brush", 1.0, 30.0, "deg", "15"),
     "robot.limits.speed_mm_s": number_of("Highest speed of the tip in any motion", 1.0, 500.0, "mm/s", "150"),
@@ -204,7 +203,7 @@ class LimitsStep(Step):
     name = "limits"
     title = "Limits"
     minutes = 3
-    observes = (AGREED, *SPEEDS)
+    observes = tuple(SPEEDS)
 
     async def carry_out(self, visit: Visit) -> None:
         """Have each limit and the box confirmed, and ask the controller whether the arm reaches every corner."""
@@ -220,13 +219,10 @@ class LimitsStep(Step):
             picture=await asyncio.to_thread(read_gray, picture),
         )
         text = "; ".join(f"{field} {value.value} mm: {value.how}" for field, value in box.items())
-        if visit.notebook.get(AGREED) != text:
-            if not await visit.yes(f"The box of the tip in the base frame. {text}. Agreed?"):
-                raise NotAccepted(
-                    "the box was not agreed.",
-                    "Teach the place again that makes the box too large: `brushloop rig teach`.",
-                )
-            visit.keep({AGREED: Taught(text, "agreed")})
+        if not await visit.yes(f"The box of the tip in the base frame. {text}. Agreed?"):
+            raise NotAccepted(
+                "the box was not agreed.", "Teach the place again that makes the box too large: `brushloop rig teach`."
+            )
         try:
             count = await ask_reach(visit.rig_path, rig, _to_reach(rig))
         except ConfigError as error:

@@ -157,6 +157,12 @@ def unmeasured(name: str, value: str, remedy: str) -> Check:
     return Check(name, "not measured", value, remedy=remedy)
 
 
+def tool_length(offset_mm: Sequence[float]) -> Check:
+    """Distance from the flange to the tip of the brush."""
+    tool_mm = math.hypot(*offset_mm)
+    return within("tool length", tool_mm, 40.0, 500.0, "mm", _metres(tool_mm) or "brushloop rig teach tip.")
+
+
 def brush_square(rotation_deg: tuple[float, float, float]) -> Check:
     """Angle between the flange's axis and the brush's: a holder is not far from square to the flange.
 
@@ -193,8 +199,7 @@ def check_rig(config: RigConfig) -> list[Check]:
 
 def _tool_and_sheet(config: RigConfig) -> Iterator[Check]:
     robot, brush, camera, board, force = config.robot, config.brush, config.camera, config.board, config.force
-    tool_mm = math.hypot(*robot.tcp_offset_mm)
-    yield within("tool length", tool_mm, 40.0, 500.0, "mm", _metres(tool_mm) or "brushloop rig teach tip.")
+    yield tool_length(robot.tcp_offset_mm)
     yield brush_square(robot.tcp_rotation_deg)
     yield brush_shorter_than_tool(robot.tcp_offset_mm, brush.length_mm)
     yield deepest_press(brush.max_depth_mm, brush.length_mm)

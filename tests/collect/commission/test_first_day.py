@@ -37,7 +37,7 @@ NAMED = {
 }
 """Traps that end a step: what is said. The others are said in passing, and the first day goes on."""
 IN_PASSING = {
-    Trap.TCP_IN_METRES: "metres were typed where millimetres are taken",
+    Trap.TCP_IN_METRES: "This looks like metres",
     Trap.FORCE_SIGN: "The sensor counts a push toward the flange as positive",
     Trap.SLOW_CAMERA: "The camera is slow",
 }
