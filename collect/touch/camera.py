@@ -18,45 +18,19 @@ from brushloop.calibrate.board.pix2len import local_scale, see_board
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.errors import StepError
 from brushloop.collect.motion import Dip, Move, Procedures, up, upright
-from brushloop.collect.photograph.frames import Gray, undistorted
+from brushloop.collect.photograph.frames import undistorted
 from brushloop.collect.rig.config import PaperConfig, RigConfig, TouchConfig
 from brushloop.collect.rig.paper import PaperPlane, fit_plane
 from brushloop.collect.touch.heights import KnownHeights, Reach, Touch, at_one_point
 from brushloop.drivers.devices import Frame
 from brushloop.sessions.events import TouchedPoint
 
-Floats = NDArray[np.float64]
 DARK_SHARE = 0.5
 """Pixels darker than this share of the paper are not paper, and are ignored in measuring the change of light."""
 DARKER = 0.2
 """Share of the paper's brightness that a pixel must have lost to belong to a mark."""
 JOIN_MM = 1.5
 """Parts that lie closer together belong to one mark."""
-
-
-def before_and_after(config: RigConfig, before: Frame, after: Frame) -> tuple[Gray, Gray, Floats]:
-    """Return both photographs, gray and undistorted, and the (3, 3) map from the second one to the paper frame.
-
-    Raises `StepError` if the board is not seen.
-    """
-    first, second = (undistorted(config.camera, frame.image) for frame in (before, after))
-    try:
-        return first, second, see_board(second, config.board).homography
-    except CalibrationError as error:
-        raise StepError(f"the board is not seen: {error.what}") from None
-
-
-def _darkening(first: NDArray[np.float32], second: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
-    """(gray levels by which each pixel became darker, level of the paper), corrected for the light.
-
-    Pictures that show no paper did not become darker.
-    """
-    paper = float(np.quantile(first, 0.9))
-    clean = first > DARK_SHARE * paper
-    if paper < 1.0 or not clean.any():
-        return np.zeros_like(first), 1.0
-    light = float(np.median(second[clean] / first[clean]))
-    return np.asarray(first - second / max(light, 1e-3), np.float32), paper
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,12 +42,26 @@ class Mark:
     ink_mm2: float
 
 
-def new_marks(before: Gray, after: Gray, image_to_paper: Floats, least_ink_mm2: float) -> list[Mark]:
-    """New marks of at least `least_ink_mm2`, the largest first. The camera must not have moved in between."""
+def new_marks(config: RigConfig, before: Frame, after: Frame, least_ink_mm2: float) -> list[Mark]:
+    """New marks of at least `least_ink_mm2`, the largest first. The camera must not have moved in between.
+
+    The change of the light is taken off; a picture that shows no paper shows no marks. Raises `StepError` if the board
+    is not seen.
+    """
     import skimage.measure  # slow to import
 
-    first, second = before.astype(np.float32), after.astype(np.float32)
-    darkening, paper = _darkening(first, second)
+    first, second = (undistorted(config.camera, frame.image) for frame in (before, after))
+    try:
+        image_to_paper = see_board(second, config.board).homography
+    except CalibrationError as error:
+        raise StepError(f"the board is not seen: {error.what}") from None
+    first, second = first.astype(np.float32), second.astype(np.float32)
+    paper = float(np.quantile(first, 0.9))
+    clean = first > DARK_SHARE * paper
+    if paper < 1.0 or not clean.any():
+        return []
+    light = float(np.median(second[clean] / first[clean]))
+    darkening = first - second / max(light, 1e-3)
     darker = np.asarray(darkening / np.maximum(first, DARK_SHARE * paper), np.float32)
     height, width = darker.shape
     middle = np.array([0.5 * width, 0.5 * height])
@@ -253,8 +241,7 @@ class FirstInkTouch:
     async def _inked(self, before: Frame, touched: list[Spot]) -> NDArray[np.bool_]:
         """(m,) whether new ink is seen at each spot."""
         after = await self._photograph()
-        frames = await asyncio.to_thread(before_and_after, self._rig.config, before, after)
-        marks = await asyncio.to_thread(new_marks, *frames, LEAST_INK_MM2)
+        marks = await asyncio.to_thread(new_marks, self._rig.config, before, after, LEAST_INK_MM2)
         off_mm = [[max(abs(mark.x_mm - x), abs(mark.y_mm - y)) for mark in marks] for x, y, _ in touched]
         return np.array([min(off, default=math.inf) <= OFF_MM for off in off_mm])
 

@@ -18,7 +18,7 @@ from brushloop.collect.motion import Dip, Procedures, mark_moves
 from brushloop.collect.rig.config import SelfCheckConfig
 from brushloop.collect.rig.devices import Rig
 from brushloop.collect.rig.paper import Patch, Sheet
-from brushloop.collect.touch.camera import before_and_after, new_marks
+from brushloop.collect.touch.camera import new_marks
 from brushloop.drivers.devices import Frame
 from brushloop.sessions.events import SelfCheckResult
 
@@ -107,11 +107,10 @@ async def self_check(procedures: Procedures, places_mm: Triangle, dip: Dip) -> S
 
 def _find(rig: Rig, before: Frame, after: Frame) -> Floats:
     try:
-        first, second, image_to_paper = before_and_after(rig.config, before, after)
+        marks = new_marks(rig.config, before, after, LEAST_MARK_MM2)
     except StepError as error:
         # A board in a mirrored picture is not seen either.
         raise StepError(f"self-check: {error}") from None
-    marks = new_marks(first, second, image_to_paper, LEAST_MARK_MM2)
     if marks and marks[0].ink_mm2 > MOST_MARK_MM2:
         large = marks[0]
         raise StepError(
