@@ -13,11 +13,12 @@ from pydantic import TypeAdapter
 from rich.console import Group
 from rich.table import Table
 
+from brushloop.calibrate.report import printable
 from brushloop.collect.motion import Move, Region, park_moves
 from brushloop.collect.motion import Path as MotionPath
 from brushloop.collect.protocols.config import ProtocolConfig
 from brushloop.collect.protocols.steps import Drawn, DrawStep, PressStep, TouchStep
-from brushloop.collect.rig.check import BLUE, GREY, ORANGE, Axes, finish, from_above, shown_name
+from brushloop.collect.rig.check import BLUE, GREY, ORANGE, Axes, finish, from_above
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import limits_of
 from brushloop.collect.rig.paper import PaperPlane, Sheet, to_base
@@ -248,7 +249,7 @@ def _sheet(
         points = max(4.0, min(0.34 * patch.size_y_mm, 0.17 * patch.size_x_mm) * 498.0 / config.paper.size_mm[0])
         if figure is not None:
             _figure(axes, patch.rect_mm, figure)
-            axes.text(patch.x_mm + 1.0, patch.y_mm + 1.0, f"#{order} {shown_name(press.stroke_id)}", fontsize=8)
+            axes.text(patch.x_mm + 1.0, patch.y_mm + 1.0, f"#{order} {printable(press.stroke_id)}", fontsize=8)
         else:
             axes.text(
                 patch.x_mm + 0.36 * patch.size_x_mm,

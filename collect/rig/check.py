@@ -18,6 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from brushloop.calibrate.board.spec import size_mm
+from brushloop.calibrate.report import picture_grid
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import limits_of
 from brushloop.collect.rig.paper import to_base, to_paper
@@ -79,15 +80,10 @@ def rig_table(config: RigConfig) -> Table:
 
 def draw_rig(config: RigConfig, path: Path) -> None:
     """Write the picture, in the format of the file's ending. Raises OSError if it cannot be written."""
-    from matplotlib.figure import Figure as Picture
-
-    picture: Any = Picture(figsize=(7.2, 6.4), layout="constrained")
-    above = picture.subplots()
+    picture, [[above]] = picture_grid(1, 1, (7.2, 6.4), f"{config.name}: base frame, mm")
     from_above(above, config)
-    handles, labels = above.get_legend_handles_labels()
-    picture.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
-    picture.suptitle(f"{shown_name(config.name)}: base frame, mm")
-    picture.savefig(path, dpi=110)
+    picture.legend(loc="outside lower center", ncols=4, frameon=False)
+    picture.savefig(path)
 
 
 def from_above(axes: Axes, config: RigConfig) -> None:
@@ -123,11 +119,6 @@ def finish(axes: Axes, title: str, along: tuple[str, str] = ("x mm", "y mm")) ->
     axes.set_xlabel(along[0], fontsize=8)
     axes.set_ylabel(along[1], fontsize=8)
     axes.tick_params(labelsize=8)
-
-
-def shown_name(name: str) -> str:
-    """A name that every font can show: characters beyond Latin as code points, and nothing that is read as TeX."""
-    return "".join(c if ord(c) < 0x250 else f"U+{ord(c):04X}" for c in name).replace("$", r"\$")
 
 
 # What can be true
