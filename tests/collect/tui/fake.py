@@ -14,6 +14,7 @@ from unittest.mock import patch
 
 import cv2
 import numpy as np
+import pytest
 from rich.cells import cell_len
 from rich.console import Console  # noqa: TID251
 from textual.app import App
@@ -26,7 +27,7 @@ from brushloop.collect.engine.capture import mark_of
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.snapshot import CellCount, LastCapture, Mark, Picture, SheetMap, Snapshot
-from brushloop.collect.errors import CollectAborted
+from brushloop.collect.errors import CollectAborted, ConfigError
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
 from brushloop.collect.photograph.checks import Verdict
 from brushloop.collect.tui.app import OperatorApp
@@ -220,10 +221,6 @@ class FakeEngine:
 LATE = "touched the paper 10.2 s after its dip, the others after 1.1 s"
 
 
-def engine_for(*_arguments: Any, **_options: Any) -> Any:
-    raise AssertionError("no engine is made")
-
-
 class FakeBrowser(SessionBrowser):
     """Two sessions, one cut in its middle."""
 
@@ -243,6 +240,12 @@ class FakeBrowser(SessionBrowser):
         details.void = ["press H15-a5-r01, attempt 1: the process ended during it"]
         details.next, details.sheets = "press H15-a5-r01", {1: [1, 2]}
         return details
+
+    def engine(self, session_id: str | None) -> Any:
+        self.asked.append(session_id)
+        if session_id is None:
+            raise ConfigError("rig.toml", "robot", "another brushloop is driving the arm")
+        return FakeEngine(picture())
 
     def planned(self) -> str:
         return "30 strokes on 1 sheet, about 21 min"
@@ -280,7 +283,7 @@ class FakeReview(Review):
 
 def app_of(engine: Any = None, browser: FakeBrowser | None = None) -> OperatorApp:
     """The app of one run, or of a day; neither resumes anything."""
-    return OperatorApp(engine_for, engine, browser=browser)
+    return OperatorApp(pytest.fail, engine, browser=browser)
 
 
 def a_review(folder: Path, app: OperatorApp) -> ReviewScreen:

@@ -18,7 +18,6 @@ from textual.widget import Widget
 from textual.widgets import Static
 
 from brushloop.collect.engine.control import State
-from brushloop.collect.errors import ConfigError
 from brushloop.collect.operator import Choice, Prompt
 from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.capture_screen import COLOURS, CaptureScreen, over_photograph
@@ -151,16 +150,6 @@ async def test_q_over_a_question_leaves_it_unanswered_and_parks() -> None:
             assert run.engine.calls == calls
 
 
-class Beginning(FakeBrowser):
-    """Notes which session is gone on with."""
-
-    def engine(self, session_id: str | None) -> Any:
-        self.asked.append(session_id)
-        if session_id is None:
-            raise ConfigError("rig.toml", "robot", "another brushloop is driving the arm")
-        return FakeEngine(picture())
-
-
 async def ready(app: OperatorApp, pilot: Pilot[None]) -> str:
     await pilot.pause()
     await app.workers.wait_for_complete()
@@ -169,8 +158,8 @@ async def ready(app: OperatorApp, pilot: Pilot[None]) -> str:
 
 
 async def test_enter_goes_on_with_an_open_session_and_n_asks_for_a_blank_sheet_first() -> None:
-    browser = Beginning()
-    app = OperatorApp(browser.engine, browser=browser)
+    browser = FakeBrowser()
+    app = app_of(browser=browser)
     async with app.run_test(size=(80, 24)) as pilot:
         text = await ready(app, pilot)
         for part in ("▶ 2026-11-21-grid-02 open", "13 of 30 planned", "13 capture", "the process", "H15-a5-r01"):
