@@ -102,8 +102,10 @@ def test_the_mcap_library_finds_by_our_index_what_was_written(written):
         reader = make_reader(file, validate_crcs=True)
         attached = [(attachment.name, attachment.data[:6]) for attachment in reader.iter_attachments()]
         things, bare = ([message for *_, message in reader.iter_messages([topic])] for topic in ("/things", "/bare"))
+        by_time = [message.log_time for *_, message in reader.iter_messages(starting_at=98, ending_before=101)]
     assert attached == [(HEADER_FILE, b'{"sche'), ("rig.toml", b"x = 1")]
     assert (things, bare) == (SMALL, LARGE[::-1])
+    assert by_time == [98, 98, 99, 99, 100, 100]
 
 
 def copied(path, *sources, channels=()):
