@@ -2,13 +2,18 @@
 
 import errno
 import hashlib
+import io
 import os
+import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
+import zstandard
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Channel, Message, Schema
+from mcap.records import Channel, Chunk, Message, MessageIndex, Schema
+from mcap.stream_reader import StreamReader
 
 from brushloop.sessions import mcap_writer
 from brushloop.sessions.errors import SessionDamaged, SessionError
@@ -106,6 +111,22 @@ def test_the_mcap_library_finds_by_our_index_what_was_written(written):
     assert attached == [(HEADER_FILE, b'{"sche'), ("rig.toml", b"x = 1")]
     assert (things, bare) == (SMALL, LARGE[::-1])
     assert by_time == [98, 98, 99, 99, 100, 100]
+
+
+def test_the_index_of_a_chunk_leads_a_viewer_to_each_message(written):
+    chunk, found = b"", 0
+    for record in StreamReader(io.BytesIO(written.read_bytes()), emit_chunks=True).records:
+        if isinstance(record, Chunk):
+            chunk = zstandard.decompress(record.data)
+        elif isinstance(record, MessageIndex):
+            for log_ns, offset in record.records:
+                assert struct.unpack_from("<BxxxxxxxxHxxxxQ", chunk, offset) == (
+                    Opcode.MESSAGE,
+                    record.channel_id,
+                    log_ns,
+                )
+                found += 1
+    assert found == len(SMALL) + len(LARGE)
 
 
 def copied(path, *sources, channels=()):
