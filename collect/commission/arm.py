@@ -128,7 +128,7 @@ async def find_framing(host: str, port: int) -> Framing:
 
 async def _name(controller: Controller) -> str:
     """Model, control box and software."""
-    call = controller.connection.call
+    call = controller.call
     software = f"interface {await call('SystemInfo.getInterfaceVersionCode')}"
     with contextlib.suppress(RpcError):
         software += f", {await call('SystemInfo.getControlSoftwareFullVersion')}"

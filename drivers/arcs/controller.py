@@ -104,22 +104,21 @@ NOT_RUNNING = -1
 """Return code of a motion in any robot mode but Running."""
 
 
-class Controller:
-    """One connection and the name of the robot behind it. Every method may raise what `RpcConnection.call` raises."""
+class Controller(RpcConnection):
+    """One connection, with typed calls. Every method may raise what `call` raises."""
 
-    def __init__(self, connection: RpcConnection) -> None:
-        self.connection = connection
-        self.robot = ""
-        self.on_pose: Callable[[Pose, float], None] | None = None
-        """Gets each pose that was asked for, and how long the answer took, in s."""
+    robot = ""
+    """Name of the robot behind it, the first of `robot_names`; to be set before anything else is asked."""
+    on_pose: Callable[[Pose, float], None] | None = None
+    """Gets each pose that was asked for, and how long the answer took, in s."""
 
     async def ask(self, method: str, **params: object) -> Any:
         """Call a method of the robot; the answer is unchecked."""
-        return await self.connection.call(f"{self.robot}.{method}", params)
+        return await self.call(f"{self.robot}.{method}", params)
 
     async def robot_names(self) -> list[str]:
         """Names of the robots, at least one. Raises `ProtocolViolation`."""
-        names = await self.connection.call("getRobotNames")
+        names = await self.call("getRobotNames")
         if not isinstance(names, list) or not names:
             raise ProtocolViolation(DEVICE, "getRobotNames", f"expected a list of names, got {names!r}")
         return [str(name) for name in names]  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]
@@ -217,9 +216,9 @@ class Controller:
         try:
             await self.ask("MotionControl.stopLine", acc=acc_m_s2, acc_rot=acc_m_s2)
         except DeviceError:
-            await self.connection.call("RuntimeMachine.abort")
+            await self.call("RuntimeMachine.abort")
             raise
-        await self.connection.call("RuntimeMachine.abort")
+        await self.call("RuntimeMachine.abort")
 
 
 def accepted(op: str, code: object) -> None:
@@ -307,10 +306,10 @@ async def only_asking(host: str, port: int, framing: Framing) -> AsyncGenerator[
 
     Raises `WrongGeneration` and other `DeviceError`s.
     """
-    controller = Controller(RpcConnection(host, port, framing=framing))
+    controller = Controller(host, port, framing=framing)
     try:
-        await open_arcs(controller.connection)
+        await open_arcs(controller)
         [controller.robot, *_] = await controller.robot_names()
         yield controller
     finally:
-        await controller.connection.close()
+        await controller.close()

@@ -252,8 +252,8 @@ class OwnPath:
         Any other error says nothing about the arm, which carries out all lines by itself.
         """
         self.require_followed()
-        if self._controller.connection.lost:
-            await self._controller.connection.open()
+        if self._controller.lost:
+            await self._controller.open()
         running, size = await self._controller.queue()
         steady, here = await self._controller.rest()
         self._require_ours(running, size)

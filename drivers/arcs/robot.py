@@ -16,7 +16,7 @@ from brushloop.drivers.arcs.motion import POLL_S, OwnPath, arrived, as_sent, dur
 from brushloop.drivers.arcs.settings import ArcsTable, Settings, make_ready, power_on, read_back, require_same
 from brushloop.drivers.arcs.stopping import Stopper
 from brushloop.drivers.arcs.telemetry import Telemetry
-from brushloop.drivers.arcs.wire import DEVICE, RpcConnection, open_arcs
+from brushloop.drivers.arcs.wire import DEVICE, open_arcs
 from brushloop.drivers.devices import Identity, Pose, PoseSample, QueuedLine
 from brushloop.drivers.errors import ArmMoved, DeviceError, MotionFailed, NotConnected, NotPowered
 from brushloop.drivers.geometry import distance
@@ -49,7 +49,7 @@ class AuboArcs:
         self._limits = limits
         self._notice = on_notice
         self._motion, self._state, self._stop = (
-            Controller(RpcConnection(table.host, table.port, framing=table.framing)) for _ in range(3)
+            Controller(table.host, table.port, framing=table.framing) for _ in range(3)
         )
         self._reopening = asyncio.Lock()
         self._stopper = Stopper([self._stop, self._state], self._motion, self._restore_stop)
@@ -72,10 +72,10 @@ class AuboArcs:
         After a failure nothing is left open, and nothing was set on an arm that was not identified.
         """
         try:
-            await open_arcs(self._state.connection)
-            version = await self._state.connection.call("SystemInfo.getInterfaceVersionCode")
+            await open_arcs(self._state)
+            version = await self._state.call("SystemInfo.getInterfaceVersionCode")
             for controller in (self._stop, self._motion):
-                await controller.connection.open()
+                await controller.open()
             [name, *_] = await self._state.robot_names()
             self._motion.robot = self._state.robot = self._stop.robot = name
             self._connected = True
@@ -299,7 +299,7 @@ class AuboArcs:
     async def _hang_up(self) -> None:
         await self._telemetry.stop()
         for controller in (self._motion, self._stop, self._state):
-            await controller.connection.close()
+            await controller.close()
         self._connected = self._enabled = False
         self._settings = None
 
@@ -313,5 +313,5 @@ class AuboArcs:
     async def _restore_stop(self) -> None:
         """Reopen the stop connection if it is lost: the controller may have dropped it while idle."""
         async with self._reopening:
-            if self._stop.connection.lost:
-                await self._stop.connection.open()
+            if self._stop.lost:
+                await self._stop.open()

@@ -12,7 +12,6 @@ from brushloop.collect.engine.control import State
 from brushloop.collect.errors import CollectAborted
 from brushloop.drivers.arcs.controller import Controller
 from brushloop.drivers.arcs.motion import until_settled
-from brushloop.drivers.arcs.wire import RpcConnection
 from brushloop.drivers.errors import MotionFailed, PathDisturbed, SettingsChanged
 from brushloop.drivers.geometry import brush_pose, from_wire, lean, to_wire
 from brushloop.sessions.events import PressResult
@@ -47,9 +46,9 @@ def second_client(lab: Lab, engine: Engine, target: Pose | None = None, **calls:
     """Sets what it is asked to set, then moves the arm, without any limits."""
 
     async def act() -> None:
-        client = Controller(RpcConnection(lab.rig.address, lab.rig.arcs.port))
+        client = Controller(lab.rig.address, lab.rig.arcs.port)
         client.robot = "rob1"
-        await client.connection.open()
+        await client.open()
         try:
             for method, params in calls.items():
                 assert await client.ask(method.replace("_", "."), **params) == 0
@@ -57,7 +56,7 @@ def second_client(lab: Lab, engine: Engine, target: Pose | None = None, **calls:
                 await client.move_line(target, 200.0, 800.0)
                 await until_settled(client.rest, target, planned_s=5.0)
         finally:
-            await client.connection.close()
+            await client.close()
 
     engine.meanwhile(act())
 

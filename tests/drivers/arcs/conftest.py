@@ -11,7 +11,6 @@ import pytest
 from brushloop.drivers.arcs.controller import Controller
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.arcs.settings import ArcsTable
-from brushloop.drivers.arcs.wire import RpcConnection
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.limits import Limits
@@ -121,8 +120,8 @@ async def arm(make_arm: MakeArm) -> AuboArcs:
 @pytest.fixture
 async def other(cabinet: Cabinet) -> AsyncIterator[Controller]:
     """A second client of the same cabinet."""
-    client = Controller(RpcConnection(HOST, cabinet.port))
+    client = Controller(HOST, cabinet.port)
     client.robot = "rob1"
-    await client.connection.open()
+    await client.open()
     yield client
-    await client.connection.close()
+    await client.close()

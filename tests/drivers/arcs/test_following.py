@@ -96,7 +96,7 @@ async def test_never_more_lines_are_queued_than_allowed(arm: AuboArcs, cabinet: 
 
 
 async def loses_its_connection(arm: AuboArcs, _: Cabinet) -> None:
-    cut(arm._motion.connection)
+    cut(arm._motion)
 
 
 async def is_held(_: AuboArcs, cabinet: Cabinet) -> None:

@@ -76,7 +76,7 @@ async def test_a_host_that_is_gone_once_the_path_was_let_go_is_not_needed(arm: A
     task = asyncio.create_task(arm.sequence(PRESS, acc_mm_s2=ACC))
     await below(cabinet, 250.0)
     for controller in (arm._motion, arm._stop, arm._state):
-        cut(controller.connection)
+        cut(controller)
     mute(cabinet)
     while cabinet.queued:
         await asyncio.sleep(0.01)
@@ -88,7 +88,7 @@ async def test_a_host_that_is_gone_once_the_path_was_let_go_is_not_needed(arm: A
 
 
 def cuts(arm: AuboArcs, _: Cabinet) -> None:
-    cut(arm._motion.connection)
+    cut(arm._motion)
 
 
 def stops(arm: AuboArcs, _: Cabinet) -> asyncio.Task[None]:

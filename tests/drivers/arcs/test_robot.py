@@ -165,7 +165,7 @@ def loses_what_is_sent_to_stop(arm: AuboArcs, _: Cabinet) -> None:
         await asyncio.sleep(1.0)
         raise DeviceTimeout("robot", "stopLine", "no reply in 1 s")
 
-    arm._stop.connection.call = silence  # type: ignore[method-assign]
+    arm._stop.call = silence  # type: ignore[method-assign]
 
 
 @pytest.mark.parametrize(
@@ -223,7 +223,7 @@ class SlowNetwork:
 async def test_a_line_that_is_still_on_its_way_is_stopped_too(
     arm: AuboArcs, cabinet: Cabinet, monkeypatch: pytest.MonkeyPatch, delay_s: float
 ):
-    connection, sent = arm._motion.connection, asyncio.Event()
+    connection, sent = arm._motion, asyncio.Event()
     send = connection.call
 
     async def delayed(method: str, params: Mapping[str, object] | None = None) -> object:

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 import brushloop.__main__
 from brushloop.drivers.arcs.controller import Controller
-from brushloop.drivers.arcs.wire import RpcConnection, open_arcs
+from brushloop.drivers.arcs.wire import open_arcs
 from brushloop.drivers.geometry import from_wire
 from brushloop.drivers.loopback import FaultRefused
 from brushloop.drivers.sim.config import CORNERS
@@ -60,8 +60,8 @@ async def test_the_hand_brings_the_true_tip_to_the_thing():
 
 async def test_what_a_client_reads_agrees_with_the_truth_and_the_labels_tell_nothing_of_it():
     async with UnknownLab(4, rate=FAST, picture_px=SMALL_PX) as lab:
-        controller = Controller(RpcConnection(lab.host, PORTS["arcs"], timeout_s=10.0))
-        await open_arcs(controller.connection)
+        controller = Controller(lab.host, PORTS["arcs"], timeout_s=10.0)
+        await open_arcs(controller)
         [controller.robot, *_] = await controller.robot_names()
         await lab.bring("pin", 2)
         joints = await controller.joint_positions()
@@ -78,7 +78,7 @@ async def test_what_a_client_reads_agrees_with_the_truth_and_the_labels_tell_not
         assert lab.host in words
         for hidden in (lab.facts.config.tool_mm, lab.facts.config.table.yaw_deg, lab.facts.pin_mm[0]):
             assert f"{hidden:.1f}" not in words
-        await controller.connection.close()
+        await controller.close()
 
 
 @pytest.mark.parametrize(
