@@ -53,8 +53,6 @@ GRIPS = (
 Each is its slant, the side toward which it slants and its turn in the picture, in degrees, and its place to the right
 and down, in shares of the picture's width and height.
 """
-MOST_ROUNDS = 3.0
-"""The sensor's rounds come faster with simulated time, up to this many times: what one process can send and read."""
 TOUCHED = ("pin", "board-corner", "sheet-corner", "well-rim", "wash-rim")
 THINGS = (*TOUCHED, "upright", "well", "wash-pot", "park", "clear-view", "hold-board", "push-sensor")
 """Those that the tip touches, and those to which it is brought by eye."""
@@ -81,10 +79,9 @@ class UnknownLab(LoopbackRig):
         clean = draw(seed, rate, picture_px)
         self.facts, self._mended = (clean, clean) if trap is None else trapped(clean, Trap(trap))
         """The lab as it is now, and once the mistake is corrected."""
-        config, [other_port] = self.facts.config, {*CAMERA_PORTS} - {self.facts.camera_port}
-        force_hz = config.force_hz * min(max(rate, 1.0), MOST_ROUNDS)
+        [other_port] = {*CAMERA_PORTS} - {self.facts.camera_port}
         super().__init__(
-            replace(config, force_hz=force_hz),
+            self.facts.config,
             # another address each time, so that no client of an earlier lab finds it
             f"127.{16 + seed % 200}.{os.getpid() % 250 + 1}.{secrets.randbelow(250) + 1}",
             {**PORTS, "camera": self.facts.camera_port, "room": other_port, "older": AUBOPE_PORT},

@@ -37,6 +37,8 @@ CLEAR_APART_MM = 160.0
 """Between two places out of the picture."""
 PRESS_SHARE = 0.45
 """Deepest press, as a share of the free length, that the maker of the brush allows."""
+MOST_ROUNDS = 3.0
+"""The sensor's rounds come faster with simulated time, up to this many times: what one process can send and read."""
 BASE_CLEAR_MM = 230.0
 """Least distance from the axis of the base that a straight way may have."""
 
@@ -179,7 +181,7 @@ def _guess(rng: np.random.Generator, seed: int, rate: float, picture_px: tuple[i
     if clear is None:
         return None
     return Facts(
-        config=replace(config, home_mm=park),
+        config=replace(config, home_mm=park, force_hz=config.force_hz * min(max(rate, 1.0), MOST_ROUNDS)),
         pin_mm=table.to_base(*pin, float(rng.uniform(20, 60))),
         wash_mm=wash,
         park_mm=park,
