@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from enum import StrEnum
 from typing import NamedTuple
@@ -147,11 +148,11 @@ def accept_question(result: StepResult, config: RigConfig) -> Prompt:
     """Ask whether the result is good enough. The default is to stop: nothing goes on without an answer."""
     match result:
         case BoardResult():
-            facts = _board(result, config)
+            facts = list(_board(result, config))
         case ZeroTouchResult():
-            facts = _touch(result, config)
+            facts = list(_touch(result, config))
         case SelfCheckResult():
-            facts = _self_check(result, config)
+            facts = list(_self_check(result, config))
         case _:
             facts = []
     good = all(fact.good is not False for fact in facts)
@@ -180,55 +181,47 @@ def _within(name: str, value: float, limit: float, shown: str) -> Fact:
     return Fact(name, f"{shown}  (at most {limit:g})", abs(value) <= limit)
 
 
-def _board(result: BoardResult, config: RigConfig) -> list[Fact]:
-    rms_px, delay_ms, jitter_ms = result.rms_px, result.camera_delay_ms, result.camera_jitter_ms
-    facts = [
-        Fact("corners seen", str(result.corners)),
-        Fact("scale (pix2len)", f"{result.mm_per_px:.4f} mm/px"),
-        _within("residual of corners", rms_px, WORST_RMS_PX, f"{rms_px:.2f} px"),
-    ]
+def _board(result: BoardResult, config: RigConfig) -> Iterator[Fact]:
+    delay_ms, jitter_ms = result.camera_delay_ms, result.camera_jitter_ms
+    yield Fact("corners seen", str(result.corners))
+    yield Fact("scale (pix2len)", f"{result.mm_per_px:.4f} mm/px")
+    yield _within("residual of corners", result.rms_px, WORST_RMS_PX, f"{result.rms_px:.2f} px")
     if delay_ms is not None and jitter_ms is not None:
-        facts.append(_within("delay of the camera", delay_ms, config.camera.max_delay_ms, f"{delay_ms:.0f} ms"))
-        facts.append(_within("variation of the delay", jitter_ms, config.camera.max_jitter_ms, f"{jitter_ms:.0f} ms"))
+        yield _within("delay of the camera", delay_ms, config.camera.max_delay_ms, f"{delay_ms:.0f} ms")
+        yield _within("variation of the delay", jitter_ms, config.camera.max_jitter_ms, f"{jitter_ms:.0f} ms")
     for check in result.checks:
         score = check.score or 0.0
         if check.name == "blurred":
-            facts.append(Fact("focus: blur", f"{score:.2f} mm  (at most {check.threshold:g})", check.passed))
+            yield Fact("focus: blur", f"{score:.2f} mm  (at most {check.threshold:g})", check.passed)
         elif check.name == "exposure":
-            facts.append(Fact("light: paper", f"level {score:.0f}", check.passed))
-    return facts
+            yield Fact("light: paper", f"level {score:.0f}", check.passed)
 
 
-def _touch(result: ZeroTouchResult, config: RigConfig) -> list[Fact]:
+def _touch(result: ZeroTouchResult, config: RigConfig) -> Iterator[Fact]:
     touch, method = config.touch, result.method
     taught = method == "taught"
-    facts = [Fact("method", "taught height, visited" if taught else method)]
+    yield Fact("method", "taught height, visited" if taught else method)
     for number, point in enumerate(result.points, 1):
         where = f"point {number} ({point.x_mm:.0f}, {point.y_mm:.0f})"
         if taught:
-            facts.append(Fact(where, f"rests at {point.z_mm:.2f} mm"))
+            yield Fact(where, f"rests at {point.z_mm:.2f} mm")
             continue
-        span_mm = point.span_mm
-        facts.append(Fact(where, f"{point.z_mm:.3f} mm"))
-        facts.append(_within("  its touches span", span_mm, touch.repeatability_mm, f"{span_mm:.3f} mm"))
+        yield Fact(where, f"{point.z_mm:.3f} mm")
+        yield _within("  its touches span", point.span_mm, touch.repeatability_mm, f"{point.span_mm:.3f} mm")
     if not taught:
-        moved_mm = result.moved_mm
-        facts.append(_within("from the height before", moved_mm, touch.moved_mm, f"{moved_mm:+.3f} mm"))
+        yield _within("from the height before", result.moved_mm, touch.moved_mm, f"{result.moved_mm:+.3f} mm")
     residuals = [abs(residual_mm) for residual_mm in result.residuals_mm]
     if len(residuals) > 3:
-        facts.append(_within("off the plane", max(residuals), touch.residual_mm, f"{max(residuals):.3f} mm"))
+        yield _within("off the plane", max(residuals), touch.residual_mm, f"{max(residuals):.3f} mm")
     plane = "level: fewer than three points" if len(residuals) < 3 else f"leans by {result.slope_deg:.2f}°"
-    facts.append(Fact("plane", plane))
-    return facts
+    yield Fact("plane", plane)
 
 
-def _self_check(result: SelfCheckResult, config: RigConfig) -> list[Fact]:
+def _self_check(result: SelfCheckResult, config: RigConfig) -> Iterator[Fact]:
     limits = config.self_check
     off_mm, turn_deg = math.hypot(*result.offset_mm), result.turn_deg
     scale_x, scale_y = (100.0 * (scale - 1.0) for scale in result.scale)
-    return [
-        _within("marks lie off by", off_mm, limits.offset_mm, f"{off_mm:.2f} mm"),
-        _within("turned by", turn_deg, limits.turn_deg, f"{turn_deg:+.2f}°"),
-        Fact("lengths off by", f"{scale_x:+.2f} % in x, {scale_y:+.2f} % in y"),
-        Fact("left over", f"{max(result.residuals_mm):.2f} mm"),
-    ]
+    yield _within("marks lie off by", off_mm, limits.offset_mm, f"{off_mm:.2f} mm")
+    yield _within("turned by", turn_deg, limits.turn_deg, f"{turn_deg:+.2f}°")
+    yield Fact("lengths off by", f"{scale_x:+.2f} % in x, {scale_y:+.2f} % in y")
+    yield Fact("left over", f"{max(result.residuals_mm):.2f} mm")
