@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, cast
@@ -22,6 +21,7 @@ from brushloop.calibrate.stroke import Prepared
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.outline import Outline
 from brushloop.model.presses import Grid
+from brushloop.model.raster import coverage
 from brushloop.model.similarity import csim_and_ssim, inked_window
 from brushloop.model.strokes import StrokeModel
 from brushloop.sessions.records import Header
@@ -156,28 +156,18 @@ def images_of(mark: Outline, origin_x_mm: float) -> Pixels:
     """
     left, top = ANCHOR_MM
     x_min_mm, x_max_mm = float(mark.x_min_mm[0]), float(mark.x_max_mm[0])
-    middle_mm, normal_mm = 0.5 * (x_min_mm + x_max_mm), (x_max_mm - x_min_mm) / NORMAL_LENGTH_PX
-    side_mm = SIZE_PX * normal_mm
-    views = ((MM_PER_PX, left + origin_x_mm, top), (normal_mm, 0.5 * side_mm - middle_mm, 0.5 * side_mm))
-    gray = dict(zip((Alignment.MM, Alignment.SIZE_NORMALISED), draw_loop(mark, views, SIZE_PX), strict=True))
+    normal_mm = (x_max_mm - x_min_mm) / NORMAL_LENGTH_PX
+    middle_mm, half_mm = 0.5 * (x_min_mm + x_max_mm), 0.5 * SIZE_PX * normal_mm
+    gray = {
+        Alignment.MM: coverage(mark, np.array([left + origin_x_mm, top]), px_mm=MM_PER_PX)[0],
+        Alignment.SIZE_NORMALISED: coverage(mark, np.array([half_mm - middle_mm, half_mm]), px_mm=normal_mm)[0],
+    }
     return np.stack([to_pixels(to_tone(gray[alignment], tone)) for alignment, tone in KEYS])
 
 
 def shown(images: Pixels) -> Image:
     """The rows to show of the gray image on the millimetre field, of (len(KEYS), 128, 128)."""
     return np.asarray(images[MM_GRAY][SHOWN_ROWS] / 255.0, np.float32)
-
-
-def draw_loop(loop: Outline, views: Sequence[tuple[float, float, float]], size_px: int) -> NDArray[np.float32]:
-    """Exact coverage of a mark in each view, (mm per pixel, x and y of its origin from the upper left corner, mm)."""
-    from brushloop.model.raster import kernel  # numba takes a fifth of a second to import
-
-    maps = np.array([[1 / px, 0.0, x / px, 0.0, -1 / px, y / px] for px, x, y in views])
-    points, weights = (np.stack([part[0]] * len(maps)) for part in (loop.points, loop.weights))
-    out = np.empty((len(maps), size_px, size_px), np.float32)
-    untyped: Any = kernel
-    untyped.rasterise(points, weights, maps, out)
-    return out
 
 
 def brush_of(header: Header) -> Brush:

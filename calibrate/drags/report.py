@@ -106,18 +106,15 @@ class DragValidation:
             "over_all": self.means(),
             "left_out": [{"stroke_id": name, "why": why} for name, why in self.drags.left_out],
             "strokes": [
-                {
-                    "stroke_id": stroke.stroke_id,
-                    "in_sample": stroke.fitted,
-                    "scores": {
-                        name: {"csim": round(csim, 6), "iou": round(iou, 6)}
-                        for name, (csim, iou) in stroke.scores.items()
-                    },
-                }
+                {"stroke_id": stroke.stroke_id, "in_sample": stroke.fitted, "scores": _rounded(stroke.scores)}
                 for stroke in self.strokes
             ],
         }
         return json.dumps(contents, indent=1, ensure_ascii=False) + "\n"
+
+
+def _rounded(scores: dict[str, tuple[float, float]]) -> dict[str, dict[str, float]]:
+    return {name: {"csim": round(csim, 6), "iou": round(iou, 6)} for name, (csim, iou) in scores.items()}
 
 
 def validate_drags(session: Path, fit: Path | None, progress: Progress = unseen) -> DragValidation:
