@@ -91,6 +91,7 @@ class JpegStream:
     def __init__(self, table: CameraTable) -> None:
         """Raises `OSError` where nothing answers, and ValueError for an answer of another kind."""
         self.settings: dict[str, float] = {}
+        self._timeout_s = table.timeout_s
         opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
         try:
             self._response = opener.open(table.source, timeout=table.timeout_s)
@@ -130,10 +131,15 @@ class JpegStream:
         length = int(http.client.parse_headers(self._response)["Content-Length"] or 0)
         if not 0 < length <= MAX_JPEG_BYTES:
             raise ValueError(f"a part of {length} bytes")
-        jpeg = self._response.read(length)
-        if len(jpeg) < length:
-            raise ConnectionError("the stream ended")
-        return jpeg
+        jpeg, until_s = bytearray(), time.monotonic() + self._timeout_s
+        while len(jpeg) < length:
+            piece = self._response.read1(length - len(jpeg))
+            if not piece:
+                raise ConnectionError("the stream ended")
+            if time.monotonic() > until_s:
+                raise TimeoutError("a picture takes longer than the timeout")
+            jpeg += piece
+        return bytes(jpeg)
 
 
 class Capture:

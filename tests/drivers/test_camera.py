@@ -286,16 +286,26 @@ def test_frames_that_waited_in_a_buffer_are_late(latency_ms: int, arrivals_ms: l
 
 
 @asynccontextmanager
-async def serving(answer: bytes) -> AsyncIterator[str]:
-    """The address of a server that gives every client the same answer."""
+async def serving(answer: bytes, trickle: bytes = b"") -> AsyncIterator[str]:
+    """The address of a server that gives every client the same answer, then a byte at a time."""
+
+    over = asyncio.Event()
 
     async def give(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await reader.readuntil(b"\r\n\r\n")
         writer.write(answer)
+        for byte in trickle:
+            await asyncio.sleep(0.01)
+            if reader.at_eof():
+                break
+            writer.write(bytes([byte]))
         writer.close()
+        over.set()
 
     async with await asyncio.start_server(give, HOST, 0) as server:
         yield f"http://{HOST}:{server.sockets[0].getsockname()[1]}/"
+        if trickle:
+            await over.wait()
 
 
 MULTIPART = b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=b\r\n\r\n"
@@ -318,17 +328,33 @@ async def test_pushed_jpegs_are_handed_over_as_they_came_until_the_stream_ends(a
         source.close()
 
 
+async def test_a_picture_that_trickles_in_is_given_up():
+    async with serving(MULTIPART + PART + PART[:-500], PART[-500:]) as address:
+        table = CameraTable(kind="opencv", source=address, timeout_s=0.1)
+        source = await asyncio.to_thread(open_source, table)
+        assert await asyncio.to_thread(source.read) == SOUND
+        assert await asyncio.to_thread(source.read) is None
+        source.close()
+
+
+async def test_a_stream_without_lengths_is_read_by_ffmpeg():
+    part = b"--b\r\nContent-Type: image/jpeg\r\n\r\n" + SOUND + b"\r\n"
+    async with serving(MULTIPART + 5 * part) as address:
+        camera = camera_at(address)
+        assert "640x480" in (await camera.connect()).model
+        await camera.close()
+
+
 @pytest.mark.parametrize(
     ("answer", "login"),
     [
-        (MULTIPART + b"--b\r\nContent-Type: image/jpeg\r\n\r\n" + SOUND, ""),
         (MULTIPART + b"boundary\r\n" * 200_000, ""),
         (b"HTTP/1.0 200 OK\r\nContent-Type: video/mp4\r\n\r\n", ""),
         (MULTIPART + PART, "user:secret@"),
     ],
-    ids=["no lengths", "no part begins", "no multipart", "a password"],
+    ids=["no part begins", "no multipart", "a password"],
 )
-async def test_ffmpeg_reads_every_other_stream(answer: bytes, login: str, monkeypatch: pytest.MonkeyPatch):
+async def test_other_streams_are_left_to_ffmpeg(answer: bytes, login: str, monkeypatch: pytest.MonkeyPatch):
     opened: list[str] = []
     monkeypatch.setattr(Capture, "__init__", lambda _self, table: opened.append(table.source))
     async with serving(answer) as address:
