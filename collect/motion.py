@@ -110,19 +110,18 @@ def inking_moves(config: RigConfig, dips: int) -> list[Move]:
 
 def dip_moves(config: RigConfig) -> list[Move]:
     """Over the well, down into the ink, up slowly; with a wipe, across the rim on the way up."""
-    motion, wipe, well = config.motion, config.ink.wipe, config.ink.well_mm
-    moves = [over(config, *well), Move(upright(config, *well, config.ink.dip_z_mm), motion.press_speed_mm_s)]
+    safe_z_mm, wipe, well = config.motion.safe_z_mm, config.ink.wipe, config.ink.well_mm
+    moves = [over(config, *well), slowly(config, *well, config.ink.dip_z_mm)]
     if wipe is None:
-        return [*moves, up(config, *well)]
-    across = [Move(upright(config, *place, wipe.z_mm), motion.press_speed_mm_s) for place in (well, wipe.rim_mm)]
-    return [*moves, *across, up(config, *wipe.rim_mm)]
+        return [*moves, slowly(config, *well, safe_z_mm)]
+    across = [slowly(config, *place, wipe.z_mm) for place in (well, wipe.rim_mm)]
+    return [*moves, *across, slowly(config, *wipe.rim_mm, safe_z_mm)]
 
 
 def wash_moves(config: RigConfig, wash: WashConfig) -> list[Move]:
     """Over the pot, down and up `wash.strokes` times, and out."""
-    speed_mm_s = config.motion.press_speed_mm_s
-    bottom = Move(upright(config, *wash.pot_mm, wash.dip_z_mm), speed_mm_s)
-    half = Move(upright(config, *wash.pot_mm, 0.5 * (wash.dip_z_mm + config.motion.safe_z_mm)), speed_mm_s)
+    bottom = slowly(config, *wash.pot_mm, wash.dip_z_mm)
+    half = slowly(config, *wash.pot_mm, 0.5 * (wash.dip_z_mm + config.motion.safe_z_mm))
     above = over(config, *wash.pot_mm)
     return [above, *[bottom, half] * wash.strokes, above]
 
@@ -201,14 +200,9 @@ def over(config: RigConfig, x_mm: float, y_mm: float) -> Move:
     return Move(upright(config, x_mm, y_mm, config.motion.safe_z_mm), config.motion.travel_speed_mm_s)
 
 
-def near(config: RigConfig, x_mm: float, y_mm: float, z_mm: float) -> Move:
-    """From travel height down to where a slow approach begins."""
+def slowly(config: RigConfig, x_mm: float, y_mm: float, z_mm: float) -> Move:
+    """To a height over a point of the paper frame, at most travel height, at the speed of a press."""
     return Move(upright(config, x_mm, y_mm, z_mm), config.motion.press_speed_mm_s)
-
-
-def up(config: RigConfig, x_mm: float, y_mm: float) -> Move:
-    """Slowly up to travel height over a point."""
-    return Move(upright(config, x_mm, y_mm, config.motion.safe_z_mm), config.motion.press_speed_mm_s)
 
 
 def visit_moves(config: RigConfig, plane: PaperPlane, x_mm: float, y_mm: float) -> list[Move]:
@@ -226,9 +220,9 @@ def visit_moves(config: RigConfig, plane: PaperPlane, x_mm: float, y_mm: float) 
 def mark_moves(config: RigConfig, plane: PaperPlane, x_mm: float, y_mm: float) -> list[Move]:
     """One mark of the self-check: over the place, down near the paper, slowly to its depth, and up."""
     surface_z_mm = plane.touch_z_mm(x_mm, y_mm)
-    down = near(config, x_mm, y_mm, surface_z_mm + CHECK_APPROACH_MM)
+    down = slowly(config, x_mm, y_mm, surface_z_mm + CHECK_APPROACH_MM)
     mark = Move(upright(config, x_mm, y_mm, surface_z_mm - config.self_check.depth_mm), CHECK_SPEED_MM_S)
-    return [over(config, x_mm, y_mm), down, mark, up(config, x_mm, y_mm)]
+    return [over(config, x_mm, y_mm), down, mark, slowly(config, x_mm, y_mm, config.motion.safe_z_mm)]
 
 
 # Poses
@@ -311,7 +305,7 @@ class Procedures:
 
     async def approach(self, x_mm: float, y_mm: float, z_mm: float) -> None:
         """Go over a point of the sheet, then down to where a slow approach begins."""
-        await self.go(over(self._config, x_mm, y_mm), near(self._config, x_mm, y_mm, z_mm))
+        await self.go(over(self._config, x_mm, y_mm), slowly(self._config, x_mm, y_mm, z_mm))
 
     async def lower(self, x_mm: float, y_mm: float, z_mm: float, speed_mm_s: float) -> float:
         """Go to a height over a point of the sheet; returns the height at which the arm rests, in mm."""

@@ -137,17 +137,19 @@ class Asker:
 
 
 class OperatorRequest(StrEnum):
-    """Request that an operator can make by key; the same key again withdraws it."""
+    """Request that an operator can make by key; the same key again withdraws it. The value names the key."""
 
-    RETAKE = "press this stroke again"
-    SKIP = "leave this stroke out"
-    NEW_SHEET = "put a new sheet in"
-    JOG = "find the paper again by jog"
+    RETAKE = "retake"
+    """Press this stroke again."""
+    SKIP = "skip"
+    """Leave this stroke out."""
+    NEW_SHEET = "new sheet"
+    JOG = "jog"
+    """Find the paper again by jog."""
 
-    @property
-    def short(self) -> str:
-        """The name of its key."""
-        return self.name.lower().replace("_", " ")
+
+EXCLUSIVE = {OperatorRequest.RETAKE, OperatorRequest.SKIP}
+"""Of these, only the last that was made counts."""
 
 
 class OperatorRequests:
@@ -155,32 +157,23 @@ class OperatorRequests:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._open: set[OperatorRequest] = set()
-
-    @property
-    def open(self) -> tuple[OperatorRequest, ...]:
+        self.open: tuple[OperatorRequest, ...] = ()
         """Requests that are still pending."""
-        with self._lock:
-            return tuple(request for request in OperatorRequest if request in self._open)
 
-    def toggle(self, request: OperatorRequest) -> bool:
-        """Make or withdraw a request; True if it is now pending. Retake and skip exclude each other."""
+    def toggle(self, request: OperatorRequest) -> None:
+        """Make or withdraw a request."""
         with self._lock:
-            if request in self._open:
-                self._open.remove(request)
-                return False
-            if request in (OperatorRequest.RETAKE, OperatorRequest.SKIP):
-                self._open -= {OperatorRequest.RETAKE, OperatorRequest.SKIP}
-            self._open.add(request)
-            return True
+            kept = set(self.open) - (EXCLUSIVE if request in EXCLUSIVE else {request})
+            if request not in self.open:
+                kept.add(request)
+            self.open = tuple(each for each in OperatorRequest if each in kept)
 
     def take(self, request: OperatorRequest) -> bool:
         """Remove a request that is about to be carried out; False if it was not made."""
         with self._lock:
-            if request not in self._open:
-                return False
-            self._open.remove(request)
-            return True
+            made = request in self.open
+            self.open = tuple(each for each in self.open if each is not request)
+            return made
 
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

@@ -17,7 +17,7 @@ from brushloop.calibrate.board.lens import apply
 from brushloop.calibrate.board.pix2len import local_scale, see_board
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.errors import StepError
-from brushloop.collect.motion import Dip, Move, Procedures, up, upright
+from brushloop.collect.motion import Dip, Move, Procedures, slowly, upright
 from brushloop.collect.photograph.frames import undistorted
 from brushloop.collect.rig.config import PaperConfig, RigConfig, TouchConfig
 from brushloop.collect.rig.paper import PaperPlane, fit_plane
@@ -229,7 +229,8 @@ class FirstInkTouch:
         x, y, z = spot
         await self._procedures.approach(x, y, z + self._config.above_mm)
         down = Move(upright(self._rig.config, x, y, z), self._config.speed_mm_s)
-        await self._procedures.queue([down, up(self._rig.config, x, y)])
+        up = slowly(self._rig.config, x, y, self._rig.config.motion.safe_z_mm)
+        await self._procedures.queue([down, up])
         self._since_dip += 1
         self._last = None
 

@@ -423,6 +423,6 @@ def _note_content(now: Snapshot) -> Content:
     if now.state is State.STOPPING:
         return Content.styled(" not seen at rest yet: press the red button if it moves ", "bold reverse")
     if now.requests:
-        asked = ", ".join(request.short for request in now.requests)
+        asked = ", ".join(now.requests)
         return Content.assemble((f" asked: {asked} ", "bold reverse"), f" {SHORT_STOP}")
     return Content(SOFTWARE_STOP)

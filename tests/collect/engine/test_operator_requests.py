@@ -25,12 +25,12 @@ def lab(lab: Lab) -> Lab:
 
 def test_a_request_made_twice_is_withdrawn_and_retake_and_skip_exclude_each_other() -> None:
     requests = OperatorRequests()
-    assert requests.toggle(OperatorRequest.RETAKE)
-    assert requests.toggle(OperatorRequest.SKIP)
+    requests.toggle(OperatorRequest.RETAKE)
+    requests.toggle(OperatorRequest.SKIP)
     assert requests.open == (OperatorRequest.SKIP,)
-    assert not requests.toggle(OperatorRequest.SKIP)
+    requests.toggle(OperatorRequest.SKIP)
     assert not requests.take(OperatorRequest.SKIP)
-    assert requests.toggle(OperatorRequest.JOG)
+    requests.toggle(OperatorRequest.JOG)
     assert requests.take(OperatorRequest.JOG)
     assert requests.open == ()
 

@@ -75,7 +75,7 @@ async def test_requests_are_passed_on_and_shown_until_they_are_carried_out() -> 
             await run.press(key)
             assert run.engine.calls == [f"request {request}"]
             text = await run.look()
-            assert f"asked: {run.engine.now.requests[0].short}" in text
+            assert f"asked: {run.engine.now.requests[0]}" in text
             assert "red button: emergency stop" in text
 
 
