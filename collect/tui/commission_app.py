@@ -90,12 +90,9 @@ class Steps:
         return self._outcome.result()
 
     def _run(self) -> Path | None:
-        async def steps() -> Path | None:
-            return await self._task
-
         try:
-            with self._runner as runner:
-                return runner.run(steps())
+            with self._runner:
+                return self._loop.run_until_complete(self._task)
         except asyncio.CancelledError as stopped:
             # The notes say whether the arm was seen at rest.
             notes = getattr(stopped, "__notes__", [])
