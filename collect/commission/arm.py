@@ -159,7 +159,7 @@ class ArmStep(Step):
         )
         tool = tool_length(settings.tool.position_mm)
         if any(settings.tool.position_mm) and tool.verdict == "contradicts":
-            why = f"The pendant's tool is {tool.value} long ({tool.allowed}). {tool.remedy}"
+            why = f"The pendant's tool is {tool.value} long; {tool.allowed} are plausible. {tool.remedy}"
             visit.say(why, "It is measured in the third step and replaced.", tone="warning")
         if safety not in MOVING_ALLOWED:
             visit.say(
