@@ -1,11 +1,11 @@
-"""What the devices of a rig take and give, and what an ink device must be able to do.
+"""What each kind of device must be able to do, and what the devices of a rig take and give.
 
-A sample is frozen and has the time at which it was taken and its place in the sequence. There is one driver for the
-arm, one for cameras and one for the force sensor; ink devices come in several kinds.
+A sample is frozen and has the time at which it was taken and its place in the sequence.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
@@ -99,6 +99,90 @@ class Identity:
     """True if the device itself says that it is the loopback rig, or shows a recording; never from configuration."""
 
 
+class Device(Protocol):
+    """What every device of a rig can do."""
+
+    async def connect(self) -> Identity:
+        """Open the connections and learn who answers; moves and powers nothing. Raises `DeviceError`."""
+        ...
+
+    async def close(self) -> None:
+        """Stop what is under way, and close the connections."""
+        ...
+
+
+class Robot(Device, Protocol):
+    """An arm with a brush. All poses are of the brush tip, in the base frame; `AuboArcs` says what each call raises."""
+
+    async def enable(self) -> None:
+        """Power the arm and release its brakes; moves nothing."""
+        ...
+
+    async def move(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
+        """Move the tip in a straight line that is checked as a whole; returns when the arm has settled."""
+        ...
+
+    async def follow(self, poses: Sequence[Pose], *, speed_mm_s: float, acc_mm_s2: float, blend_mm: float) -> None:
+        """Move the tip through all poses without halting between them, corners rounded within `blend_mm`."""
+        ...
+
+    async def sequence(self, lines: Sequence[QueuedLine], *, acc_mm_s2: float) -> list[Pose]:
+        """Have the controller carry out all lines, even if this program dies meanwhile; returns the poses seen."""
+        ...
+
+    async def stop(self) -> None:
+        """Stop now. Idempotent, from any state, never queued behind a slow call. Not an emergency stop."""
+        ...
+
+    def latest(self) -> PoseSample:
+        """The newest pose; never blocks. Raises `Stale` when it is too old to act on."""
+        ...
+
+    async def where(self) -> Pose:
+        """Ask the controller for the pose."""
+        ...
+
+    def pose_lag_ms(self) -> float | None:
+        """How late poses arrived during the last motions; None if that is not known."""
+        ...
+
+    async def confirm(self) -> None:
+        """Raise a `MotionError` if the arm is not as it was left; sets nothing."""
+        ...
+
+    async def take_up(self) -> Pose:
+        """Accept the place where the arm rests as the start of the next move."""
+        ...
+
+    def listen(self, on_sample: Callable[[PoseSample], None] | None) -> None:
+        """Hand every pose sample to `on_sample`, in the event loop; None ends it."""
+        ...
+
+
+class Camera(Device, Protocol):
+    """A camera that looks at the sheet."""
+
+    async def fresh(self, after: Stamp) -> Frame:
+        """The first frame exposed after `after`, never an older buffered one. Raises `DeviceTimeout`."""
+        ...
+
+
+class ForceSensor(Device, Protocol):
+    """A force sensor between flange and brush; optional in a rig."""
+
+    def latest(self) -> ForceSample:
+        """The newest sample; never blocks. Raises `Stale`."""
+        ...
+
+    def listen(self, on_sample: Callable[[ForceSample], None] | None) -> None:
+        """Hand every sample to `on_sample`, in the event loop; None ends it."""
+        ...
+
+    async def bias(self, seconds: float) -> None:
+        """Average for `seconds` with nothing touching, and subtract that from now on."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class Well:
     """The well before a dip."""
@@ -110,12 +194,8 @@ class Well:
 
 
 @runtime_checkable
-class Ink(Protocol):
-    """A device that keeps the well filled as its table of `rig.toml` says; optional in a rig."""
-
-    async def connect(self) -> Identity:
-        """Open the line and make sure that the right device answers; gives no ink."""
-        ...
+class Ink(Device, Protocol):
+    """A device that keeps the well filled as its table in `rig.toml` says. Connecting gives no ink."""
 
     async def dose(self, volume_ml: float) -> None:
         """Add ink to the well. Raises `LimitExceeded` before anything is sent."""
@@ -134,8 +214,4 @@ class Ink(Protocol):
 
     async def level(self) -> float | None:
         """Fill level of the well, 0 to 1; None where the device has no gauge."""
-        ...
-
-    async def close(self) -> None:
-        """Leave the device at rest and release the line."""
         ...

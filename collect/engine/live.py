@@ -18,8 +18,7 @@ from brushloop.collect.engine.snapshot import Picture
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.photograph.frames import gray
 from brushloop.collect.photograph.measure import blur_px, busiest_tile
-from brushloop.drivers.camera import OpenCvCamera
-from brushloop.drivers.devices import ForceSample, Frame, Stamp
+from brushloop.drivers.devices import Camera, ForceSample, Frame, Stamp
 from brushloop.drivers.errors import DeviceError
 from brushloop.sessions.mcap_writer import Outgoing, channel_of, encoded
 from brushloop.sessions.messages import image_message
@@ -37,7 +36,7 @@ WIDTH_PX = 320
 
 
 @contextlib.asynccontextmanager
-async def each_frame(camera: OpenCvCamera, shows: Sequence[Callable[[Frame], None]]) -> AsyncGenerator[None]:
+async def each_frame(camera: Camera, shows: Sequence[Callable[[Frame], None]]) -> AsyncGenerator[None]:
     """Within the block pass the newest frame to each of `shows`, in a thread, every `FRAME_PERIOD_S`.
 
     Never slows the run. Without `shows`, the camera is not asked for frames.

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from brushloop.collect.errors import StepError
 from brushloop.collect.rig.config import CameraConfig
-from brushloop.drivers.camera import OpenCvCamera
-from brushloop.drivers.devices import Frame, Stamp
+from brushloop.drivers.devices import Camera, Frame, Stamp
 
 Gray = NDArray[np.uint8]
 Thumbnail = NDArray[np.float32]
@@ -115,7 +114,7 @@ class Frames:
         self._waiting = wanted, loop.time() + within_s, (answer := loop.create_future())
         return await answer
 
-    async def follow(self, camera: OpenCvCamera) -> None:
+    async def follow(self, camera: Camera) -> None:
         """Take frame after frame, until cancelled or the camera fails."""
         after = Stamp(0)
         try:
@@ -147,7 +146,7 @@ class Frames:
 
 
 @contextlib.asynccontextmanager
-async def watching(camera: OpenCvCamera, reference: Thumbnail | None) -> AsyncGenerator[Frames]:
+async def watching(camera: Camera, reference: Thumbnail | None) -> AsyncGenerator[Frames]:
     """Within the block, follow the frames; `reference` is the view without the arm."""
     frames = Frames(reference)
     task = asyncio.create_task(frames.follow(camera), name="camera frames")

@@ -12,12 +12,10 @@ from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.config import RigConfig
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.camera import OpenCvCamera
-from brushloop.drivers.devices import Identity, Ink
+from brushloop.drivers.devices import Camera, Device, ForceSensor, Identity, Ink, Robot
 from brushloop.drivers.force.sri_m8123 import SriM8123
 from brushloop.drivers.host import Claimed, Clock, claimed
 from brushloop.drivers.limits import Limits
-
-Device = AuboArcs | OpenCvCamera | SriM8123 | Ink
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,11 +24,11 @@ class Rig:
 
     config: RigConfig
     clock: Clock
-    robot: AuboArcs
-    camera: OpenCvCamera
+    robot: Robot
+    camera: Camera
     robot_identity: Identity
     camera_identity: Identity
-    force: SriM8123 | None = None
+    force: ForceSensor | None = None
     ink: Ink | None = None
     force_identity: Identity | None = None
     ink_identity: Identity | None = None

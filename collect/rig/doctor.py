@@ -29,12 +29,12 @@ from rich.text import Text
 from brushloop.calibrate.board.pix2len import see_board
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.rig.config import PREFIX, RigConfig
-from brushloop.collect.rig.devices import Device, make_robot
+from brushloop.collect.rig.devices import make_robot
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, RobotMode, survey
 from brushloop.drivers.arcs.telemetry import rtde_answers
 from brushloop.drivers.arcs.wire import Framing
 from brushloop.drivers.camera import OpenCvCamera
-from brushloop.drivers.devices import Stamp
+from brushloop.drivers.devices import Device, Stamp
 from brushloop.drivers.errors import DeviceError
 from brushloop.drivers.force.sri_m8123 import ForceTable, SriM8123
 from brushloop.drivers.host import Clock
