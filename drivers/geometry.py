@@ -143,9 +143,7 @@ def to_wire(pose: Pose) -> list[float]:
 
 
 def from_wire(values: list[float]) -> Pose:
-    """The inverse of `to_wire`. Raises ValueError unless given six finite numbers."""
-    if len(values) != 6 or not all(math.isfinite(v) for v in values):
-        raise ValueError(f"a pose is six finite numbers, got {values!r}")
+    """The inverse of `to_wire`, of six numbers that `arcs.wire.numbers` has checked, or a configuration."""
     x, y, z, rx, ry, rz = values
     return Pose(x * 1e3, y * 1e3, z * 1e3, *of_angles(rx, ry, rz))
 
