@@ -7,7 +7,6 @@ DeviceError
  |    +-- Stale             the newest sample is too old to act on
  +-- Stuck                  samples come, and all are the same
  +-- ProtocolViolation      bytes outside the wire format
- +-- WrongGeneration        the cabinet runs software that this driver does not speak
  +-- RpcError               the controller answered with an error object
  +-- LimitExceeded          refused before anything moved
  +-- MotionError
@@ -85,12 +84,6 @@ class ProtocolViolation(DeviceError, ValueError):
     """The peer sent bytes that the wire format does not allow."""
 
 
-class WrongGeneration(DeviceError):
-    """The cabinet answers, but runs the older AUBOPE software."""
-
-    remedy = "It needs the ARCS software; ask the maker for the upgrade."
-
-
 class RpcError(DeviceError):
     """The controller answered with a JSON-RPC error object."""
 
@@ -135,9 +128,6 @@ class MotionFailed(MotionError):
 
 class RobotNotSafe(MotionError):
     """The safety mode forbids motion; the message has the controller's name for it."""
-
-    def __init__(self, device: str, op: str, mode: str, condition: str, remedy: str) -> None:
-        super().__init__(device, op, f"safety mode is {mode}", condition=condition, remedy=remedy)
 
 
 class NotPowered(MotionError):

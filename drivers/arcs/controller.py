@@ -136,16 +136,6 @@ class Controller(RpcConnection):
         """Six joints in rad. Raises `ProtocolViolation`."""
         return numbers("getJointPositions", await self.ask("RobotState.getJointPositions"))
 
-    async def payload(self) -> tuple[float, list[float]]:
-        """(mass in kg, its centre in mm). Raises `ProtocolViolation`."""
-        answer = await self.ask("RobotConfig.getPayload")
-        try:
-            mass_kg, cog_m, *_ = answer
-            mass_kg, *centre_m = numbers("getPayload", [mass_kg, *cog_m], 4)
-        except (TypeError, ValueError):
-            raise ProtocolViolation(DEVICE, "getPayload", f"expected mass and centre, got {answer!r}") from None
-        return mass_kg, [1e3 * v for v in centre_m]
-
     async def mode(self) -> str:
         """The robot mode."""
         return str(await self.ask("RobotState.getRobotModeType"))
@@ -158,7 +148,8 @@ class Controller(RpcConnection):
         """Raise `RobotNotSafe`, with condition and remedy, unless the mode allows motion."""
         mode = await self.safety()
         if mode not in MOVING_ALLOWED:
-            raise RobotNotSafe(DEVICE, op, mode, *CONDITION_AND_REMEDY.get(mode, UNKNOWN_CONDITION))
+            condition, remedy = CONDITION_AND_REMEDY.get(mode, UNKNOWN_CONDITION)
+            raise RobotNotSafe(DEVICE, op, f"safety mode is {mode}", condition=condition, remedy=remedy)
 
     async def move_line(
         self, target: Pose, speed_mm_s: float, acc_mm_s2: float, blend_mm: float = 0.0, least_s: float = 0.0
@@ -304,7 +295,7 @@ async def survey(host: str, port: int, framing: Framing) -> list[dict[str, Any]]
 async def only_asking(host: str, port: int, framing: Framing) -> AsyncGenerator[Controller]:
     """Connect to a controller, yield it, and disconnect; for asking, as nothing is set, powered or moved.
 
-    Raises `WrongGeneration` and other `DeviceError`s.
+    Raises `DeviceError`.
     """
     controller = Controller(host, port, framing=framing)
     try:

@@ -87,18 +87,6 @@ async def until_settled(
         await asyncio.sleep(POLL_S)
 
 
-def planned_s(start: Pose, line: QueuedLine, acc_mm_s2: float) -> float:
-    """Upper estimate of a line's duration: at its speed plus one ramp, or the turn at half a radian per second.
-
-    If the tip moves less than a millimetre, ARCS reads m/s as rad/s.
-    """
-    translation_mm, rotation_deg = distance(start, line.target)
-    speed_mm_s = line.speed_mm_s
-    ramp_s = speed_mm_s / acc_mm_s2
-    turn_s = math.radians(rotation_deg) / (speed_mm_s / 1e3) if translation_mm < 1.0 else rotation_deg / 30.0
-    return max(max(translation_mm / speed_mm_s, turn_s) + ramp_s, line.least_s)
-
-
 def _not_arrived(what: str) -> MotionFailed:
     return MotionFailed(
         DEVICE,
@@ -137,9 +125,18 @@ def as_sent(
 
 
 def durations_s(start: Pose, lines: Sequence[QueuedLine], acc_mm_s2: float) -> list[float]:
-    """An upper estimate for each of the lines."""
-    corners = [start, *(line.target for line in lines)]
-    return [planned_s(before, line, acc_mm_s2) for before, line in zip(corners, lines, strict=False)]
+    """Upper estimate for each of the lines: at its speed plus one ramp, or the turn at half a radian per second.
+
+    If the tip moves less than a millimetre, ARCS reads m/s as rad/s.
+    """
+    estimates_s: list[float] = []
+    for line in lines:
+        translation_mm, rotation_deg = distance(start, line.target)
+        ramp_s = line.speed_mm_s / acc_mm_s2
+        turn_s = rotation_deg / 30.0 if translation_mm >= 1.0 else math.radians(rotation_deg) / (line.speed_mm_s / 1e3)
+        estimates_s.append(max(max(translation_mm / line.speed_mm_s, turn_s) + ramp_s, line.least_s))
+        start = line.target
+    return estimates_s
 
 
 async def feed(

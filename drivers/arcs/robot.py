@@ -38,13 +38,7 @@ class AuboArcs:
     FK and IK are the controller's; units on the wire are m, rad, s.
     """
 
-    def __init__(
-        self,
-        table: ArcsTable,
-        limits: Limits,
-        clock: Clock,
-        on_notice: Callable[[str], None] = lambda _text: None,
-    ) -> None:
+    def __init__(self, table: ArcsTable, limits: Limits, clock: Clock, on_notice: Callable[[str], None]) -> None:
         self._table = table
         self._limits = limits
         self._notice = on_notice
@@ -67,7 +61,7 @@ class AuboArcs:
         self._motion.on_pose = self._telemetry.lag.asked
 
     async def connect(self) -> Identity:
-        """Connect and identify; powers nothing, telemetry runs from here on. Raises `WrongGeneration` for AUBOPE.
+        """Connect and identify; powers nothing, telemetry runs from here on. Raises `DeviceError`.
 
         After a failure nothing is left open, and nothing was set on an arm that was not identified.
         """

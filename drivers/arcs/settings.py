@@ -17,7 +17,7 @@ from brushloop.drivers.arcs.controller import Controller, RobotMode, accepted
 from brushloop.drivers.arcs.motion import POLL_S
 from brushloop.drivers.arcs.wire import DEVICE, Framing, numbers
 from brushloop.drivers.devices import Pose
-from brushloop.drivers.errors import DeviceTimeout, MotionError, SettingsChanged
+from brushloop.drivers.errors import DeviceTimeout, MotionError, ProtocolViolation, SettingsChanged
 from brushloop.drivers.geometry import angles, distance, from_wire
 
 Finite = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
@@ -100,11 +100,15 @@ def _listed(numbers: Iterable[float]) -> str:
 async def read_back(controller: Controller) -> Settings:
     """Read all settings from the controller. Raises `ProtocolViolation` for an answer of the wrong shape."""
     offset = numbers("getTcpOffset", await controller.ask("RobotConfig.getTcpOffset"))
-    mass_kg, centre_mm = await controller.payload()
+    match await controller.ask("RobotConfig.getPayload"):
+        case [mass_kg, [*centre_m], *_]:
+            mass_kg, *centre_m = numbers("getPayload", [mass_kg, *centre_m], 4)
+        case other:
+            raise ProtocolViolation(DEVICE, "getPayload", f"expected mass and centre, got {other!r}")
     [level] = numbers("getCollisionLevel", [await controller.ask("RobotConfig.getCollisionLevel")], 1)
     [fraction] = numbers("getSpeedFraction", [await controller.ask("MotionControl.getSpeedFraction")], 1)
     mode = str(await controller.ask("RobotManage.getOperationalMode"))
-    return Settings(from_wire(offset), (mass_kg, *centre_mm), level, fraction, mode)
+    return Settings(from_wire(offset), (mass_kg, *(1e3 * v for v in centre_m)), level, fraction, mode)
 
 
 def require_same(op: str, wanted: Settings, current: Settings) -> None:

@@ -34,7 +34,6 @@ from brushloop.drivers.errors import (
     NotConnected,
     ProtocolViolation,
     RpcError,
-    WrongGeneration,
 )
 
 DEVICE = "robot"
@@ -371,13 +370,14 @@ def answer_in(payload: bytes, ident: str | int, op: str) -> dict[str, Any] | Non
 
 
 async def open_arcs(connection: RpcConnection) -> None:
-    """Open the connection. Raises `WrongGeneration` if only the older software's port answers."""
+    """Open the connection. Raises as `open` does, or a `DeviceError` that says that the cabinet runs older software."""
     try:
         await connection.open()
     except (ConnectionLost, DeviceTimeout) as error:
         if error.op == "connect" and await answers(connection.host, AUBOPE_PORT):
             what = f"port {connection.port} does not answer but {AUBOPE_PORT} does: this cabinet runs AUBOPE (V4)"
-            raise WrongGeneration(DEVICE, "connect", what) from None
+            remedy = "It needs the ARCS software; ask the maker for the upgrade."
+            raise DeviceError(DEVICE, "connect", what, remedy=remedy) from None
         raise
 
 

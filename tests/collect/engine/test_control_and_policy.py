@@ -76,7 +76,7 @@ LATE_CAMERA = DeviceTimeout("camera", "fresh", "no new frame")
         (PRESS, StepVoid("rests too high"), 1, Action.RETRY),
         (PRESS, StepVoid("rests too high"), MAX_FAILURES, Action.ASK),
         (PRESS, MotionFailed("robot", "moveLine", "out of reach"), 1, Action.ABORT),
-        (PRESS, RobotNotSafe("robot", "moveLine", "ProtectiveStop", "", ""), 1, Action.ASK),
+        (PRESS, RobotNotSafe("robot", "moveLine", "safety mode is ProtectiveStop"), 1, Action.ASK),
         (PRESS, Stuck("force", 120.0, 24), 1, Action.ASK),
         (PRESS, SheetFull(42, 1), 1, Action.ASK),
         (PRESS, LATE_CAMERA, 1, Action.ABORT),
