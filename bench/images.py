@@ -14,7 +14,7 @@ from bench.harness import Result, at_most, interleave, machine, rounds_of
 from brushloop.model.ccdbsm import Brush, ccdbsm
 from brushloop.model.inversion import Inverter
 from brushloop.model.raster import PX_MM, SIZE_PX, coverage
-from brushloop.model.raster.press import press_images
+from brushloop.model.raster.centred import press_images
 from brushloop.model.strokes import stroke_model
 
 BATCH = 256

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from brushloop.model.ccdbsm import Brush, CcdBsm, ccdbsm
 from brushloop.model.outline import Outline, cross
 from brushloop.model.raster import PX_MM, centred_origin, coverage
-from brushloop.model.raster.press import press_images
+from brushloop.model.raster.centred import press_images
 from brushloop.model.strokes import stroke_models
 
 MODELS = stroke_models(Brush())
