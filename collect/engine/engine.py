@@ -107,10 +107,10 @@ class Engine:
                 no_pose_s = stale.age_ms / 1e3
             except DeviceError:
                 pass
-            with contextlib.suppress(DeviceError):
-                force_n = math.hypot(*rig.force.latest().force_n) if rig.force is not None else None
-        if force_n is not None:
-            self._run.telemetry.note_force(force_n, self._clock.now_ns())
+            if rig.force is not None:
+                with contextlib.suppress(DeviceError):
+                    self._run.telemetry.force(sample := rig.force.latest())
+                    force_n = math.hypot(*sample.force_n)
         return self._run.progress.snapshot(
             state=state,
             tip_mm=tip_mm,

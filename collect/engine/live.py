@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from numpy.typing import NDArray
 
 from brushloop.collect.engine.snapshot import Picture
@@ -22,10 +23,11 @@ from brushloop.drivers.devices import Camera, ForceSample, Frame, Stamp
 from brushloop.drivers.errors import DeviceError
 from brushloop.sessions.mcap_writer import Outgoing, channel_of, encoded
 from brushloop.sessions.messages import image_message
-from brushloop.sessions.records import Topic
+from brushloop.sessions.records import Event, Topic
 
 if TYPE_CHECKING:
     from foxglove import Channel
+    from google.protobuf.message import Message
 
 SLOT_NS = 100_000_000
 """Time that one value of the trace covers. The value is the peak force, so that a short peak is seen."""
@@ -84,14 +86,10 @@ class Telemetry:
         self.picture = Picture(_no_wider(image, WIDTH_PX), blur_px(busiest_tile(image)))
 
     def force(self, sample: ForceSample) -> None:
-        """Take a sample of the force sensor; called at its full rate."""
-        self.note_force(math.hypot(*sample.force_n), sample.stamp.host_ns)
-
-    def note_force(self, force_n: float, t_ns: int) -> None:
-        """Take a force in N at host time `t_ns`."""
-        slot = t_ns // SLOT_NS
+        """Take a sample of the force sensor; called at its full rate, and from any thread."""
+        slot, force_n = sample.stamp.host_ns // SLOT_NS, math.hypot(*sample.force_n)
         with self._lock:
-            if slot != self._slot:
+            if slot > self._slot:
                 self._slot = slot
                 self._peaks.append(force_n)
             elif self._peaks and force_n > self._peaks[-1]:
@@ -105,8 +103,6 @@ class Telemetry:
 
 HOST = "127.0.0.1"
 """Loopback only, and not configurable, because a viewer needs no password."""
-PORT = 8765
-"""The default port of Foxglove."""
 BACKLOG = 1024
 """Messages that may wait for one slow viewer; the oldest are dropped."""
 PREVIEW_PX = 1024
@@ -120,7 +116,7 @@ class LiveView:
     Neither waits for a viewer, and nothing is encoded for a topic that nobody watches.
     """
 
-    def __init__(self, port: int = PORT) -> None:
+    def __init__(self, port: int) -> None:
         """Listen, on 127.0.0.1 only. Raises `ConfigError` if foxglove-sdk is missing or the port is taken."""
         try:
             import foxglove
@@ -148,15 +144,14 @@ class LiveView:
     def offer(self, outgoing: Outgoing) -> None:
         """Show a message that is being recorded. Stills are not sent: `frame` shows what the camera sees."""
         if outgoing.topic is not Topic.STILL:
-            channel = self._channel(outgoing)
+            channel = self._channel(outgoing.topic, type(outgoing.message))
             if channel.has_sinks():
                 channel.log(encoded(outgoing.message), log_time=outgoing.log_ns)
 
     def frame(self, frame: Frame) -> None:
         """Show a camera frame as a small JPEG."""
         stamp_ns = frame.stamp.host_ns
-        preview = Outgoing(Topic.PREVIEW, stamp_ns, stamp_ns, 0, image_message(stamp_ns, b"", "jpeg"))
-        if self._channel(preview).has_sinks():
+        if self._channel(Topic.PREVIEW, CompressedImage).has_sinks():
             small = _no_wider(frame.image, PREVIEW_PX)
             _, jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
             message = image_message(stamp_ns, jpeg.tobytes(), "jpeg")
@@ -166,17 +161,17 @@ class LiveView:
         """End the server."""
         self._server.stop()
 
-    def _channel(self, outgoing: Outgoing) -> Channel:
+    def _channel(self, topic: Topic, kind: type[Event | Message]) -> Channel:
         """The channel of a topic, with the schema that files have too; it is advertised at its first message."""
         import foxglove
 
         with self._lock:
-            if outgoing.topic not in self._channels:
-                schema, record = channel_of(outgoing.topic, type(outgoing.message))
-                self._channels[outgoing.topic] = foxglove.Channel(
+            if topic not in self._channels:
+                schema, record = channel_of(topic, kind)
+                self._channels[topic] = foxglove.Channel(
                     record.topic,
                     schema=foxglove.Schema(name=schema.name, encoding=schema.encoding, data=schema.data),
                     message_encoding=record.message_encoding,
                     context=self._context,
                 )
-            return self._channels[outgoing.topic]
+            return self._channels[topic]

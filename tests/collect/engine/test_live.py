@@ -183,7 +183,7 @@ def test_a_port_that_is_taken_is_reported_in_one_line(live: LiveView) -> None:
 def test_without_the_extra_the_error_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "foxglove", None)
     with pytest.raises(ConfigError, match=r"--live: needs foxglove-sdk: pip install 'brushloop\[live\]'") as caught:
-        LiveView()
+        LiveView(port=0)
     assert caught.value.exit_code == 2
 
 
