@@ -64,16 +64,11 @@ class RunControl:
         return self._state
 
     def entered(self, task: asyncio.Task[None]) -> None:
-        """Note that the engine's event loop runs `task`; cancel it if a stop was requested before."""
+        """Note that this event loop runs `task` until the end; cancel it if a stop was requested before."""
         with self._lock:
             self._loop = asyncio.get_running_loop()
             if self._stop_wanted:
                 task.cancel()
-
-    def left(self) -> None:
-        """Note that the engine's event loop ends; from then on, keys have no effect."""
-        with self._lock:
-            self._loop = None
 
     def stop(self, act: Callable[[], None]) -> None:
         """Run `act` in the engine's event loop now; from any thread, in any state, any number of times."""
@@ -86,25 +81,22 @@ class RunControl:
             self._loop.call_soon_threadsafe(act)
 
     def pause(self) -> None:
-        """Pause before the next step; from any thread."""
+        """Pause before the next step, unless the run is to end there; from any thread."""
         with self._lock:
-            self._pause_wanted = True
-            if self._state == State.RUNNING:
+            self._pause_wanted = not self.park_wanted
+            if self._pause_wanted and self._state == State.RUNNING:
                 self._set(State.PAUSING)
 
     def resume(self) -> None:
         """Go on after a pause, or cancel one that has not begun; from any thread."""
         with self._lock:
-            self._pause_wanted = False
-            if self._state == State.PAUSING:
-                self._set(State.RUNNING)
-            self._wake()
+            self._end_pause()
 
     def park(self) -> None:
         """End the run before the next step; from any thread."""
         with self._lock:
             self.park_wanted = True
-            self._wake()
+            self._end_pause()
 
     async def pause_point(self) -> None:
         """Wait here, between two steps, while the run is paused."""
@@ -113,22 +105,19 @@ class RunControl:
                 return
             self._set(State.PAUSED)
         while True:
+            await self._go_on.wait()
             self._go_on.clear()
             with self._lock:
-                if self.park_wanted or not self._pause_wanted:
-                    self._change(State.RUNNING)
-                    return
-            await self._go_on.wait()
-
-    def go_on(self) -> None:
-        """Run, or pause before the next step if that was requested. Raises `CancelledError` once a stop was."""
-        with self._lock:
-            self._change(State.PAUSING if self._pause_wanted else State.RUNNING)
+                if not self._pause_wanted:
+                    return self._change(State.RUNNING)
 
     def move_to(self, new: State) -> None:
-        """Change the state. Raises `CancelledError` once a stop was requested."""
+        """Change the state; a run that is to pause before the next step is pausing, not running.
+
+        Raises `CancelledError` once a stop was requested.
+        """
         with self._lock:
-            self._change(new)
+            self._change(State.PAUSING if new is State.RUNNING and self._pause_wanted else new)
 
     def begin_closing(self) -> None:
         """Ignore stops from now on: one would lose the merge. Raises `CancelledError` if one was already requested."""
@@ -152,8 +141,11 @@ class RunControl:
         if self._state == State.STOPPING:
             raise asyncio.CancelledError
 
-    def _wake(self) -> None:
-        if self._loop is not None and self._state not in FINAL:
+    def _end_pause(self) -> None:
+        self._pause_wanted = False
+        if self._state == State.PAUSING:
+            self._set(State.RUNNING)
+        elif self._state == State.PAUSED and self._loop is not None:
             self._loop.call_soon_threadsafe(self._go_on.set)
 
     def _set(self, new: State) -> None:

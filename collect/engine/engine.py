@@ -193,34 +193,31 @@ class Engine:
         self._task = asyncio.create_task(self._session(), name="session")
         self._run.control.entered(self._task)
         try:
-            await self._task
-        except asyncio.CancelledError:
-            await self._stopped()
+            await self._until_stopped(self._task)
         except CollectAborted as error:
             self._end(State.STOPPED, error)
             raise
         except Exception as error:
-            self._rest_unknown = rest_is_unknown(error)
+            # After a stop that failed, the arm was not seen at rest either.
+            self._rest_unknown = error is self._stop_failure or rest_is_unknown(error)
             self._end(State.FAILED, error)
             raise
         finally:
             if self._stopper is not None:
                 await self._stopper
-            self._run.control.left()
             if self._store is not None:
                 self._store.release()
 
-    async def _stopped(self) -> None:
-        if self._stopper is not None:
-            await self._stopper
-        if self._stop_failure is not None and not isinstance(self._stop_failure, NotConnected):
-            # Not reported as stopped: the arm was not seen at rest.
-            self._rest_unknown = True
-            self._end(State.FAILED, self._stop_failure)
-            raise self._stop_failure
-        stopped = CollectAborted("stopped; the same command resumes from here")
-        self._end(State.STOPPED, stopped)
-        raise stopped
+    async def _until_stopped(self, session: asyncio.Task[None]) -> None:
+        """Raise what ends the session; of a stop, `CollectAborted`, or why the arm was not seen at rest."""
+        try:
+            await session
+        except asyncio.CancelledError:
+            if self._stopper is not None:
+                await self._stopper
+            if self._stop_failure is not None and not isinstance(self._stop_failure, NotConnected):
+                raise self._stop_failure from None
+            raise CollectAborted("stopped; the same command resumes from here") from None
 
     async def _session(self) -> None:
         run = self._run
@@ -282,7 +279,7 @@ class Engine:
             with self._run.progress.meanwhile("wait for an answer"):
                 yield
         finally:
-            self._run.control.go_on()
+            self._run.control.move_to(State.RUNNING)
 
     def _end(self, state: State, error: Exception) -> None:
         """End with `error`, whose message says so if the arm may move or the brush may be down. The session keeps it

@@ -219,7 +219,7 @@ class Run(RunContext):
             self.progress.log(describe(moved), warning=True)  # logged before the arm moves
         self.left_ink_ns = None
         await self.procedures.retreat()
-        self.control.go_on()
+        self.control.move_to(State.RUNNING)
 
     async def perform(self, step: Step) -> StepResult:
         """Do the step once. If it is cut short, the attempt is void and its patch stays used.

@@ -53,7 +53,7 @@ def test_a_pause_that_comes_as_the_run_goes_on_is_not_lost() -> None:
     control = RunControl()
     control.move_to(State.RECOVERING)
     control._lock = SlippedIn(control.pause)  # type: ignore[assignment]
-    control.go_on()
+    control.move_to(State.RUNNING)
     assert control.state is State.PAUSING
 
 
