@@ -19,7 +19,7 @@ from brushloop.collect.errors import (
     describe,
 )
 from brushloop.collect.operator import Choice, Prompt
-from brushloop.collect.protocols.steps import BoardStep, Protocol, Step, ZeroTouchStep
+from brushloop.collect.protocols.steps import Step, ZeroTouchStep
 from brushloop.collect.rig.config import RigConfig
 from brushloop.drivers.errors import (
     ArmMoved,
@@ -167,13 +167,6 @@ def accept_question(result: StepResult, config: RigConfig) -> Prompt:
 def by_method(step: Step, answer: str) -> Step:
     """Return the same step; a zero touch by the method that the answer names, if any."""
     return replace(step, method=METHODS[answer]) if isinstance(step, ZeroTouchStep) and answer in METHODS else step
-
-
-def board_first(protocol: Protocol) -> Protocol:
-    """Yield a board step, then the same steps, so that the board is seen before the brush comes down. Both board steps
-    have the same key, so the later one is then done already."""
-    yield BoardStep(0)
-    yield from protocol
 
 
 def _within(name: str, value: float, limit: float, shown: str) -> Fact:

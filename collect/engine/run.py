@@ -17,7 +17,6 @@ from brushloop.collect.engine.policy import (
     STOP,
     Action,
     accept_question,
-    board_first,
     by_method,
     decide,
     in_set_up,
@@ -57,9 +56,10 @@ class Run(RunContext):
 
     async def carry_out(self) -> None:
         """Power on, retreat, do every step that is not in the journal yet, repeat what was marked bad, park."""
-        protocol = steps_on(self.rig.config, self.opening.protocol)
         await self._retreat()
-        await self._walk(board_first(protocol) if self.opening.request.guided else protocol)
+        if self.opening.request.guided:
+            await self._result(steps.BoardStep(0))  # so that the board is seen before the brush comes down
+        await self._walk(steps_on(self.rig.config, self.opening.protocol))
         for number in itertools.count():
             step = steps.ReviewStep(number)
             if step.key not in self.store.state.done and not capture.marked_bad(self):
@@ -113,11 +113,11 @@ class Run(RunContext):
                 if asked and self.asker.watched:
                     action = Action.ASK  # the person at the set-up can remove the cause
                 self.progress.log(f"{step.kind}: {error} -> {action}", warning=True)
-                if action is Action.ABORT or (action is Action.ASK and not self.asker.watched):
-                    await self._lift(error)
-                    raise
-                if action is Action.ASK:
-                    await self._ask(error)
+                if action is not Action.RETRY:
+                    parked = await self._lift(error)  # a person may be about to reach under the arm
+                    if action is Action.ABORT:
+                        raise
+                    await self._ask(error, parked=parked)
                     failures = 0
                 await self._retreat()
             except SessionError as error:
@@ -132,23 +132,16 @@ class Run(RunContext):
         if self.control.state is State.PAUSING:
             self.progress.doing("paused")
         await self.control.pause_point()
-        await self._back_in_control()
+        try:
+            await self.rig.robot.confirm()
+        except MotionError:
+            await self._retreat()  # somebody moved the arm during a pause or a question, or with another client
         if isinstance(step, steps.DipStep) and self.requests.take(OperatorRequest.NEW_SHEET):
             await self._new_sheet()
         if isinstance(step, steps.DipStep) and self.requests.take(OperatorRequest.JOG):
             await self._touch_again(step)
         if self.control.park_wanted:
             await self._park()
-
-    async def _back_in_control(self) -> None:
-        """Retreat along the tool axis if the arm is not where it was left: somebody may have moved it during a pause
-        or a question, or with another client."""
-        try:
-            return await self.rig.robot.confirm()
-        except MotionError as error:
-            if not isinstance(error, ArmMoved):
-                await self._ask(error)
-        await self._retreat()
 
     async def _park(self) -> None:
         await self._retreat()
@@ -174,21 +167,16 @@ class Run(RunContext):
                 await self._ask(error)
         await self._retreat()
 
-    async def _ask(self, error: StepError | DeviceError) -> None:
+    async def _ask(self, error: StepError | DeviceError, *, parked: bool = False) -> None:
         """Let a person decide after `error`; raise an error if nobody watches or the answer is to stop."""
         if not self.asker.watched:
             raise error
-        in_order = False
-        if not arm_at_fault(error):
-            with contextlib.suppress(StepError, DeviceError):
-                await self._recover()  # a person is about to reach under the arm
-                in_order = True
         asked = question(error, self.store.state.sheet)
         answer = await self.asker.ask_or_default(asked)
         meant = next(choice.label for choice in asked.choices if choice.key == answer)
         self.progress.log(f"{asked.question} -> {meant}")
         if answer == STOP.key:
-            if in_order:
+            if parked:
                 raise Parked(f"stopped at a question, parked: {describe(error)}") from error
             raise error
         self.procedures.photographer.forget()  # a person may have changed what the camera sees
@@ -197,14 +185,16 @@ class Run(RunContext):
         if isinstance(error, SheetFull):
             self.fresh_sheet()
 
-    async def _lift(self, error: StepError | DeviceError | SessionError) -> None:
-        """Lift the brush off the paper after `error`, unless the arm is at fault."""
+    async def _lift(self, error: StepError | DeviceError | SessionError) -> bool:
+        """Lift the brush off the paper after `error` and park, unless the arm is at fault; whether that was done."""
         if arm_at_fault(error):
-            return
+            return False
         try:
             await self._recover()
         except (StepError, DeviceError) as failure:
             error.add_note(f"The brush could not be lifted: {describe(failure)}")
+            return False
+        return True
 
     async def _recover(self) -> None:
         if not self.enabled:

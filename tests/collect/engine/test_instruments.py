@@ -14,6 +14,7 @@ from mcap.reader import make_reader
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.recorder import ForceGuard, Recorder
 from brushloop.collect.errors import ForceTooHigh, NeedsOperator, arm_at_fault, describe, rest_is_unknown
+from brushloop.collect.motion import Procedures
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.devices import ForceSample, Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceError, MotionFailed, Stuck
@@ -25,7 +26,7 @@ from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.records import Topic
 from tests.collect.conftest import Collected
 from tests.rigs import Lab
-from tests.runs import ended_by, question, until, wait_for_end
+from tests.runs import answer, ended_by, question, until, wait_for_end
 
 
 def slowly(lab: Lab) -> None:
@@ -155,6 +156,26 @@ def test_poses_that_come_late_end_the_run_before_a_press_counts(lab: Lab, monkey
         lab.run()
     assert len(lab.state.cut) == 1
     assert not lab.state.results(PressResult)
+
+
+@pytest.mark.parametrize("watched", [False, True])
+def test_whoever_must_act_is_told_that_the_brush_could_not_be_lifted(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, watched: bool
+) -> None:
+    retreats, retreat = list[Procedures](), Procedures.retreat
+
+    async def only_once(self: Procedures) -> None:
+        if retreats:
+            raise MotionFailed("robot", "moveLine", "did not arrive")
+        retreats.append(self)
+        await retreat(self)
+
+    monkeypatch.setattr(Procedures, "retreat", only_once)
+    monkeypatch.setattr(AuboArcs, "pose_lag_ms", lambda _: 412.0)
+    engine = lab.started(on_screen=watched)
+    if watched:
+        answer(engine, "could not be lifted", "x")
+    assert "could not be lifted: robot: moveLine: did not arrive" in describe(ended_by(engine, NeedsOperator))
 
 
 # The force ceiling: what is under way ends with the stop, and nothing is sent after it
