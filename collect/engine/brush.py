@@ -11,7 +11,6 @@ from brushloop.collect.motion import TOUCH_TOLERANCE_MM
 from brushloop.collect.operator import Choice, Prompt
 from brushloop.collect.protocols.steps import DrawStep, PressStep, TouchStep, ZeroTouchStep
 from brushloop.collect.rig.config import TouchConfig
-from brushloop.collect.rig.paper import PaperPlane
 from brushloop.collect.touch.force import ForceTap
 from brushloop.collect.touch.heights import plane_of
 from brushloop.collect.touch.measure import measure_plane
@@ -115,7 +114,9 @@ async def zero_touch(context: StepContext, step: ZeroTouchStep) -> ZeroTouchResu
     plane = plane_of(measured)
     poses = all_poses(rig.config, run.opening.protocol, plane)
     await within_limits("over the paper as it was touched, ", rig.config, poses)
-    moved_mm = _moved_mm(measured, run.procedures.plane)
+    # How far the paper lies above where it was before, at the touched point where it moved most.
+    before = run.procedures.plane
+    moved_mm = max((p.z_mm - before.touch_z_mm(p.x_mm, p.y_mm) for p in measured.points), key=abs)
     if measured.method != "taught":
         run.progress.log(
             f"zero touch by {measured.method}: the paper lies {moved_mm:+.2f} mm from the height known before"
@@ -127,12 +128,6 @@ async def zero_touch(context: StepContext, step: ZeroTouchStep) -> ZeroTouchResu
     if (optics := rig.config.camera.optics) is not None:
         context.recorder.optics(optics)
     return measured.model_copy(update={"moved_mm": moved_mm})
-
-
-def _moved_mm(measured: ZeroTouchResult, before: PaperPlane) -> float:
-    """How far the paper lies above where it was before, at the touched point where it moved most."""
-    away = [point.z_mm - before.touch_z_mm(point.x_mm, point.y_mm) for point in measured.points]
-    return max(away, key=abs)
 
 
 async def _accepted(context: StepContext, moved_mm: float) -> None:

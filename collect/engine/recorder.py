@@ -56,7 +56,8 @@ class ForceGuard:
 
     def __init__(self, rig: Rig, *listeners: Callable[[ForceSample], None]) -> None:
         """`listeners` are called with every sample."""
-        self._rig = rig
+        self._rig, limits = rig, rig.config.force
+        self._max_n = math.inf if limits is None else limits.max_n
         self.listeners = list(listeners)
         self._over: asyncio.Event = asyncio.Event()
         self._guarding = False
@@ -93,7 +94,6 @@ class ForceGuard:
 
     async def _watch(self) -> None:
         assert self._rig.force is not None
-        assert self._rig.config.force is not None
         while True:
             self._rig.force.latest()
             try:
@@ -101,13 +101,13 @@ class ForceGuard:
                     await self._over.wait()
             except TimeoutError:
                 continue
-            raise ForceTooHigh(self.peak_n, self._rig.config.force.max_n)
+            raise ForceTooHigh(self.peak_n, self._max_n)
 
     def sample(self, sample: ForceSample) -> None:
         """Accept one sample of the sensor."""
-        if self._guarding and self._rig.config.force is not None:
+        if self._guarding:
             self.peak_n = max(self.peak_n, math.hypot(*sample.force_n))
-            if self.peak_n > self._rig.config.force.max_n:
+            if self.peak_n > self._max_n:
                 self._over.set()
         for listener in self.listeners:
             listener(sample)

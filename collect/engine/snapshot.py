@@ -189,9 +189,7 @@ def no_pose_text(now: Snapshot) -> str:
 class Progress:
     """Progress of one run; written by the engine's thread, read from any."""
 
-    def __init__(
-        self, protocol: ProtocolConfig, clock: Clock, layout: Layout | None = None, resumes: Path | None = None
-    ) -> None:
+    def __init__(self, protocol: ProtocolConfig, clock: Clock, layout: Layout, resumes: Path | None) -> None:
         """`layout` is that of the sheet; it determines the order of the strokes. `resumes` is the session's folder."""
         self._clock = clock
         self._lock = threading.Lock()
@@ -310,7 +308,7 @@ class Progress:
         ended = kept.keys() | {press.stroke_id for press in left_out}
         self.plan, self.left = plan, [stroke for stroke in plan if stroke.stroke_id not in ended]
         sheet, layout = state.sheet, self._layout
-        on_sheet = () if layout is None else tuple(marks.get((sheet, patch)) for patch in range(layout.capacity))
+        on_sheet = tuple(marks.get((sheet, patch)) for patch in range(layout.capacity))
         self._change(
             strokes_done=len(kept),
             strokes_planned=len(plan),
@@ -319,7 +317,7 @@ class Progress:
             given_up=len(left_out),
             eta_s=self._eta_s(times_ns),
             ink_level=ink_level,
-            sheet=None if layout is None else SheetMap(sheet + 1, layout.columns, on_sheet),
+            sheet=SheetMap(sheet + 1, layout.columns, on_sheet),
         )
 
     def _grid(
