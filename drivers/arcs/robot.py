@@ -202,7 +202,6 @@ class AuboArcs:
         Raises `ArmMoved` while it moves, `SettingsChanged` if a pose would refer to another tool, `RobotNotSafe`,
         `NotPowered`.
         """
-        self._require_enabled("take up")
         here = await self._resting("take up")
         await self._require_settings("take up")
         self._left = here

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Callable
 
 import pytest
 
@@ -95,44 +95,31 @@ async def test_never_more_lines_are_queued_than_allowed(arm: AuboArcs, cabinet: 
     assert cabinet.taken == len(arc())
 
 
-async def loses_its_connection(arm: AuboArcs, _: Cabinet) -> None:
-    cut(arm._motion)
-
-
-async def is_held(_: AuboArcs, cabinet: Cabinet) -> None:
-    cabinet.cabinet.hold()
-
-
-async def is_stopped_by_another_client(_: AuboArcs, cabinet: Cabinet) -> None:
-    cabinet.cabinet.stop(2.0, 2.0)
-
-
-async def stops_by_itself(_: AuboArcs, cabinet: Cabinet) -> None:
-    cabinet.cabinet.safety_stop()
-
-
 @pytest.mark.parametrize(
     ("act", "error", "words"),
     [
-        (lambda arm, _: arm.stop(), MotionFailed, "was stopped"),
-        (is_stopped_by_another_client, MotionFailed, "does not advance"),
-        (is_held, MotionFailed, "does not advance"),
-        (stops_by_itself, RobotNotSafe, "ProtectiveStop"),
-        (loses_its_connection, ConnectionLost, "closed|lost|reset|abort|connection"),
+        (lambda arm, _: asyncio.create_task(arm.stop()), MotionFailed, "was stopped"),
+        (lambda _, cabinet: cabinet.cabinet.stop(2.0, 2.0), MotionFailed, "does not advance"),
+        (lambda _, cabinet: cabinet.cabinet.hold(), MotionFailed, "does not advance"),
+        (lambda _, cabinet: cabinet.cabinet.safety_stop(), RobotNotSafe, "ProtectiveStop"),
+        (lambda arm, _: cut(arm._motion), ConnectionLost, "closed|lost|reset|abort|connection"),
     ],
+    ids=["stopped", "stopped by another client", "held", "stopped by itself", "cut off"],
 )
 async def test_whatever_ends_a_way_is_named_and_no_line_follows(
     arm: AuboArcs,
     cabinet: Cabinet,
     way: asyncio.Task[None],
-    act: Callable[[AuboArcs, Cabinet], Awaitable[None]],
+    act: Callable[[AuboArcs, Cabinet], asyncio.Task[None] | None],
     error: type[Exception],
     words: str,
 ):
-    await act(arm, cabinet)
+    stopping = act(arm, cabinet)
     with pytest.raises(error, match=words):
         await way
     assert await rests_short(cabinet)
+    if stopping:
+        await stopping
 
 
 async def test_a_stop_while_lines_are_being_sent_lets_none_follow(arm: AuboArcs, cabinet: Cabinet):

@@ -30,7 +30,6 @@ from tests.waiting import until
 
 FAR = brush_pose(250.0, -30.0, 260.0)  # 200 mm from home: two seconds of the fast clock
 SLOW = {"speed_mm_s": 5.0, "acc_mm_s2": 800.0}
-Break = Callable[[AuboArcs, Cabinet], None]
 
 
 @pytest.mark.parametrize(("box", "simulated"), [(None, True), ("cb_ISStation", False)])
@@ -152,14 +151,6 @@ async def test_a_safety_stop_in_mid_move_is_named_with_its_condition_and_stays_u
 # ---------------------------------------------------------------- stop
 
 
-def hangs(method: str) -> Break:
-    return lambda _, cabinet: mute_to(cabinet, method)
-
-
-def drops_all_connections(_: AuboArcs, cabinet: Cabinet) -> None:
-    cabinet.drop_clients()
-
-
 def loses_what_is_sent_to_stop(arm: AuboArcs, _: Cabinet) -> None:
     async def silence(*_: object) -> None:
         await asyncio.sleep(1.0)
@@ -171,13 +162,16 @@ def loses_what_is_sent_to_stop(arm: AuboArcs, _: Cabinet) -> None:
 @pytest.mark.parametrize(
     "act",
     [
-        hangs("rob1.MotionControl.getExecId"),
-        hangs("rob1.RobotState.getSafetyModeType"),
-        drops_all_connections,
+        lambda _, cabinet: mute_to(cabinet, "rob1.MotionControl.getExecId"),
+        lambda _, cabinet: mute_to(cabinet, "rob1.RobotState.getSafetyModeType"),
+        lambda _, cabinet: cabinet.drop_clients(),
         loses_what_is_sent_to_stop,
     ],
+    ids=["no id", "no safety mode", "no connection", "no answer to a stop"],
 )
-async def test_a_stop_gets_through_at_once_whatever_hangs(arm: AuboArcs, cabinet: Cabinet, act: Break):
+async def test_a_stop_gets_through_at_once_whatever_hangs(
+    arm: AuboArcs, cabinet: Cabinet, act: Callable[[AuboArcs, Cabinet], None]
+):
     move = asyncio.create_task(arm.move(FAR, **SLOW))
     await asyncio.sleep(0.2)
     act(arm, cabinet)
