@@ -368,8 +368,8 @@ async def ask_reach(rig_path: Path, config: RigConfig, poses: Iterable[PlannedPo
         names.setdefault(pose, name)
     own_tool = from_wire([*(v / 1e3 for v in robot.tcp_offset_mm), *map(math.radians, robot.tcp_rotation_deg)])
     async with only_asking(robot.host, robot.port, robot.framing) as controller:
-        set_tool = from_wire(numbers("getTcpOffset", await controller.ask("RobotConfig.getTcpOffset")))
-        near = await controller.joint_positions()
+        set_tool = from_wire(await controller.ask_numbers("RobotConfig.getTcpOffset"))
+        near = await controller.ask_numbers("RobotState.getJointPositions")
         for pose, name in names.items():
             wire = to_wire(_for_tool(pose, own_tool, set_tool))
             match await controller.ask("RobotAlgorithm.inverseKinematics", qnear=near, pose=wire):

@@ -13,7 +13,7 @@ from brushloop.collect.rig.check import tool_length
 from brushloop.collect.rig.doctor import Finding, Scrubber, numbers_only, transcript, write_archive
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, Controller, only_asking
 from brushloop.drivers.arcs.settings import read_back
-from brushloop.drivers.arcs.wire import DEVICE, Framing, answers, numbers
+from brushloop.drivers.arcs.wire import DEVICE, Framing, answers
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import DeviceError, DeviceTimeout, ProtocolViolation, RpcError
 from brushloop.drivers.geometry import distance, from_wire, inverse, product, turned
@@ -79,7 +79,7 @@ async def _flange_at_rest(controller: Controller) -> Pose:
 
 async def _flange(controller: Controller) -> Pose:
     """From the cabinet's tool pose, with its tool taken off again: whatever is set there does not matter."""
-    tool = from_wire(numbers("getTcpOffset", await controller.ask("RobotConfig.getTcpOffset")))
+    tool = from_wire(await controller.ask_numbers("RobotConfig.getTcpOffset"))
     tip = await controller.pose()
     turn = product(tip.quaternion, inverse(tool.quaternion))
     x, y, z = (at - offset for at, offset in zip(tip.position_mm, turned(turn, tool.position_mm), strict=True))

@@ -116,6 +116,11 @@ class Controller(RpcConnection):
         """Call a method of the robot; the answer is unchecked."""
         return await self.call(f"{self.robot}.{method}", params)
 
+    async def ask_numbers(self, method: str, count: int = 6) -> list[float]:
+        """So many numbers, or the only one, which a method of the robot answers. Raises `ProtocolViolation`."""
+        answer = await self.ask(method)
+        return numbers(method.rpartition(".")[2], [answer] if count == 1 else answer, count)
+
     async def robot_names(self) -> list[str]:
         """Names of the robots, at least one. Raises `ProtocolViolation`."""
         names = await self.call("getRobotNames")
@@ -127,14 +132,10 @@ class Controller(RpcConnection):
         """Where the tip is. Raises `ProtocolViolation`."""
         loop = asyncio.get_running_loop()
         asked_s = loop.time()
-        pose = from_wire(numbers("getTcpPose", await self.ask("RobotState.getTcpPose")))
+        pose = from_wire(await self.ask_numbers("RobotState.getTcpPose"))
         if self.on_pose is not None:
             self.on_pose(pose, loop.time() - asked_s)
         return pose
-
-    async def joint_positions(self) -> list[float]:
-        """Six joints in rad. Raises `ProtocolViolation`."""
-        return numbers("getJointPositions", await self.ask("RobotState.getJointPositions"))
 
     async def mode(self) -> str:
         """The robot mode."""

@@ -99,14 +99,14 @@ def _listed(numbers: Iterable[float]) -> str:
 
 async def read_back(controller: Controller) -> Settings:
     """Read all settings from the controller. Raises `ProtocolViolation` for an answer of the wrong shape."""
-    offset = numbers("getTcpOffset", await controller.ask("RobotConfig.getTcpOffset"))
+    offset = await controller.ask_numbers("RobotConfig.getTcpOffset")
     match await controller.ask("RobotConfig.getPayload"):
         case [mass_kg, [*centre_m], *_]:
             mass_kg, *centre_m = numbers("getPayload", [mass_kg, *centre_m], 4)
         case other:
             raise ProtocolViolation(DEVICE, "getPayload", f"expected mass and centre, got {other!r}")
-    [level] = numbers("getCollisionLevel", [await controller.ask("RobotConfig.getCollisionLevel")], 1)
-    [fraction] = numbers("getSpeedFraction", [await controller.ask("MotionControl.getSpeedFraction")], 1)
+    [level] = await controller.ask_numbers("RobotConfig.getCollisionLevel", 1)
+    [fraction] = await controller.ask_numbers("MotionControl.getSpeedFraction", 1)
     mode = str(await controller.ask("RobotManage.getOperationalMode"))
     return Settings(from_wire(offset), (mass_kg, *(1e3 * v for v in centre_m)), level, fraction, mode)
 

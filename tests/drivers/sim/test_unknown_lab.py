@@ -64,7 +64,7 @@ async def test_what_a_client_reads_agrees_with_the_truth_and_the_labels_tell_not
         await open_arcs(controller)
         [controller.robot, *_] = await controller.robot_names()
         await lab.bring("pin", 2)
-        joints = await controller.joint_positions()
+        joints = await controller.ask_numbers("RobotState.getJointPositions")
         tcp = from_wire(await controller.ask("RobotConfig.getTcpOffset"))
         reported = await controller.pose()
         assert [*map(float, matrix_of(tcp)[:3, 3])] == pytest.approx(list(lab.facts.cabinet_tcp[:3]))
