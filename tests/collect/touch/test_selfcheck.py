@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+from unittest.mock import AsyncMock
 
 import cv2
 import numpy as np
@@ -64,8 +66,6 @@ def test_a_good_rig_passes_in_whatever_order_the_marks_are_found(order: list[int
         (linear((1, 0), (0, -1)), "mirrored in y"),
         (linear((0, 1), (1, 0)), "x and y are swapped"),
         (linear((0, -1), (-1, 0)), "swapped and negated"),
-        (linear(*turn(180.0)), r"turned by [+-]180"),
-        (linear(*turn(90.0)), r"turned by \+90"),
         (linear(*turn(1.5)), r"turned by \+1\.5"),
         (linear((1.02, 0), (0, 1.02)), r"\+2\.00 % along x and \+2\.00 % along y"),
         (linear((1, 0), (0, 0.98)), r"\+0\.00 % along x and -2\.00 % along y"),
@@ -93,46 +93,6 @@ def test_no_turn_passes_for_a_mirror_nor_a_mirror_for_a_turn(noise: int, turn_de
 async def checked(bench: Bench, places: Triangle = PLACES) -> SelfCheckResult:
     bench.effector.rig = bench.rig  # with the board that the test gave it
     return await self_check(bench.effector, places, bench.effector.dip)
-
-
-def in_paper(bench: Bench, change: Any) -> Any:
-    """An arm that goes to `change(x, y)` of the paper frame when (x, y) is asked for, over the sheet only."""
-
-    def bent(pose: Pose) -> Pose:
-        x, y = bench.world.config.table.to_paper(pose.x_mm, pose.y_mm)
-        if not (0.0 <= x <= 110.0 and 0.0 <= y <= 80.0):
-            return pose
-        base_x, base_y = to_base(bench.rig.config.paper, *change(x, y))
-        return replace(pose, x_mm=base_x, y_mm=base_y)
-
-    return bent
-
-
-@pytest.mark.parametrize(
-    ("change", "why"),
-    [
-        (lambda x, y: (110.0 - x, y), "mirrored in x"),
-        (lambda x, y: (x + 3.0, y - 4.0), "the marks lie off by"),
-    ],
-    ids=["mirrored x", "displaced"],
-)
-async def test_an_arm_that_goes_elsewhere_is_refused(make_bench: MakeBench, change: Any, why: str) -> None:
-    bench = make_bench()
-    bench.bent = in_paper(bench, change)
-    with pytest.raises(StepError, match=why):
-        await checked(bench)
-    assert bench.lifted
-
-
-async def test_a_dry_brush_leaves_no_marks(make_bench: MakeBench) -> None:
-    bench = make_bench()
-
-    async def no_ink() -> None:
-        return
-
-    bench.effector.dip = no_ink  # pyright: ignore[reportAttributeAccessIssue]
-    with pytest.raises(StepError, match="3 marks were pressed, new marks seen: 0"):
-        await checked(bench)
 
 
 async def test_an_even_triangle_is_refused_before_anything_moves(make_bench: MakeBench) -> None:
@@ -179,29 +139,76 @@ def test_a_wide_triangle_is_always_uneven_wide_and_on_free_patches(width: float,
             judge(places, mirrored, CONFIG)
 
 
-def whole_sheet(make_bench: MakeBench) -> tuple[Bench, Triangle]:
-    bench = make_bench(whole=True)
-    sheet = Sheet(bench.rig.config.paper)
-    return bench, triangle((sheet.patch(0), *partners(sheet, sheet.patch(0), set())))
+Fault = Callable[["Bench"], None]
 
 
-async def test_a_mirrored_camera_is_named(make_bench: MakeBench) -> None:
-    bench, places = whole_sheet(make_bench)
-    scene = bench.scene
-    bench.photograph = lambda: np.ascontiguousarray(scene.render(tool=bench.world.tool())[:, ::-1])  # pyright: ignore[reportAttributeAccessIssue]
-    with pytest.raises(StepError, match="the board is not seen: the photograph is mirrored"):
-        await checked(bench, places)
-    assert bench.lifted
+def goes_to(change: Callable[[float, float], tuple[float, float]]) -> Fault:
+    """An arm that goes to `change(x, y)` of the paper frame when (x, y) is asked for, over the sheet only."""
+
+    def bend(bench: Bench) -> None:
+        paper = bench.rig.config.paper
+        width_mm, height_mm = paper.size_mm
+
+        def bent(pose: Pose) -> Pose:
+            x, y = bench.world.config.table.to_paper(pose.x_mm, pose.y_mm)
+            if not (0.0 <= x <= width_mm and 0.0 <= y <= height_mm):
+                return pose
+            base_x, base_y = to_base(paper, *change(x, y))
+            return replace(pose, x_mm=base_x, y_mm=base_y)
+
+        bench.bent = bent
+
+    return bend
 
 
-async def test_an_arm_in_the_picture_is_no_mark(make_bench: MakeBench) -> None:
-    bench, places = whole_sheet(make_bench)
+def dry_brush(bench: Bench) -> None:
+    bench.effector.dip = AsyncMock()
+
+
+def mirrored_camera(bench: Bench) -> None:
+    photograph = bench.photograph
+    bench.photograph = lambda: np.ascontiguousarray(photograph()[:, ::-1])
+
+
+def arm_in_the_second_picture(bench: Bench) -> None:
     photograph, shots = bench.photograph, itertools.count()
 
     def with_arm() -> NDArray[np.uint8]:
         image = photograph()
-        return cv2.circle(image.copy(), (250, 550), 90, 70, -1) if next(shots) else image  # pyright: ignore[reportReturnType]
+        return np.asarray(cv2.circle(image.copy(), (250, 550), 90, 70, -1) if next(shots) else image, np.uint8)
 
-    bench.photograph = with_arm  # pyright: ignore[reportAttributeAccessIssue]
-    with pytest.raises(StepError, match=r"mm2 at \(.*\) mm became dark, more than a mark: is the arm"):
-        await checked(bench, places)
+    bench.photograph = with_arm
+
+
+def board_printed_too_small(bench: Bench) -> None:
+    """By 2 %, or measured badly: every length by this camera is 2 % too large."""
+    board = bench.rig.config.board
+    wrong = board.model_copy(update={"square_mm": 1.02 * board.square_mm, "marker_mm": 1.02 * board.marker_mm})
+    bench.rig = replace(bench.rig, config=bench.rig.config.model_copy(update={"board": wrong}))
+
+
+CORNERS, ONE_PATCH = (0, 5, 36), (36,)
+
+
+@pytest.mark.parametrize(
+    ("fault", "patches", "why"),
+    [
+        (goes_to(lambda x, y: (244.0 - x, y)), CORNERS, "mirrored in x"),
+        (goes_to(lambda x, y: (x + 3.0, y - 4.0)), CORNERS, "the marks lie off by"),
+        (dry_brush, CORNERS, "3 marks were pressed, new marks seen: 0"),
+        (mirrored_camera, CORNERS, "the board is not seen: the photograph is mirrored"),
+        (arm_in_the_second_picture, CORNERS, r"mm2 at \(.*\) mm became dark, more than a mark: is the arm"),
+        (board_printed_too_small, CORNERS, r"off by \+(1\.[7-9]|2\.[0-3]).* along x and \+(1\.[7-9]|2\.[0-3])"),
+        (board_printed_too_small, ONE_PATCH, None),
+    ],
+)
+async def test_what_is_wrong_at_the_rig_is_described_with_the_brush_lifted(
+    make_bench: MakeBench, fault: Fault, patches: tuple[int, ...], why: str | None
+) -> None:
+    """Within one patch, a camera that is 2 % wrong is not seen."""
+    bench = make_bench(whole=True)
+    sheet = Sheet(bench.rig.config.paper)
+    fault(bench)
+    with contextlib.nullcontext() if why is None else pytest.raises(StepError, match=why):
+        await checked(bench, triangle([sheet.patch(index) for index in patches]))
+    assert bench.lifted
