@@ -17,7 +17,7 @@ from brushloop.collect.plan import draw_plan, make_plan
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.rig.paper import PaperPlane
-from brushloop.collect.walk import all_poses, ask_reach
+from brushloop.collect.walk import all_poses, ask_reach, check_protocol
 from brushloop.drivers.arcs.controller import RobotMode
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.geometry import brush_pose
@@ -66,14 +66,17 @@ def test_a_plan_is_shown_as_tables_or_as_one_json_object(rig_path: Path) -> None
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in EXAMPLES.glob("*.toml")))
-def test_every_kind_has_a_picture_whatever_its_names(rig_path: Path, tmp_path: Path, name: str) -> None:
-    path = tmp_path / "plan.png"
+def test_every_example_passes_and_has_a_picture_whatever_its_names(rig_path: Path, tmp_path: Path, name: str) -> None:
+    path, config = tmp_path / "plan.png", load_rig(rig_path)
     for each in EXAMPLES.glob("*.csv"):
         (tmp_path / each.name).write_bytes(each.read_bytes())
     # No font here has that character, and a dollar would begin a formula.
     (tmp_path / name).write_text((EXAMPLES / name).read_text().replace('"shi"', '"永$x"'))
     wanted = load_protocol(tmp_path / name)
-    draw_plan(load_rig(rig_path), wanted, make_plan(load_rig(rig_path), wanted), path)
+    check_protocol(rig_path, tmp_path / name, config, wanted)
+    plan = make_plan(config, wanted)
+    assert plan.seconds > 10.0
+    draw_plan(config, wanted, plan, path)
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     assert image is not None
     assert min(image.shape) > 400

@@ -9,7 +9,6 @@ import pytest
 
 from brushloop.collect.commission.visit import Notebook, Taught
 from brushloop.collect.errors import ConfigError
-from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.check import check_rig, places_of
 from brushloop.collect.rig.config import load_rig
 from brushloop.drivers.sim.config import SimConfig
@@ -17,19 +16,12 @@ from brushloop.drivers.sim.rig import rig_toml
 from tests.command import brushloop
 
 RIG = rig_toml(SimConfig())
-PROTOCOL = 'kind = "grid"\ndepths_mm = [11.0, 20.0]\ntilts_deg = [0.0, 10.0]\nrepeats = 2\n'
 
 
 def rig_file(tmp_path: Path, old: str = "", new: str = "") -> Path:
     assert old in RIG
     path = tmp_path / "rig.toml"
     path.write_text(RIG.replace(old, new) if old else RIG)
-    return path
-
-
-def protocol_file(tmp_path: Path, text: str = PROTOCOL) -> Path:
-    path = tmp_path / "protocol.toml"
-    path.write_text(text)
     return path
 
 
@@ -91,21 +83,6 @@ def test_a_value_from_the_environment_is_refused_by_its_variable(
         load_rig(rig_file(tmp_path))
     assert refused.value.exit_code == 2
     assert "ROBOT__HOST" not in str(refused.value)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", r"kind: is missing: one of 'grid', 'few-strokes', 'list', 'replay', 'write', 'calibration'$"),
-        (PROTOCOL.replace('"grid"', '"gird"'), r"kind: 'gird' is not one of 'grid', 'few-strokes', "),
-        (PROTOCOL.replace("[11.0, 20.0]", "[11.0, 11.0]"), r"depths_mm: 11.0 occurs twice"),
-        (PROTOCOL.replace("[0.0, 10.0]", "[-5.0]"), r"tilts_deg.0: .*greater than or equal to 0"),
-        (PROTOCOL + "hurry = 3\n", r"hurry: unknown field; known are board_every, .*, depths_mm, .*, kind$"),
-    ],
-)
-def test_a_bad_protocol_is_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        load_protocol(protocol_file(tmp_path, text))
 
 
 # What is shown of a rig.toml, and what in it cannot be true
