@@ -16,7 +16,7 @@ from tests import rigs
 from tests.rigs import BARE, BENT_VIEW, COARSE, SHARP, Lab
 from tests.waiting import PATIENCE_S
 
-RPC_TIMEOUT_S = 10.0
+RPC_TIMEOUT_S = 30.0
 
 
 @pytest.fixture(autouse=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 from pathlib import Path
-from subprocess import CompletedProcess
 from typing import Any
 
 import pytest
@@ -53,39 +52,37 @@ def test_a_signal_stops_the_process_and_the_same_command_goes_on(wired_lab: Lab)
     assert len({c.stroke.stroke_id for c in Recording(lab.session).captures()}) == 2
 
 
-def parked(ran: CompletedProcess[str]) -> bool:
-    last = ran.stderr.splitlines()[-1]
-    return (ran.returncode, ran.stdout) == (4, "") and last.startswith(
-        "brushloop: parked on request; the same command resumes from here"
-    )
+@pytest.mark.parametrize("goes_away", ["output", "terminal"])
+def test_where_nobody_watches_any_more_the_step_ends_and_the_arm_parks(
+    bare_lab: Lab, monkeypatch: pytest.MonkeyPatch, goes_away: str
+) -> None:
+    """Nobody is there to lift a brush that was stopped on the paper."""
+    lab = bare_lab
+    leave = lab.rig.world._leave_mark
 
-
-def test_where_the_output_goes_away_the_step_ends_and_the_arm_parks(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    def closed(_engine: Engine) -> None:
+    def output_closed(_engine: Engine) -> None:
         wait_until(lambda: lab.rig.world.presses, "a press")
         raise BrokenPipeError
 
-    monkeypatch.setattr(start, "show_progress", closed)
-    lab.write_protocol(repeats=10)
-    assert parked(lab.command())
-
-
-def test_where_the_terminal_is_closed_the_step_ends_and_the_arm_parks(lab: Lab) -> None:
-    """Nobody is there to lift a brush that was stopped on the paper."""
-    lab.write_protocol(repeats=10)
-    leave = lab.rig.world._leave_mark
-
-    def close(deepest: Any) -> None:
+    def leave_and_close(deepest: Any) -> None:
         leave(deepest)
         os.kill(os.getpid(), signal.SIGHUP)  # a shell may pass it on again
 
-    lab.rig.world._leave_mark = close  # type: ignore[method-assign]
-    assert parked(lab.command())
+    if goes_away == "output":
+        monkeypatch.setattr(start, "show_progress", output_closed)
+    else:
+        monkeypatch.setattr(lab.rig.world, "_leave_mark", leave_and_close)
+    lab.write_protocol(repeats=10)
+    ran = lab.command()
+    assert (ran.returncode, ran.stdout) == (4, "")
+    assert ran.stderr.splitlines()[-1].startswith("brushloop: parked on request; the same command resumes from here")
     assert lab.rig.faults.phase() is Phase.PARKED
     assert not lab.state.cut
 
 
-def test_a_session_that_is_open_elsewhere_is_refused_before_anything_moves(lab: Lab) -> None:
+def test_a_session_that_is_open_elsewhere_is_refused_before_anything_moves(bare_lab: Lab) -> None:
+    lab = bare_lab
+    lab.write_protocol()
     engine = lab.engine()
     engine.start()
     until(engine, lambda now: now.strokes_done == 1)
@@ -126,9 +123,9 @@ def test_the_recording_and_what_comes_next(tmp_path: Path) -> None:
 
 
 def test_the_ending_is_printed_after_the_screen_too(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    bare_lab: Lab, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    lab.write_protocol("[11.0]")
+    lab = bare_lab
     monkeypatch.setattr("brushloop.collect.tui.app.run_app", lambda app: (app.engine.start(), wait_for_end(app.engine)))
     rig, protocol = lab.folder / "rig.toml", lab.folder / "protocol.toml"
     done = collect(CollectRequest(rig, protocol, lab.sessions, on_screen=True))
