@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import functools
 import io
 import os
@@ -14,13 +13,15 @@ import pytest
 from textual.pilot import Pilot
 
 from brushloop.collect.engine.control import FINAL, State
+from brushloop.collect.engine.snapshot import Snapshot
 from brushloop.collect.errors import CollectAborted, ConfigError
-from brushloop.collect.tui import run_screen
+from brushloop.collect.tui import run_screen, terminal
 from brushloop.collect.tui.app import OperatorApp, ScreenCrashed, run_app
 from brushloop.collect.tui.run_screen import COMMAND_GOES_ON, GOES_ON, OVER, RunScreen
 from brushloop.collect.tui.terminal import TerminalDriver, _LostWrites
 from brushloop.collect.tui.widgets import SOFTWARE_STOP, AskScreen
-from tests.collect.tui.fake import FAILED, SPLIT, FakeEngine, Watched, app_of, picture, watched
+from tests.collect.tui.fake import FAILED, SPLIT, FakeEngine, Watched, app_of, full_picture, picture, watched
+from tests.waiting import until
 
 AT_WORK = sorted(set(State) - FINAL)
 KEYS = ("space", "r", "k", "n", "j", "b")
@@ -54,17 +55,21 @@ async def test_stop_keys_stop_in_every_state_of_a_run() -> None:
             assert run.engine.calls == ["stop", "stop"], state
 
 
-@pytest.mark.parametrize("over", ["q", "question_mark", "prompt"])
-async def test_the_stop_key_stops_over_whatever_lies_on_the_screen(over: str) -> None:
-    async with watched(picture()) as run:
+@pytest.mark.parametrize("over", ["q", "question_mark", "enter", "prompt"])
+async def test_the_stop_key_stops_over_whatever_lies_on_the_screen(over: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(terminal, "STOP_SHOWN_S", 600.0)  # a busy machine looks late
+    async with watched(full_picture()) as run:
         if over == "prompt":
             await run.look(picture(state=State.ASKING, prompt=SPLIT))
         else:
             await run.press(over)
         await run.look()
+        assert over == "question_mark" or not isinstance(run.app.screen, RunScreen)
         await run.press("s")
         assert run.engine.calls == ["stop"]
         assert "STOP SENT" in await run.look()
+        await run.press("escape")
+        assert isinstance(run.app.screen, RunScreen) is (over != "prompt")
 
 
 async def test_requests_are_passed_on_and_shown_until_they_are_carried_out() -> None:
@@ -79,13 +84,14 @@ async def test_requests_are_passed_on_and_shown_until_they_are_carried_out() -> 
             assert "red button: emergency stop" in text
 
 
-async def test_q_asks_while_the_run_is_on_and_parks_before_it_leaves() -> None:
-    async with watched(picture()) as run:
+@pytest.mark.parametrize("now", [picture(), picture(state=State.ASKING, prompt=SPLIT)], ids=["running", "asking"])
+async def test_q_asks_while_the_run_is_on_and_parks_before_it_leaves(now: Snapshot) -> None:
+    async with watched(now) as run:
         for quit_key, no_key in (("q", "n"), ("ctrl+q", "escape")):
             await run.press(quit_key, quit_key)
             assert asks(run.app)
             await run.press(no_key)
-            assert isinstance(run.app.screen, RunScreen)
+            assert not asks(run.app)
         assert run.engine.calls == []
         await run.press("q", "y")
         assert run.engine.calls == ["park"]
@@ -176,8 +182,7 @@ def without_terminal(monkeypatch: pytest.MonkeyPatch, pilot: object) -> None:
 
 
 async def until_over(pilot: Pilot[None]) -> None:
-    while pilot.app.is_running:
-        await asyncio.sleep(0.02)
+    await until(lambda: not pilot.app.is_running, "the end of the screen")
 
 
 @pytest.mark.parametrize(

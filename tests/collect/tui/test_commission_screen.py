@@ -18,22 +18,16 @@ from brushloop.collect.errors import CollectAborted
 from brushloop.collect.tui.commission_app import CommissionApp, Steps
 from brushloop.collect.tui.widgets import AskScreen
 from tests.collect.tui.fake import Asking, shown
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, until
 
 SIZE = (80, 24)
-
-
-async def until(condition: Callable[[], bool]) -> None:
-    async with asyncio.timeout(PATIENCE_S):
-        while not condition():
-            await asyncio.sleep(0.01)
 
 
 @asynccontextmanager
 async def running(asking: Asking) -> AsyncIterator[tuple[CommissionApp, Pilot[None]]]:
     app = CommissionApp(asking.visit, asking)
     async with app.run_test(size=SIZE) as pilot:
-        await until(lambda: app.first_day.is_mounted and (app.first_day.prompt is not None or not asking.kinds))
+        await until(lambda: app.first_day.is_mounted and app.first_day.prompt is not None, "the first question")
         await pilot.pause()
         try:
             yield app, pilot
@@ -43,7 +37,7 @@ async def running(asking: Asking) -> AsyncIterator[tuple[CommissionApp, Pilot[No
 
 
 async def seen(app: CommissionApp, pilot: Pilot[None], condition: Callable[[], bool]) -> None:
-    await until(condition)
+    await until(condition, "what the screen is to show")
     await pilot.pause()
 
 
@@ -96,7 +90,7 @@ async def test_a_stop_key_stops_what_is_at_work_and_ends_the_screen(key: str, wo
         await seen(app, pilot, lambda: asking.at_work and app.first_day.prompt is None)
         assert re.search(r"s: software stop; red button: emergency stop   at work, \d+ s", shown(app))
         await pilot.press(key)
-        await until(lambda: not app.is_running)
+        await until(lambda: not app.is_running, "the end of the screen")
     assert asking.stopped_arm
     with pytest.raises(CollectAborted, match=r"look at the arm\. The same command resumes"):
         app.steps.join()

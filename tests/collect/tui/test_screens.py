@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from textual.geometry import Region, Size
+from textual.geometry import Region
 from textual.pilot import Pilot
 from textual.widget import Widget
 from textual.widgets import Static
@@ -20,9 +20,9 @@ from textual.widgets import Static
 from brushloop.collect.engine.control import State
 from brushloop.collect.operator import Choice, Prompt
 from brushloop.collect.tui.app import OperatorApp
-from brushloop.collect.tui.capture_screen import COLOURS, CaptureScreen, over_photograph
-from brushloop.collect.tui.pictures import CellPicture, braille, look_for_pixels, picture_widget, strip_of
-from brushloop.collect.tui.run_screen import RunScreen, spark
+from brushloop.collect.tui.capture_screen import COLOURS, over_photograph
+from brushloop.collect.tui.pictures import CellPicture, look_for_pixels, picture_widget
+from brushloop.collect.tui.run_screen import RunScreen
 from brushloop.collect.tui.widgets import AskScreen
 from brushloop.sessions.recording import remarks_of
 from tests.collect.tui.fake import (
@@ -30,9 +30,7 @@ from tests.collect.tui.fake import (
     FakeEngine,
     a_review,
     app_of,
-    capture,
     full_picture,
-    has_picture,
     picture,
     shown,
     watched,
@@ -68,11 +66,6 @@ async def test_what_did_not_change_is_not_drawn_again(monkeypatch: pytest.Monkey
         assert drawn == []
 
 
-def test_a_force_is_drawn_to_scale_and_noise_does_not_fill_its_place() -> None:
-    assert spark([0.0, 0.5, 1.0]) == " ▄█"
-    assert spark([0.001, 0.0]) == "▁ "
-
-
 async def test_b_marks_the_last_capture_and_takes_it_back_while_the_run_is_on(tmp_path: Path) -> None:
     now = full_picture(folder=str(tmp_path))
     last = now.last
@@ -105,20 +98,6 @@ PROMPT = Prompt(
 )
 
 
-async def test_enter_shows_the_last_capture_large_with_the_missed_check_first() -> None:
-    async with watched(full_picture(last=capture(kept=False))) as run:
-        await run.press("enter")
-        text = await run.look()
-        assert isinstance(run.app.screen, CaptureScreen)
-        assert text.index("! split") < text.index("✓ well lit")
-        for part in ("0.42  ≤ 0.30 mm", "The tip is split.", "% in mm", "predicted only", "s STOP"):
-            assert part in text
-        assert has_picture(text)
-        await run.press("left", "right", "s", "escape")
-        assert isinstance(run.app.screen, RunScreen)
-        assert run.engine.calls == ["stop"]
-
-
 def test_an_overlay_has_the_edge_of_the_prediction() -> None:
     predicted = np.zeros((128, 128), bool)
     predicted[50:70, 40:80] = True
@@ -137,17 +116,6 @@ async def test_a_key_answers_the_question_that_is_shown_and_the_next_one_comes()
         assert "Is there ink?" in await run.look(asking)
         assert "RUNNING" in await run.look(picture())
         assert isinstance(run.app.screen, RunScreen)
-
-
-async def test_q_over_a_question_leaves_it_unanswered_and_parks() -> None:
-    async with watched(picture(state=State.ASKING, prompt=PROMPT)) as run:
-        assert "q Leave: park the arm" in await run.look()
-        for answer, calls in (("n", []), ("y", ["park"])):
-            await run.press("q")
-            assert isinstance(run.app.screen, AskScreen)
-            assert run.app.screen.own
-            await run.press(answer)
-            assert run.engine.calls == calls
 
 
 async def ready(app: OperatorApp, pilot: Pilot[None]) -> str:
@@ -246,17 +214,3 @@ def test_pictures_work_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setitem(sys.modules, "textual_image", None)
     look_for_pixels()
     assert isinstance(picture_widget("x"), CellPicture)
-
-
-def test_a_pixel_is_a_dot_of_its_own_colour_on_the_colour_of_most() -> None:
-    paper = np.full((4, 4), 255, np.uint8)
-    paper[0, 0] = paper[3, 3] = 0
-    [line] = braille(paper, Size(2, 1))
-    assert strip_of(line).text == "⠁⢀"
-    colours = np.full((4, 4, 3), 255, np.uint8)
-    colours[:, 2:] = (0, 114, 181)
-    colours[0, 3] = 255
-    [line] = braille(colours, Size(2, 1))
-    strip = strip_of(line)
-    assert strip.text == "⠀⠈"
-    assert str(list(strip)[1].style) == "rgb(255,255,255) on rgb(0,115,180)"
