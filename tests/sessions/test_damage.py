@@ -126,6 +126,10 @@ def last_step(folder, _):
     forget_from(folder, "begin", "H13-a05-r01 capture").unlink()
 
 
+def merged_of_another(folder, other):
+    shutil.copy(other / f"{OTHER}.mcap", folder / f"{ID}.mcap")
+
+
 def merged_alone(folder, other):
     for path in folder.glob("0*.mcap"):
         path.unlink()
@@ -188,12 +192,11 @@ CASES = {
     ),
     "open: the configuration": Case(configuration, "is missing, or has changed since the session was started"),
     "open: the journal of another": Case(lambda f, other: shutil.copy(other / JOURNAL_NAME, f), FOREIGN),
+    "open: a merged file of another": Case(merged_of_another, FOREIGN),
     "closed: steps": Case(steps_of_closed, "(board) is missing, though the journal says it was finished"),
     "closed: steps and merged file": Case(steps_and_merged, "its index", ["capture H13-a05-r01"], BOTH[:1]),
     "closed: no merged file": Case(lambda f, _: (f / f"{ID}.mcap").unlink(), "is missing, though the journal says"),
-    "closed: the merged file of another": Case(
-        lambda f, other: shutil.copy(other / f"{OTHER}.mcap", f / f"{ID}.mcap"), "has changed since it was recorded"
-    ),
+    "closed: the merged file of another": Case(merged_of_another, "has changed since it was recorded"),
     "closed: the journal of another": Case(lambda f, other: shutil.copy(other / JOURNAL_NAME, f), FOREIGN),
     "closed: the journal of another and no steps": Case(merged_alone, FOREIGN),
     "closed: a step of another": Case(
@@ -404,12 +407,3 @@ def test_a_session_may_be_renamed_open_and_closed(opened, resume, repair, tmp_pa
     assert verify_session(closed).sound
     assert repair(closed).did == []
     assert list(summaries(tmp_path)) == [Summary("s1", "closed", "loopback rig", 2, f"{ID}.mcap")]
-
-
-def test_a_merged_file_of_another_session_in_an_open_one_is_put_aside_once(make, opened, other, repair):
-    shutil.copy(other / f"{OTHER}.mcap", opened / f"{ID}.mcap")
-    assert verify_session(opened).findings == {f"{ID}.mcap": [FOREIGN]}
-    report = repair(opened)
-    assert (len(report.did), not report.lost) == (1, True)
-    assert (opened / f"{ID}.mcap.damaged-1").read_bytes() == (other / f"{OTHER}.mcap").read_bytes()
-    assert verify_session(opened).sound

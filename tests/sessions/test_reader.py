@@ -66,11 +66,10 @@ def test_stills_are_found_by_the_kind_of_their_step(make, closed):
     assert list(recording.stills_of("dip")) == []
 
 
-@pytest.mark.parametrize("content", [b"", b"{}", b"hello, world: this is no recording\n" * 30, None], ids=str)
+@pytest.mark.parametrize("content", [b"", b"{}", b"hello, world: this is no recording\n" * 30], ids=str)
 def test_what_is_no_mcap_file_is_refused(path, content):
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(InputError, match="no such session" if content is None else "is not an MCAP file"):
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="is not an MCAP file"):
         Recording(path)
 
 

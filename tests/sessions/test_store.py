@@ -1,12 +1,10 @@
 """A session's folder: one process at a time, resumed from its journal, whole whatever the disk and the clock do."""
 
 import errno
-import io
 import itertools
 import os
 from collections import namedtuple
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
@@ -47,16 +45,6 @@ def test_attempts_sheets_patches_and_results_are_kept_across_processes(make, sto
     assert [(begin.key, why) for begin, why in state.cut] == [("H15-a05", "stopped by the operator")]
     assert state.sheet == 1, "a fresh sheet frees its patches and stays fresh"
     assert state.used_patches == {(0, 0), (0, 1), (0, 36), (0, 2), (1, 0)}
-
-
-def test_a_process_that_dies_between_rename_and_done_does_the_step_again(make, store, resume):
-    attempt = store.begin("H13-a05", StepKind.PRESS, patches=(3,))
-    attempt.writer.write(make.stroke(0, stroke_id="never journalled"))
-    attempt.writer.finish()
-    second = resume(store)
-    assert second.state.done == {}
-    make.perform(second, "H13-a05", 4)
-    assert make.stroke_names(second.close()) == ["H13-a05"]
 
 
 def test_the_merged_file_holds_what_the_journal_counted_and_the_configuration(make, store):
@@ -110,33 +98,6 @@ def test_a_step_is_not_begun_nor_a_session_merged_where_its_files_might_not_fit(
             store.close()
     assert make.tree(store.folder) == before
     assert make.stroke_names(store.close()) == ["a"]
-
-
-def test_a_disk_that_fills_up_during_a_step_ends_the_attempt_and_nothing_finished_is_lost(
-    make, store, resume, monkeypatch
-):
-    """The file of a step does not fit; with room again, the session goes on with the next attempt."""
-    make.perform(store, "a", 0)
-    open_ = Path.open
-
-    class Full(io.FileIO):
-        def write(self, data):
-            raise OSError(errno.ENOSPC, "No space left on device")
-
-    def open_on_it(path, mode="r", **options):
-        return io.BufferedWriter(Full(path, mode)) if mode == "xb" else open_(path, mode, **options)
-
-    with monkeypatch.context() as full_disk:
-        full_disk.setattr(Path, "open", open_on_it)
-        with pytest.raises(DiskFull, match="cannot write: No space left on device"):
-            make.perform(store, "b", 1)
-
-    again = resume(store)
-    assert set(again.state.done) == {"a"}
-    assert again.state.used_patches == {(0, 0), (0, 1)}
-    make.perform(again, "b", 2)
-    assert make.stroke_names(again.close()) == ["a", "b"]
-    assert verify_session(store.folder).sound
 
 
 def test_a_read_only_folder_is_reported_in_one_line(make, store, monkeypatch):

@@ -16,7 +16,7 @@ from mcap.records import Channel, Chunk, Message, MessageIndex, Schema
 from mcap.stream_reader import StreamReader
 
 from brushloop.sessions import mcap_writer
-from brushloop.sessions.errors import SessionDamaged, SessionError
+from brushloop.sessions.errors import DiskFull, SessionDamaged, SessionError
 from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.mcap_writer import CHUNK_BYTES, McapWriter, SegmentWriter
 from brushloop.sessions.records import HEADER_FILE
@@ -54,14 +54,16 @@ def test_a_recording_is_never_overwritten(make, path, suffix):
     assert make.tree(path.parent) == {there.name: b"precious"}
 
 
-@pytest.mark.parametrize("failing", ["fsync", "rename"])
-def test_an_error_of_the_last_steps_is_a_session_error(make, path, monkeypatch, failing):
+@pytest.mark.parametrize(
+    ("failing", "number", "kind"), [("fsync", errno.ENOSPC, DiskFull), ("rename", errno.EIO, SessionError)]
+)
+def test_an_error_of_the_last_steps_is_a_session_error(make, path, monkeypatch, failing, number, kind):
     def fail(*_):
-        raise OSError(errno.EIO, "Input/output error")
+        raise OSError(number, os.strerror(number))
 
     writer = SegmentWriter(path, make.header)
-    monkeypatch.setattr(*((os, "fsync", fail) if failing == "fsync" else (Path, "rename", fail)))
-    with pytest.raises(SessionError, match="Input/output error"):
+    monkeypatch.setattr(os if failing == "fsync" else Path, failing, fail)
+    with pytest.raises(kind, match=os.strerror(number)):
         writer.finish()
     assert [p.name for p in path.parent.iterdir()] == [f"{path.name}.part"]
 
