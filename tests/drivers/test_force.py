@@ -156,7 +156,7 @@ async def test_a_sensor_that_says_the_same_again_and_again_is_named_as_stuck(mon
     monkeypatch.setattr(sri_m8123, "STUCK_MS", 100.0)
     board = ForceBoard(lambda _: WRENCH, noise_n=0.002, noise_nm=2e-4)
     async with sensing(board) as sensor:
-        await until(lambda: sensor.latest().stamp.seq > 50, "rounds")
+        await until(lambda: sensor.latest().stamp.seq > 10, "rounds")
         assert sensor.latest().force_n == pytest.approx(WRENCH[:3], abs=0.02)
         board.next_fault = lambda: "stuck"
         await until(lambda: isinstance(latest_error(sensor), Stuck), "a stuck sensor")

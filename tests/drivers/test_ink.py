@@ -99,7 +99,6 @@ async def test_a_session_reads_like_the_documented_one():
     ("exchanges", "error", "says"),
     [
         ([(LEVEL, b"001 ok 1.5*CD6C\n")], ProtocolViolation, "above 1"),
-        ([(LEVEL, b"001 ok nan*1429\n")], ProtocolViolation, "not a decimal"),
         ([(LEVEL, b"001 ok*C626\n")], ProtocolViolation, "not a decimal: ''"),
         ([(LEVEL, b"001 err 6 jammed*4073\n")], InkRefused, "Look at the pump"),
         ([(DOSE, b"001 ok 0.400*8194\n")], DeviceError, r"gave 0.400 ml instead of 0.500 ml"),

@@ -329,14 +329,14 @@ FINDERS: dict[str, tuple[Find, list[bytes]]] = {
 def test_any_bytes_hold_one_reply_or_none_wherever_they_are_cut(find: Find, valid: list[bytes]):
     """As `SerialPort` asks: everything so far is shown after each piece, until something is made of it."""
     rng, replies = random.Random(31), 0
-    for received in hostile(valid, 4000):
+    for received in hostile(valid, 1500):
         firsts: list[object] = []
         for chunks in pieces(received, rng):
             shown = (find(b"".join(chunks[: end + 1])) for end in range(len(chunks)))
             firsts.append(next((reply for reply in shown if reply is not None), None))
         assert firsts[0] == firsts[1] == firsts[2], received
         replies += firsts[0] is not None
-    assert replies > 200
+    assert replies > 75
 
 
 @pytest.mark.parametrize("sound", [LINES[1], START], ids=["ink station", "pump"])

@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.config import SimConfig, Table
@@ -25,7 +24,6 @@ class Scripted(FaultBoard):
         self.doing = Phase.PARKED
         self.presses: list[None] = []
         self.clock = self
-        self.stops: list[SafetyMode] = []
         self.config = SimConfig(force_sensor=False)
         super().__init__(self)  # type: ignore[arg-type]
 
@@ -36,7 +34,7 @@ class Scripted(FaultBoard):
         return self.doing
 
     def strikes_on(self, device: Device, ops: str) -> list[bool]:
-        self.begin_due(self.stops.append)
+        self.begin_due(lambda _mode: None)
         return [self.meet(device, op) is not None for op in ops.split()]
 
 
@@ -82,16 +80,6 @@ def test_a_fault_strikes_the_requests_that_its_conditions_name(
         vars(board).update(changes)
         assert board.strikes_on(hung.device, ops) == expected
     assert board.strikes == sum(sum(expected) for _, _, expected in moments)
-
-
-def test_a_stop_begins_by_itself_and_once() -> None:
-    board = Scripted()
-    board.hang(fault_of({"device": "robot", "kind": "emergency-stop", "phase": "lifting", "for_s": 9.0}))
-    assert board.strikes_on(Device.ROBOT, "x") == [False]
-    assert board.stops == []
-    board.doing = Phase.LIFTING
-    assert board.strikes_on(Device.ROBOT, "x") == board.strikes_on(Device.ROBOT, "x") == [False]
-    assert board.stops == [SafetyMode.ROBOT_EMERGENCY_STOP]
 
 
 @pytest.mark.parametrize(

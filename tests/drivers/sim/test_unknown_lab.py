@@ -12,15 +12,10 @@ import pytest
 from typer.testing import CliRunner
 
 import brushloop.__main__
-from brushloop.drivers.arcs.controller import Controller
-from brushloop.drivers.arcs.wire import open_arcs
-from brushloop.drivers.geometry import from_wire
-from brushloop.drivers.loopback import FaultRefused
 from brushloop.drivers.sim.config import CORNERS
-from brushloop.drivers.sim.kinematics import forward, inverted, matrix_of, pose_of
 from brushloop.drivers.sim.lab import LabRefused, UnknownLab
 from brushloop.drivers.sim.lab_facts import draw, in_picture
-from brushloop.drivers.sim.rig import PORTS, ControlServer
+from brushloop.drivers.sim.rig import ControlServer
 from brushloop.drivers.sim.world import tool_of
 
 SMALL_PX = (640, 480)
@@ -58,27 +53,12 @@ async def test_the_hand_brings_the_true_tip_to_the_thing():
     assert lab.world.presses == []
 
 
-async def test_what_a_client_reads_agrees_with_the_truth_and_the_labels_tell_nothing_of_it():
-    async with UnknownLab(4, rate=FAST, picture_px=SMALL_PX) as lab:
-        controller = Controller(lab.host, PORTS["arcs"], timeout_s=10.0)
-        await open_arcs(controller)
-        [controller.robot, *_] = await controller.robot_names()
-        await lab.bring("pin", 2)
-        joints = await controller.ask_numbers("RobotState.getJointPositions")
-        tcp = from_wire(await controller.ask("RobotConfig.getTcpOffset"))
-        reported = await controller.pose()
-        assert [*map(float, matrix_of(tcp)[:3, 3])] == pytest.approx(list(lab.facts.cabinet_tcp[:3]))
-        assert pose_of(forward(joints) @ matrix_of(tcp)).position_mm == pytest.approx(reported.position_mm, abs=1e-3)
-        flange = matrix_of(reported) @ inverted(matrix_of(tcp))
-        tip = pose_of(flange @ tool_of(lab.facts.config))
-        assert tip.position_mm == pytest.approx(lab.world.tool().position_mm, abs=1e-3)
-        assert (await controller.ask("RobotConfig.getPayload"))[0] == lab.facts.payload_kg
-        assert await controller.ask("RobotState.isSteady")
-        words = " ".join(lab.labels())
-        assert lab.host in words
-        for hidden in (lab.facts.config.tool_mm, lab.facts.config.table.yaw_deg, lab.facts.pin_mm[0]):
-            assert f"{hidden:.1f}" not in words
-        await controller.close()
+def test_the_labels_tell_where_to_connect_and_nothing_that_has_to_be_measured():
+    lab = lab_of(4)
+    words = " ".join(lab.labels())
+    assert lab.host in words
+    for hidden in (lab.facts.config.tool_mm, lab.facts.config.table.yaw_deg, lab.facts.pin_mm[0]):
+        assert f"{hidden:.1f}" not in words
 
 
 @pytest.mark.parametrize(
@@ -123,5 +103,3 @@ async def test_a_person_at_the_command_line_guides_the_arm(tmp_path: Path):
             run, "sim", "hand", str(socket), "bring", "board-corner", "--corner", "lower left"
         )
         assert said == "The tip is at the board-corner, lower left.\n"
-        with pytest.raises(FaultRefused, match="to = 'moon' is not one of pin"):
-            await asyncio.to_thread(run, "sim", "hand", str(socket), "bring", "moon")

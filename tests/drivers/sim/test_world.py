@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import tomllib
 from collections.abc import Iterable
@@ -129,8 +128,8 @@ def test_the_rig_toml_of_the_paper_s_brush_says_where_its_marks_begin() -> None:
     assert paper.quality is not None
     assert "made to agree with the paper's Table 2: no evidence for the model" in paper.name
     heads_mm: list[float] = []
-    for depth_mm, tilt_deg in itertools.product((11.0, 20.0), (0.0, 5.0, 10.0)):
-        mark = Brush(paper.brush).press(depth_mm, tilt_deg, ink_load=1.0, press_seed=1)
+    for tilt_deg in (0.0, 10.0):  # the farthest back and the farthest forward
+        mark = Brush(paper.brush).press(20.0, tilt_deg, ink_load=1.0, press_seed=1)
         columns = np.flatnonzero((mark.density > 0.5).any(axis=0))
         heads_mm.append((columns[-1] + 1 - mark.origin_px[0]) / mark.px_per_mm)
     assert max(abs(at - paper.quality.head_mm) for at in heads_mm) < paper.quality.misplaced_mm - 0.5
