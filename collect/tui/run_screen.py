@@ -305,7 +305,7 @@ def figures_content(now: Snapshot) -> Content:
     percent = 100 * now.strokes_done // now.strokes_planned if now.strokes_planned else 0
     going_on = "" if now.state in FINAL else f"   {left} left   {eta_text(now) or 'no ETA yet'}"
     strokes = f"{now.strokes_done}/{now.strokes_planned}  {percent} %   elapsed {minutes_text(now.elapsed_s)}{going_on}"
-    counts = [f"{now.voids} attempts cut", f"left out {now.given_up}" if now.given_up else ""]
+    counts = [f"attempts cut {now.voids}", f"left out {now.given_up}" if now.given_up else ""]
     counts.append("ink level unknown" if now.ink_level is None else f"ink {now.ink_level:.0%} of the well")
     warned = "bold $text-warning" if now.voids or now.given_up else ""
     rows: list[tuple[str, Content | str]] = [
