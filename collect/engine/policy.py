@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from enum import StrEnum
-from typing import NamedTuple
 
 from brushloop.calibrate.board.pix2len import WORST_RMS_PX
 from brushloop.collect.errors import (
@@ -122,8 +121,8 @@ TITLES = {
     StepKind.SELF_CHECK: "Self-check",
 }
 """Steps of the set-up, in their order."""
-NAME = 20
-"""Columns of a fact's name."""
+NAME, SIGNS = 20, {True: "✓", False: "!", None: " "}
+"""Columns of a fact's name; what stands before it if it is within its limit, if not, and if it has none."""
 
 
 def in_set_up(step: Step) -> bool:
@@ -131,17 +130,8 @@ def in_set_up(step: Step) -> bool:
     return step.kind in TITLES and step.index == 0
 
 
-class Fact(NamedTuple):
-    """One measured value of a set-up step, and whether it is within its limit; None without one."""
-
-    name: str
-    value: str
-    good: bool | None = None
-
-    def __str__(self) -> str:
-        """A line such as `✓ residual of corners  0.11 px  (at most 1)`."""
-        sign = {True: "✓", False: "!", None: " "}[self.good]
-        return f"{sign} {self.name:<{NAME}} {self.value}"
+Fact = tuple[str, str, bool | None]
+"""Name and value of what a set-up step measured, and whether it is within its limit; None without one."""
 
 
 def accept_question(result: StepResult, config: RigConfig) -> Prompt:
@@ -155,13 +145,13 @@ def accept_question(result: StepResult, config: RigConfig) -> Prompt:
             facts = list(_self_check(result, config))
         case _:
             facts = []
-    good = all(fact.good is not False for fact in facts)
+    good = all(within is not False for _name, _value, within in facts)
     verdict = f"{TITLES[result.kind]}: " + ("all within limits." if good else "not all is within limits.")
-    text = "\n".join([verdict, *map(str, facts)])
+    lines = [f"{SIGNS[within]} {name:<{NAME}} {value}" for name, value, within in facts]
     choices = [Choice(GO_ON, "good, go on" if good else "go on anyway"), AGAIN]
     if isinstance(result, ZeroTouchResult):
         choices += [BY_JOG, *([BY_FORCE] if config.force is not None else [])]
-    return Prompt(text, (*choices, STOP), STOP.key)
+    return Prompt("\n".join([verdict, *lines]), (*choices, STOP), STOP.key)
 
 
 def by_method(step: Step, answer: str) -> Step:
@@ -171,13 +161,13 @@ def by_method(step: Step, answer: str) -> Step:
 
 def _within(name: str, value: float, limit: float, shown: str) -> Fact:
     """A value that may be at most `limit` to either side of zero."""
-    return Fact(name, f"{shown}  (at most {limit:g})", abs(value) <= limit)
+    return name, f"{shown}  (at most {limit:g})", abs(value) <= limit
 
 
 def _board(result: BoardResult, config: RigConfig) -> Iterator[Fact]:
     delay_ms, jitter_ms = result.camera_delay_ms, result.camera_jitter_ms
-    yield Fact("corners seen", str(result.corners))
-    yield Fact("scale (pix2len)", f"{result.mm_per_px:.4f} mm/px")
+    yield "corners seen", str(result.corners), None
+    yield "scale (pix2len)", f"{result.mm_per_px:.4f} mm/px", None
     yield _within("residual of corners", result.rms_px, WORST_RMS_PX, f"{result.rms_px:.2f} px")
     if delay_ms is not None and jitter_ms is not None:
         yield _within("delay of the camera", delay_ms, config.camera.max_delay_ms, f"{delay_ms:.0f} ms")
@@ -185,21 +175,21 @@ def _board(result: BoardResult, config: RigConfig) -> Iterator[Fact]:
     for check in result.checks:
         score = check.score or 0.0
         if check.name == "blurred":
-            yield Fact("focus: blur", f"{score:.2f} mm  (at most {check.threshold:g})", check.passed)
+            yield "focus: blur", f"{score:.2f} mm  (at most {check.threshold:g})", check.passed
         elif check.name == "exposure":
-            yield Fact("light: paper", f"level {score:.0f}", check.passed)
+            yield "light: paper", f"level {score:.0f}", check.passed
 
 
 def _touch(result: ZeroTouchResult, config: RigConfig) -> Iterator[Fact]:
     touch, method = config.touch, result.method
     taught = method == "taught"
-    yield Fact("method", "taught height, visited" if taught else method)
+    yield "method", "taught height, visited" if taught else method, None
     for number, point in enumerate(result.points, 1):
         where = f"point {number} ({point.x_mm:.0f}, {point.y_mm:.0f})"
         if taught:
-            yield Fact(where, f"rests at {point.z_mm:.2f} mm")
+            yield where, f"rests at {point.z_mm:.2f} mm", None
             continue
-        yield Fact(where, f"{point.z_mm:.3f} mm")
+        yield where, f"{point.z_mm:.3f} mm", None
         yield _within("  its touches span", point.span_mm, touch.repeatability_mm, f"{point.span_mm:.3f} mm")
     if not taught:
         yield _within("from the height before", result.moved_mm, touch.moved_mm, f"{result.moved_mm:+.3f} mm")
@@ -207,7 +197,7 @@ def _touch(result: ZeroTouchResult, config: RigConfig) -> Iterator[Fact]:
     if len(residuals) > 3:
         yield _within("off the plane", max(residuals), touch.residual_mm, f"{max(residuals):.3f} mm")
     plane = "level: fewer than three points" if len(residuals) < 3 else f"leans by {result.slope_deg:.2f}°"
-    yield Fact("plane", plane)
+    yield "plane", plane, None
 
 
 def _self_check(result: SelfCheckResult, config: RigConfig) -> Iterator[Fact]:
@@ -216,5 +206,5 @@ def _self_check(result: SelfCheckResult, config: RigConfig) -> Iterator[Fact]:
     scale_x, scale_y = (100.0 * (scale - 1.0) for scale in result.scale)
     yield _within("marks lie off by", off_mm, limits.offset_mm, f"{off_mm:.2f} mm")
     yield _within("turned by", turn_deg, limits.turn_deg, f"{turn_deg:+.2f}°")
-    yield Fact("lengths off by", f"{scale_x:+.2f} % in x, {scale_y:+.2f} % in y")
-    yield Fact("left over", f"{max(result.residuals_mm):.2f} mm")
+    yield "lengths off by", f"{scale_x:+.2f} % in x, {scale_y:+.2f} % in y", None
+    yield "left over", f"{max(result.residuals_mm):.2f} mm", None

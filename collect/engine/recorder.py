@@ -19,7 +19,7 @@ from brushloop.calibrate.board.pix2len import Plane, see_board
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.stroke import Gray
 from brushloop.collect.engine.control import RunControl
-from brushloop.collect.engine.live import Telemetry
+from brushloop.collect.engine.live import LiveView, Telemetry
 from brushloop.collect.engine.open_or_resume import Opening
 from brushloop.collect.engine.snapshot import Progress
 from brushloop.collect.errors import ConfigError, ForceTooHigh, StepError, describe
@@ -120,10 +120,10 @@ CLOCK_STEP_NS = 1_000_000_000
 class Recorder:
     """Writer of one attempt, with one method for each kind of message."""
 
-    def __init__(self, writer: SegmentWriter, clock: Clock, show: Callable[[Outgoing], None] | None = None) -> None:
-        """`show` is called with every message as well; it must neither block nor raise."""
+    def __init__(self, writer: SegmentWriter, clock: Clock, live: LiveView | None = None) -> None:
+        """`live` shows every message to viewers as well."""
         self._writer = writer
-        self._show = show
+        self._live = live
         self._clock = clock
         self.listeners: list[Callable[[PoseSample], None]] = []
         """Called with every pose."""
@@ -213,8 +213,12 @@ class Recorder:
     def _put(self, topic: Topic, log_ns: int, publish_ns: int, sequence: int, message: Event | Message) -> None:
         outgoing = Outgoing(topic, log_ns, publish_ns, sequence, message)
         self._writer.write(outgoing)
-        if self._show is not None:
-            self._show(outgoing)
+        self.show(outgoing)
+
+    def show(self, outgoing: Outgoing) -> None:
+        """Show viewers a message that the file holds."""
+        if self._live is not None:
+            self._live.offer(outgoing)
 
 
 @dataclass(slots=True)

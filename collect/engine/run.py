@@ -34,6 +34,7 @@ from brushloop.collect.errors import (
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
 from brushloop.collect.protocols import steps
 from brushloop.collect.protocols.steps import MARKING, Protocol, Step, press_of, takes
+from brushloop.collect.rig.paper import Patch
 from brushloop.collect.walk import patches_of, steps_on
 from brushloop.drivers.errors import ArmMoved, DeviceError, LimitExceeded, MotionError
 from brushloop.sessions.errors import SessionError
@@ -225,8 +226,8 @@ class Run(RunContext):
         attempt = store.begin(step.key, step.kind, patches=tuple(patch.index for patch in patches), press=press)
         self.progress.count()
         try:
-            with self._observed(attempt) as (recorder, guard):
-                result = await self._do(step, StepContext(self, patches, attempt, recorder, guard))
+            with self._observed(attempt, patches) as context:
+                result = await self._do(step, context)
                 await self._check_heights(step)
         except BaseException as error:
             self.left_ink_ns = None
@@ -243,19 +244,16 @@ class Run(RunContext):
         return result
 
     @contextlib.contextmanager
-    def _observed(self, attempt: Attempt) -> Generator[tuple[Recorder, ForceGuard]]:
+    def _observed(self, attempt: Attempt, patches: tuple[Patch, ...]) -> Generator[StepContext]:
         """Within the block, record the poses and forces of an attempt, and show them to whoever watches."""
-        rig, live = self.rig, self.opening.live
-        show = None if live is None else live.offer
-        recorder = Recorder(attempt.writer, rig.clock, show)
-        if show is not None:
-            show(step_message(attempt.begin))
+        rig, recorder = self.rig, Recorder(attempt.writer, self.rig.clock, self.opening.live)
+        recorder.show(step_message(attempt.begin))
         guard = ForceGuard(rig, recorder.force, self.telemetry.force)
         try:
             rig.robot.listen(recorder.pose)
             if rig.force is not None:
                 rig.force.listen(guard.sample)
-            yield recorder, guard
+            yield StepContext(self, patches, attempt, recorder, guard)
         finally:
             if rig.force is not None:
                 rig.force.listen(None)

@@ -275,44 +275,39 @@ class Progress:
         for begin in state.running.values():
             marks |= {(begin.sheet, patch): Mark.NOW for patch in begin.patches[:1]}
             at_work = begin.press is not None
-        kept: dict[str, Press] = {}
-        bad: list[Press] = []
+        made: dict[tuple[str, int], tuple[Press, Mark]] = {}
         left_out: list[Press] = []
         times_ns: list[int] = []
         ink_level: float | None = None
         for step in state.files.values():
             match step.result:
                 case PressResult(press=press):
-                    marks[press.sheet, press.patch] = Mark.WAITING
+                    made[press.stroke_id, press.take] = press, Mark.WAITING
                 case SelfCheckResult(sheet=sheet, patches=patches):
                     marks |= {(sheet, patch): Mark.CHECK for patch in patches}
-                case CaptureResult(press=press, kept=True):
-                    marks[press.sheet, press.patch] = Mark.KEPT
-                    kept[press.stroke_id] = press
-                    times_ns += [step.t_ns] if step.t_ns >= self._started_ns else []
-                case CaptureResult(press=press, retake=retake):
-                    marks[press.sheet, press.patch] = Mark.BAD
-                    bad.append(press)
-                    left_out += [] if retake else [press]
+                case CaptureResult(press=press, kept=counts, retake=retake):
+                    made[press.stroke_id, press.take] = press, Mark.KEPT if counts else Mark.BAD
+                    times_ns += [step.t_ns] if counts and step.t_ns >= self._started_ns else []
+                    left_out += [] if counts or retake else [press]
                 case DipResult(skipped=skipped):
                     ink_level = step.result.ink_level
                     left_out += [] if skipped is None else [skipped]
-                case ReviewResult(again=again) as review:
+                case ReviewResult() as review:
                     plan = with_review(plan, review)
-                    for stroke in again:
-                        press = kept.pop(stroke.stroke_id)
-                        marks[press.sheet, press.patch] = Mark.BAD
-                        bad.append(press)
+                    again = {stroke.stroke_id for stroke in review.again}
+                    made |= {key: (press, Mark.BAD) for key, (press, _) in made.items() if press.stroke_id in again}
                 case _:
                     pass
-        ended = kept.keys() | {press.stroke_id for press in left_out}
+        marks |= {(press.sheet, press.patch): mark for press, mark in made.values()}
+        kept, bad = ([press for press, mark in made.values() if mark is wanted] for wanted in (Mark.KEPT, Mark.BAD))
+        ended = {press.stroke_id for press in (*kept, *left_out)}
         self.plan, self.left = plan, [stroke for stroke in plan if stroke.stroke_id not in ended]
         sheet, layout = state.sheet, self._layout
         on_sheet = tuple(marks.get((sheet, patch)) for patch in range(layout.capacity))
         self._change(
             strokes_done=len(kept),
             strokes_planned=len(plan),
-            grid=self._grid(kept.values(), bad, left_out, at_work=at_work),
+            grid=self._grid(kept, bad, left_out, at_work=at_work),
             voids=len(state.cut),
             given_up=len(left_out),
             eta_s=self._eta_s(times_ns),
