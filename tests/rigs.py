@@ -35,7 +35,7 @@ from brushloop.drivers.sim.brush.footprint import Flaw
 from brushloop.drivers.sim.config import SimConfig, Table, View
 from brushloop.drivers.sim.faults import Device
 from brushloop.drivers.sim.rig import PORTS, LoopbackRig, rig_toml
-from brushloop.drivers.sim.world import SimClock
+from brushloop.drivers.sim.world import Press, SimClock
 from brushloop.sessions.journal import JOURNAL_NAME, RunState, replay
 from tests.command import brushloop
 from tests.runs import SteppedEngine, end, wait_for_end
@@ -60,7 +60,8 @@ COARSE = SimConfig(rate=60.0, view=SMALL_VIEW, force_hz=100.0)
 BARE = SimConfig(rate=300.0, view=SMALL_VIEW, ink_device="none", force_sensor=False)
 """The same, without ink device and force sensor, and fast."""
 SHARP = SimConfig(rate=60.0, view=SHARP_VIEW, table=SMALL_TABLE)
-OPTIONS = ("--out", "--config", "--protocol")
+TOUCH_DEPTH_MM = 1.0
+"""Zero touch goes no deeper; it visits its own place in every process."""
 
 _R = TypeVar("_R")
 
@@ -118,6 +119,11 @@ class Lab:
         return replay(self.session / JOURNAL_NAME)
 
     @property
+    def presses(self) -> list[Press]:
+        """What was pressed so far, without the zero touches."""
+        return [press for press in self.rig.world.presses if press.depth_mm > TOUCH_DEPTH_MM]
+
+    @property
     def at_rest(self) -> bool:
         """Nothing moves and nothing is queued."""
         motion = self.rig.world.motion
@@ -156,8 +162,8 @@ class Lab:
     @property
     def options(self) -> list[str]:
         """Of `brushloop collect`: where its files lie."""
-        paths = (self.sessions, self.folder / "rig.toml", self.folder / "protocol.toml")
-        return [word for option, path in zip(OPTIONS, paths, strict=True) for word in (option, str(path))]
+        config, protocol = self.folder / "rig.toml", self.folder / "protocol.toml"
+        return ["--out", str(self.sessions), "--config", str(config), "--protocol", str(protocol)]
 
     def edit_rig(self, old: str, new: str) -> None:
         """Change `rig.toml`; with nothing old, append to it."""

@@ -79,7 +79,7 @@ def test_ink_on_a_patch_that_should_be_blank_is_seen_before_the_brush_is_dipped(
     world.version += 1
     with pytest.raises(NeedsOperator, match=r"patches? of sheet 1 that should be blank"):
         sharp_lab.run()
-    assert not [press for press in world.presses if press.depth_mm > 1.0]
+    assert not sharp_lab.presses
     assert world.well.ml == ink_ml
 
 

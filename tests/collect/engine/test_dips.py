@@ -16,10 +16,8 @@ from brushloop.collect.errors import BadPicture, CollectAborted, ConfigError
 from brushloop.collect.motion import Procedures, dip_moves, wash_moves
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.tui.review_screen import Review
-from brushloop.drivers.devices import Pose
 from brushloop.sessions.events import PressResult
 from brushloop.sessions.recording import Recording
-from tests.collect.sent import noting
 from tests.rigs import Lab
 from tests.runs import ended_by, until, wait_for_end
 
@@ -39,27 +37,23 @@ def screen(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 @pytest.fixture
-def targets(request: pytest.FixtureRequest) -> list[str]:
-    """Where the arm was sent, as far as it matters: "ink", "paper", "park"."""
-    lab: Lab = request.getfixturevalue("sharp_lab" if "sharp_lab" in request.fixturenames else "lab")
-    sent: list[str] = []
-    config = load_rig(lab.folder / "rig.toml")
+def went(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What the arm did, one after the other."""
+    names: list[str] = []
+    for name in ("set_out", "dip", "press", "capture"):
+        method = getattr(Procedures, name)
 
-    def note(target: Pose) -> None:
-        if target.position_mm == pytest.approx(config.motion.park_mm, abs=1e-3):
-            sent.append("park")
-        elif target.z_mm == pytest.approx(config.ink.dip_z_mm, abs=1e-3):
-            sent.append("ink")
-        elif target.z_mm < config.paper.touch_z_mm - 1.0 and sent[-1:] != ["paper"]:
-            sent.append("paper")
+        async def noted(*arguments: Any, _name: str = name, _method: Any = method) -> Any:
+            names.append(_name)
+            return await _method(*arguments)
 
-    noting(lab.rig.world.motion, note)
-    return sent
+        monkeypatch.setattr(Procedures, name, noted)
+    return names
 
 
-def test_nobody_looks_at_the_paper_between_dip_and_press(sharp_lab: Lab, targets: list[str], screen: list[str]) -> None:
+def test_nobody_looks_at_the_paper_between_dip_and_press(sharp_lab: Lab, went: list[str], screen: list[str]) -> None:
     sharp_lab.run()
-    assert targets[targets.index("ink") :][:3] == ["ink", "paper", "park"]
+    assert went[went.index("dip") :] == ["dip", "press", "capture"]
     assert screen[screen.index("dip") :][:4] == ["dip", "check that the sheet is blank", "dip", "press H13-a0-r01"]
     [wait_s] = [made.press.dip_to_touch_s for made in sharp_lab.state.results(PressResult)]
     assert wait_s is not None
@@ -70,13 +64,13 @@ def test_nobody_looks_at_the_paper_between_dip_and_press(sharp_lab: Lab, targets
 
 
 def test_a_brush_that_waited_with_its_ink_dips_again(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch, targets: list[str], screen: list[str]
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, went: list[str], screen: list[str]
 ) -> None:
     """A pause between dip and press is as good as any length: every wait counts as too long here."""
     monkeypatch.setattr(brush_steps, "STALE_INK_S", 0.0)
     lab.write_protocol("[11.0]", "[0.0]")
     lab.run()
-    assert targets.count("ink") == 2
+    assert went.count("dip") == 2
     assert screen[screen.index("press H11-a0-r01") :][:3] == ["press H11-a0-r01", "dip", "press H11-a0-r01"]
 
 
@@ -84,17 +78,9 @@ def test_a_brush_that_waited_with_its_ink_dips_again(
 
 
 def test_the_arm_sets_out_for_the_next_dip_while_a_capture_is_judged_and_dips_after_the_decision(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, went: list[str]
 ) -> None:
-    engine, look, went = lab.engine(), capturing._looked_at, list[str]()
-    for name in ("set_out", "dip", "press", "capture"):
-        method = getattr(Procedures, name)
-
-        async def noted(*arguments: Any, _name: str = name, _method: Any = method) -> Any:
-            went.append(_name)
-            return await _method(*arguments)
-
-        monkeypatch.setattr(Procedures, name, noted)
+    engine, look = lab.engine(), capturing._looked_at
 
     async def once_under_way(*arguments: Any) -> Any:
         async with asyncio.timeout(10.0):
@@ -131,7 +117,7 @@ def test_a_stop_while_a_capture_is_judged_costs_a_photograph_and_no_press(
 
     again = lab.run()
     assert again.snapshot().strokes_done == 2
-    assert len([press for press in lab.rig.world.presses if press.depth_mm > 1.0]) == 2
+    assert len(lab.presses) == 2
 
 
 async def test_a_photograph_at_fault_does_not_stop_the_arm_on_its_way_and_a_failed_motion_is_reported_first() -> None:

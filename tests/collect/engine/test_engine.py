@@ -34,8 +34,7 @@ def test_a_whole_session_is_collected_as_the_protocol_says_and_merged(collected:
     assert all(capture.image().shape == (384, 512) for capture in captures)
     assert {(c.stroke.depth_mm, c.stroke.tilt_deg) for c in captures} == {(11, 0), (11, 10), (15, 0), (15, 10)}
     # World's own answer sheet; the operator taught the touch height .03 mm too high. The first contact is zero touch.
-    pressed = [p for p in collected.lab.rig.world.presses if p.depth_mm > 1.0]
-    for press, stroke in zip(pressed, (capture.stroke for capture in captures), strict=True):
+    for press, stroke in zip(collected.lab.presses, (capture.stroke for capture in captures), strict=True):
         assert stroke.depth_mm == pytest.approx(press.depth_mm + 0.03, abs=0.01)
         assert (stroke.tilt_deg, 0.0) == pytest.approx((press.tilt_deg, press.heading_deg), abs=0.01)
         assert stroke.anchor_mm == pytest.approx((press.x_mm, press.y_mm), abs=0.05)
@@ -170,10 +169,10 @@ def test_who_resumes_on_a_screen_is_asked_before_anything_moves(lab: Lab) -> Non
 def test_a_session_does_not_go_on_with_another_camera_or_a_board_elsewhere(lab: Lab, view: View, said: str) -> None:
     begun(lab)
     lab.rig.reconfigure(replace(lab.rig.config, view=view))
-    pressed = len(lab.rig.world.presses)
+    pressed = lab.presses
     with pytest.raises(NeedsOperator, match=said):
         lab.run()
-    assert not [press for press in lab.rig.world.presses[pressed:] if press.depth_mm > 1.0]
+    assert lab.presses == pressed
 
 
 def test_a_session_is_not_resumed_on_another_robot(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -48,10 +48,6 @@ def in_mid_press(lab: Lab, monkeypatch: pytest.MonkeyPatch, fault: Fault) -> Non
     monkeypatch.setattr(lab.rig.world, "reaction", pushed_n)
 
 
-def presses(lab: Lab) -> int:
-    return len([press for press in lab.rig.world.presses if press.depth_mm > 1.0])
-
-
 @pytest.mark.xdist_group("collected")
 def test_force_and_ink_are_recorded_beside_the_poses(collected: Collected) -> None:
     folder = collected.folder
@@ -139,7 +135,7 @@ def test_an_empty_reservoir_holds_the_run_before_a_dry_press_until_it_is_refille
         ended_by(engine, InkRefused, "Refill the reservoir")
         assert lab.at_rest
         assert lab.rig.world.tool().z_mm > 170.0
-    assert presses(lab) == watched
+    assert len(lab.presses) == watched
 
 
 def test_a_dose_that_does_not_arrive_is_the_operators_to_mend(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,7 +143,7 @@ def test_a_dose_that_does_not_arrive_is_the_operators_to_mend(lab: Lab, monkeypa
     monkeypatch.setattr(lab.rig.world.well, "add", lambda _volume_ml: None)  # the tube has come off
     with pytest.raises(DoseLost, match="Look at the tube"):
         lab.run()
-    assert not presses(lab)
+    assert not lab.presses
 
 
 def test_poses_that_come_late_end_the_run_before_a_press_counts(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:

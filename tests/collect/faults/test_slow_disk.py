@@ -1,7 +1,7 @@
-"""A disk that is slow, cannot keep up, or fills up: the recorder's side of a session, the arm's safety included.
+"""A disk that is slow or fills up: the recorder's side of a session, the arm's safety included.
 
-The disk belongs to the process that records, so it is no fault of the rig. What the writer alone does is in
-tests/sessions/test_writer.py.
+The disk belongs to the process that records, so it is no fault of the rig. What the writer alone does, and a disk that
+does not keep up, is in tests/sessions/test_writer.py.
 """
 
 from __future__ import annotations
@@ -55,16 +55,6 @@ def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
     return disk
 
 
-def ended(bare_lab: Lab, says: str) -> None:
-    """A run ends, says so, and leaves the arm at rest clear of the paper."""
-    with pytest.raises(SessionError, match=says):
-        bare_lab.run()
-    assert bare_lab.engines[-1].snapshot().state is State.FAILED
-    assert bare_lab.at_rest
-    assert bare_lab.rig.faults.phase() in (Phase.PARKED, Phase.RESTING)
-    assert bare_lab.rig.world.tool().z_mm >= bare_lab.rig.config.table.paper_z_mm + 8.0
-
-
 def test_a_slow_disk_is_waited_for_and_loses_nothing(bare_lab: Lab, disk: Disk) -> None:
     disk.message_s, disk.sync_s = 0.012, 0.05  # a pose comes every 0.010 s
     bare_lab.run()
@@ -72,21 +62,17 @@ def test_a_slow_disk_is_waited_for_and_loses_nothing(bare_lab: Lab, disk: Disk) 
     assert len(list(Recording(bare_lab.session).captures())) == 1
 
 
-def test_a_disk_that_does_not_keep_up_ends_the_run_and_says_so(
-    bare_lab: Lab, disk: Disk, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A queue of five stands for the 20 000 messages that a slower disk would take minutes to fill."""
-    monkeypatch.setattr("brushloop.sessions.mcap_writer.QUEUE_LIMIT", 5)
-    disk.message_s = 0.1
-    ended(bare_lab, "the disk does not keep up")
-
-
 @pytest.mark.parametrize("full_after", [0, 3, pytest.param(60, marks=pytest.mark.soak)])
 def test_a_disk_that_fills_up_ends_the_run_and_with_room_the_same_command_goes_on(
     bare_lab: Lab, disk: Disk, full_after: int
 ) -> None:
     disk.full_after = full_after
-    ended(bare_lab, "No space left on device")
+    with pytest.raises(SessionError, match="No space left on device"):
+        bare_lab.run()
+    assert bare_lab.engines[-1].snapshot().state is State.FAILED
+    assert bare_lab.at_rest
+    assert bare_lab.rig.faults.phase() in (Phase.PARKED, Phase.RESTING)
+    assert bare_lab.rig.world.tool().z_mm >= bare_lab.rig.config.table.paper_z_mm + 8.0
     folder = bare_lab.session
     events = [line["event"] for line in read_lines(folder / "journal.jsonl")]
     # Where the last message of a step does not fit, the journal has no word for its end either: begun, not done.
