@@ -58,7 +58,7 @@ class Region(Path):
 
 
 Segment = Move | Path
-Dip = Callable[[], Awaitable[None]]
+Dip = Callable[[], Awaitable[object]]
 """Fills the brush; begins and ends at travel height."""
 
 

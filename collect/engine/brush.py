@@ -68,7 +68,7 @@ async def mark(context: StepContext, step: PressStep | DrawStep) -> PressResult:
     for number in range(len(step.drawn.strokes) if isinstance(step, DrawStep) else 1):
         if number > 0:
             await fill_brush(context)
-        left_ns, run.left_ink_ns = run.left_ink_ns, None
+        left_ns = run.left_ink_ns
         if isinstance(step, DrawStep):
             stroke = procedures.stroke(patch, step.drawn, number)
         else:
@@ -155,15 +155,9 @@ async def check_rig(context: StepContext) -> SelfCheckResult:
     """The SELF_CHECK step: a scalene triangle of marks shows whether the rig is mirrored, turned or stretched."""
     run, patches = context.run, context.patches
     places_mm = triangle_on(patches, run.rig.config.self_check)
-    checked = await context.guard.guarded(self_check(run.procedures, places_mm, partial(_fill_for_touch, context)))
+    checked = await context.guard.guarded(self_check(run.procedures, places_mm, partial(fill_brush, context)))
     place = {"sheet": run.store.state.sheet, "patches": tuple(patch.index for patch in patches)}
     return checked.model_copy(update=place)
-
-
-async def _fill_for_touch(context: StepContext) -> None:
-    """Fill brush and well. The touch that follows takes ink, so the next press must dip again."""
-    await fill_brush(context)
-    context.run.left_ink_ns = None
 
 
 async def _measured(context: StepContext, config: TouchConfig) -> ZeroTouchResult:
@@ -174,6 +168,6 @@ async def _measured(context: StepContext, config: TouchConfig) -> ZeroTouchResul
     def tell(doing: str) -> None:
         run.progress.doing(f"zero touch by {config.method}: {doing}")
 
-    dip = partial(_fill_for_touch, context)
+    dip = partial(fill_brush, context)
     measured = measure_plane(run.procedures, config, dip=dip, tap=tap, asker=run.asker, tell=tell)
     return await context.guard.guarded(measured)

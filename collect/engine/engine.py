@@ -43,7 +43,7 @@ from brushloop.sessions.store import SessionStore
 
 PARKED_MM = 2.0
 """Distance from the park position, in mm, within which the arm counts as parked."""
-SILENT_S = 1.0
+SILENT_MS = 1000.0
 """Time without a pose after which the snapshot says so: the arm or the connection to it has failed."""
 UNCHECKED = (
     "no self-check: it is switched off in rig.toml, or left out there and in the command (--arm). Nothing checks "
@@ -65,7 +65,6 @@ class Engine:
 
     def __init__(self, opening: Opening, resumes: Path | None, clock: Clock) -> None:
         """`resumes`: folder of the session that is resumed; None for a new one."""
-        self._opening = opening
         self._request = opening.request
         self._rig_config = opening.rig
         self._resumes = resumes
@@ -98,13 +97,14 @@ class Engine:
 
     def snapshot(self) -> Snapshot:
         """The state of the run; from any thread."""
-        tip_mm = force_n = None
-        no_pose_s, state = 0.0, self._run.control.state
+        tip_mm = force_n = no_pose_s = None
+        state = self._run.control.state
         if (rig := self._rig) is not None:
             try:
                 tip_mm = self._see_tip(rig)
             except Stale as stale:
-                no_pose_s = stale.age_ms / 1e3
+                if stale.age_ms >= SILENT_MS and state not in FINAL:
+                    no_pose_s = stale.age_ms / 1e3
             except DeviceError:
                 pass
             if rig.force is not None:
@@ -123,7 +123,7 @@ class Engine:
             force_ceiling_n=None if self._rig_config.force is None else self._rig_config.force.max_n,
             picture=self._run.telemetry.picture,
             requests=self._run.requests.open,
-            no_pose_s=no_pose_s if no_pose_s >= SILENT_S and state not in FINAL else None,
+            no_pose_s=no_pose_s,
         )
 
     def _see_tip(self, rig: Rig) -> tuple[float, float, float]:
@@ -226,8 +226,8 @@ class Engine:
             run.connected(rig)
             self._rig = rig
             await self._permitted(rig)
-            store = self._store = run.store = open_store(self._opening, self._resumes, rig, self._clock)
-            dry, live = self._request.dry_run_mm is not None, self._opening.live
+            store = self._store = run.store = open_store(run.opening, self._resumes, rig, self._clock)
+            dry, live = self._request.dry_run_mm is not None, run.opening.live
             try:
                 strokes = run.progress.opened(store)
                 begun = f"resumed with {strokes} strokes" if strokes else "session"

@@ -243,7 +243,7 @@ class RunContext:
     """Where the paper lies in the newest frame in which the board was seen. Set by the BOARD step that comes before the
     first dip of every process, and raises if no board is seen."""
     left_ink_ns: int | None = None
-    """Host time at which the brush left the ink; None if it has marked since or may have lost its ink."""
+    """Host time at which the brush left the ink; None if another step came since, or it may have lost its ink."""
     sound_frame: Gray | None = None
     """Newest valid gray photograph of the current sheet."""
     looked_at_sheet: int | None = None

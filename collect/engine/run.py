@@ -235,7 +235,9 @@ class Run(RunContext):
             await uninterrupted(store.void, attempt, why)
             self.progress.count()
             raise
-        if isinstance(result, DipResult) and self.requests.take(OperatorRequest.SKIP):
+        if not isinstance(result, DipResult):
+            self.left_ink_ns = None
+        elif self.requests.take(OperatorRequest.SKIP):
             left_out = self.progress.planned(step.index).press()
             result = result.model_copy(update={"skipped": left_out})
             self.progress.log(f"{left_out.stroke_id}: is left out, as the operator requested")
