@@ -24,8 +24,8 @@ from brushloop.collect.rig.devices import limits_of
 from brushloop.collect.rig.paper import PaperPlane, Sheet, to_base
 from brushloop.collect.touch.selfcheck import partners
 from brushloop.collect.walk import StepMoves, moves_of, sheet_of, walk
+from brushloop.drivers.arcs.motion import as_sent, durations_s
 from brushloop.drivers.devices import Pose
-from brushloop.drivers.geometry import distance
 from brushloop.drivers.limits import Limits
 from brushloop.sessions.events import Press
 
@@ -34,27 +34,10 @@ SETTLE_S = 0.12
 Measured on the loopback rig; for a real controller it is not known."""
 FRAME_S = 0.1
 """Period of 10 frames a second: a photograph is the second frame that begins after the arm rests."""
-IN_PLACE_MM = 1.0
-"""For a line shorter than this, ARCS reads the speed as that of the rotation: mm/s as thousandths of rad/s."""
 OMITTED = (
     "connecting, power on, doses of ink, touches that measure the height, quality checks, writing to disk, "
     "sheet changes, pauses, and repeated presses"
 )
-
-
-def trapezoid_s(way: float, speed: float, acc: float) -> float:
-    """Seconds of a trapezoidal speed profile from rest to rest; triangular if the speed is not reached."""
-    return way / speed + speed / acc if way * acc >= speed * speed else 2.0 * math.sqrt(way / acc)
-
-
-def move_s(start: Pose, target: Pose, speed_mm_s: float, acc_mm_s2: float, limits: Limits) -> float:
-    """Seconds of a straight line, rest to rest, slower where the tool turns; a turn on the spot counts in rad."""
-    travel_mm, turn_deg = distance(start, target)
-    if travel_mm < IN_PLACE_MM and turn_deg > 0.01:
-        return trapezoid_s(math.radians(turn_deg), speed_mm_s / 1e3, acc_mm_s2 / 1e3)
-    if turn_deg > 0.01:
-        speed_mm_s = limits.turn_capped(start, target, speed_mm_s)
-    return trapezoid_s(travel_mm, speed_mm_s, acc_mm_s2)
 
 
 def path_s(start: Pose, path: MotionPath, acc_mm_s2: float, limits: Limits) -> float:
@@ -75,7 +58,7 @@ def step_s(config: RigConfig, here: Pose, moves: StepMoves) -> tuple[float, Pose
             # One descent: the number of descents of a measured touch is not known beforehand.
             segment = Move(segment.poses[0], segment.speed_mm_s)
         if isinstance(segment, Move):
-            total_s += max(move_s(here, segment.target, segment.speed_mm_s, acc_mm_s2, limits), segment.least_s)
+            total_s += sum(durations_s(here, as_sent(here, [segment], limits), acc_mm_s2))
             here = segment.target
         else:
             total_s += path_s(here, segment, acc_mm_s2, limits)

@@ -42,6 +42,9 @@ PROGRESS = 0.05
 """Smallest approach to the target that counts as progress, mm or deg."""
 ARRIVED_MM, ARRIVED_DEG = 0.05, 0.1
 """How near its target a settled arm is."""
+IN_PLACE_MM, IN_PLACE_DEG = 1.0, 0.01
+"""For a line shorter than this, and that turns by more, ARCS reads the speed as that of the turn: mm/s as thousandths
+of rad/s."""
 POLL_S = 0.02
 
 
@@ -125,16 +128,15 @@ def as_sent(
 
 
 def durations_s(start: Pose, lines: Sequence[QueuedLine], acc_mm_s2: float) -> list[float]:
-    """Upper estimate for each of the lines: at its speed plus one ramp, or the turn at half a radian per second.
-
-    If the tip moves less than a millimetre, ARCS reads m/s as rad/s.
-    """
+    """Seconds of each of the lines from rest to rest, with a trapezoidal speed, or a triangular one if it is short."""
     estimates_s: list[float] = []
     for line in lines:
-        translation_mm, rotation_deg = distance(start, line.target)
-        ramp_s = line.speed_mm_s / acc_mm_s2
-        turn_s = rotation_deg / 30.0 if translation_mm >= 1.0 else math.radians(rotation_deg) / (line.speed_mm_s / 1e3)
-        estimates_s.append(max(max(translation_mm / line.speed_mm_s, turn_s) + ramp_s, line.least_s))
+        travel_mm, turn_deg = distance(start, line.target)
+        way, speed, acc = travel_mm, line.speed_mm_s, acc_mm_s2
+        if travel_mm < IN_PLACE_MM and turn_deg > IN_PLACE_DEG:
+            way, speed, acc = math.radians(turn_deg), speed / 1e3, acc / 1e3
+        moving_s = way / speed + speed / acc if way * acc >= speed * speed else 2.0 * math.sqrt(way / acc)
+        estimates_s.append(max(moving_s, line.least_s))
         start = line.target
     return estimates_s
 

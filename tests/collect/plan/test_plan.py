@@ -15,7 +15,7 @@ from brushloop.collect.engine.run import Run
 from brushloop.collect.errors import ConfigError, StepVoid
 from brushloop.collect.motion import Path as MotionPath
 from brushloop.collect.motion import Procedures, inking_moves, stroke_moves
-from brushloop.collect.plan import make_plan, move_s, path_s
+from brushloop.collect.plan import make_plan, path_s
 from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
 from brushloop.collect.protocols.steps import MARKING, Drawn, DrawStep, Step, StepKind
 from brushloop.collect.rig.config import RigConfig, load_rig
@@ -165,12 +165,9 @@ def test_a_drawn_stroke_goes_through_its_points_at_its_depths(config: RigConfig)
     assert moves.dips == 1
 
 
-def test_a_turn_on_the_spot_is_read_in_radians(tmp_path: Path) -> None:
-    limits = limits_of(rig(tmp_path))
-    upright, tilted = brush_pose(300.0, 0.0, 200.0), brush_pose(300.0, 0.0, 200.0, tilt_deg=10.0)
-    assert move_s(upright, tilted, 20.0, 800.0, limits) == pytest.approx(0.17453 / 0.02 + 0.025, abs=1e-3)
-    path = MotionPath([brush_pose(310.0, 0.0, 200.0), brush_pose(320.0, 0.0, 200.0)], 20.0)
-    assert path_s(upright, path, 800.0, limits) == pytest.approx(1.025)
+def test_a_path_has_one_ramp(tmp_path: Path) -> None:
+    start, *poses = (brush_pose(x_mm, 0.0, 200.0) for x_mm in (300.0, 310.0, 320.0))
+    assert path_s(start, MotionPath(poses, 20.0), 800.0, limits_of(rig(tmp_path))) == pytest.approx(1.025)
 
 
 def test_the_ink_of_a_plan_is_what_a_pump_doses(tmp_path: Path) -> None:

@@ -53,11 +53,17 @@ async def test_connecting_reports_who_answers_and_where_the_flange_is(
 
 
 async def test_a_slow_turn_on_the_spot_is_given_the_time_it_takes(arm: AuboArcs):
-    home = arm.latest().pose
-    turn = brush_pose(*home.position_mm, heading_deg=90.0)
-    [turning_s] = durations_s(home, [QueuedLine(turn, 20.0)], 800.0)
-    assert turning_s >= math.radians(90.0) / 0.020  # 20 mm/s is read as 0.02 rad/s
-    await arm.move(turn, **QUICK)
+    await arm.move(brush_pose(*arm.latest().pose.position_mm, heading_deg=90.0), **QUICK)
+
+
+def test_a_line_is_timed_with_its_ramps_and_a_turn_on_the_spot_in_radians():
+    start, short, long, waiting, turned = (
+        brush_pose(x_mm, 0.0, 0.0, heading_deg=turn_deg)
+        for x_mm, turn_deg in [(0.0, 0.0), (0.25, 0.0), (8.25, 0.0), (8.5, 0.0), (8.5, 90.0)]
+    )
+    lines = [QueuedLine(short, 20.0), QueuedLine(long, 20.0), QueuedLine(waiting, 20.0, 3.0), QueuedLine(turned, 20.0)]
+    expected_s = [2.0 * math.sqrt(0.25 / 800.0), 0.4 + 0.025, 3.0, math.radians(90.0) / 0.020 + 0.025]
+    assert durations_s(start, lines, 800.0) == pytest.approx(expected_s)
 
 
 @pytest.mark.parametrize("mode", ["ArmOnFire", None])
