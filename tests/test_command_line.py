@@ -73,6 +73,9 @@ sys.stderr.write(json.dumps(found))
         (("sim", "--write-rig", "no/rig.toml"), "brushloop: no/rig.toml: there is no folder no\n"),
         (("sim", "--rate", "nan"), "brushloop: --rate is 'nan', allowed: a number from 0.01 to 1000\n"),
         (("sim", "--idle-exit=-1"), "brushloop: --idle-exit is '-1', allowed: a number from 0\n"),
+        (("sim", "--unknown", "3", "--trap", "loud"), "brushloop: --trap is 'loud', allowed: swapped-corner, "),
+        (("sim", "--unknown", "3", "--write-rig", "rig.toml"), "--unknown: can only be combined with --trap"),
+        (("sim", "--trap", "force-sign"), "brushloop: --trap: needs --unknown SEED\n"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(tmp_path: Path, arguments: tuple[str, ...], words: str) -> None:

@@ -313,26 +313,25 @@ PART = b"--b\r\nContent-Type: image/jpeg\r\ncontent-length: %d\r\n\r\n" % len(SO
 
 
 @pytest.mark.parametrize(
-    ("answer", "jpegs"),
-    [(MULTIPART + 2 * PART, 2), (MULTIPART + PART + PART[:-99], 1), (MULTIPART + PART + b"\xff" * 99_999, 1)],
-    ids=["ends", "cut off", "garbage"],
+    ("answer", "trickle", "jpegs"),
+    [
+        (MULTIPART + 2 * PART, b"", 2),
+        (MULTIPART + PART + PART[:-99], b"", 1),
+        (MULTIPART + PART + b"\xff" * 99_999, b"", 1),
+        (MULTIPART + PART + PART[:-500], PART[-500:], 1),
+    ],
+    ids=["ends", "cut off", "garbage", "trickles in"],
 )
-async def test_pushed_jpegs_are_handed_over_as_they_came_until_the_stream_ends(answer: bytes, jpegs: int):
-    async with serving(answer) as address:
-        source = await asyncio.to_thread(open_source, CameraTable(kind="opencv", source=address))
+async def test_pushed_jpegs_are_handed_over_as_they_came_until_the_stream_ends(
+    answer: bytes, trickle: bytes, jpegs: int
+):
+    async with serving(answer, trickle) as address:
+        table = CameraTable(kind="opencv", source=address, timeout_s=0.1 if trickle else 60.0)
+        source = await asyncio.to_thread(open_source, table)
         assert isinstance(source, JpegStream)
         assert not source.simulated
         for _ in range(jpegs):
             assert await asyncio.to_thread(source.read) == SOUND
-        assert await asyncio.to_thread(source.read) is None
-        source.close()
-
-
-async def test_a_picture_that_trickles_in_is_given_up():
-    async with serving(MULTIPART + PART + PART[:-500], PART[-500:]) as address:
-        table = CameraTable(kind="opencv", source=address, timeout_s=0.1)
-        source = await asyncio.to_thread(open_source, table)
-        assert await asyncio.to_thread(source.read) == SOUND
         assert await asyncio.to_thread(source.read) is None
         source.close()
 

@@ -8,17 +8,16 @@ from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
-from typer.testing import CliRunner
 
 from brushloop.sessions import mcap_writer
 from brushloop.sessions import repair as repairs
-from brushloop.sessions.cli import app
 from brushloop.sessions.errors import DiskFull, SessionDamaged, SessionError
 from brushloop.sessions.events import StepKind
 from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.show import Summary, details, summaries
 from brushloop.sessions.verify import verify_session
+from tests.command import brushloop
 from tests.journal_lines import read_lines
 
 ID, OTHER = "2026-01-02-grid-01", "2026-01-03-grid-01"
@@ -375,18 +374,18 @@ def test_the_exit_code_distinguishes_lossless_from_lossy(opened, damage, code, m
     path = file_of(opened, "H13-a05-r00 capture")
     if damage:
         damage(path)
-        ran = CliRunner().invoke(app, ["verify", str(opened)])
-        assert (ran.exit_code, f"damaged: {path.name}: (capture H13-a05-r00) " in ran.output) == (6, True)
-    ran = CliRunner().invoke(app, ["repair", str(opened)])
-    assert (ran.exit_code, message in ran.output) == (code, True), ran.output
-    ran = CliRunner().invoke(app, ["verify", str(opened)])
-    assert (ran.exit_code, f"{ID} (open) is sound: " in ran.output) == (0, True)
+        ran = brushloop("sessions", "verify", opened)
+        assert (ran.returncode, f"damaged: {path.name}: (capture H13-a05-r00) " in ran.stdout) == (6, True)
+    ran = brushloop("sessions", "repair", opened)
+    assert (ran.returncode, message in ran.stdout) == (code, True), ran.stdout
+    ran = brushloop("sessions", "verify", opened)
+    assert (ran.returncode, f"{ID} (open) is sound: " in ran.stdout) == (0, True)
 
 
 def test_close_writes_the_merged_file_of_a_session_left_open(make, opened):
-    assert CliRunner().invoke(app, ["close", str(opened)]).exit_code == 0
+    assert brushloop("sessions", "close", opened).returncode == 0
     assert tuple(make.stroke_names(opened / f"{ID}.mcap")) == BOTH
-    assert "is closed" in str(CliRunner().invoke(app, ["close", str(opened)]).exception)
+    assert "is closed" in brushloop("sessions", "close", opened).stderr
 
 
 def test_what_is_wrong_within_a_message_is_damage_though_every_crc_holds(make, store, tmp_path):

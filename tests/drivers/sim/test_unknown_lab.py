@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-import brushloop.__main__
 from brushloop.drivers.sim.config import CORNERS
-from brushloop.drivers.sim.lab import LabRefused, UnknownLab
+from brushloop.drivers.sim.lab import UnknownLab
 from brushloop.drivers.sim.lab_facts import draw, in_picture
 from brushloop.drivers.sim.rig import ControlServer
 from brushloop.drivers.sim.world import tool_of
+from tests.command import brushloop
 
 SMALL_PX = (640, 480)
 FAST = 500.0
@@ -77,29 +76,9 @@ async def test_what_a_person_cannot_do_is_named(request_: dict[str, Any], words:
         await lab_of(4).hand(**request_)
 
 
-def run(*arguments: str) -> str:
-    result = CliRunner().invoke(brushloop.__main__.app, arguments, catch_exceptions=False)
-    return result.output
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("--unknown", "3", "--trap", "loud"), r"--trap is 'loud', allowed: swapped-corner, .*cable-pulled"),
-        (("--unknown", "3", "--write-rig", "rig.toml"), "--unknown: can only be combined with --trap"),
-        (("--trap", "force-sign"), "--trap: needs --unknown SEED"),
-    ],
-)
-def test_options_that_do_not_go_together_are_refused(arguments: tuple[str, ...], words: str):
-    with pytest.raises(LabRefused, match=words) as refused:
-        run("sim", *arguments)
-    assert refused.value.exit_code == 2
-
-
 async def test_a_person_at_the_command_line_guides_the_arm(tmp_path: Path):
     lab, socket = lab_of(4), tmp_path / "lab.sock"
     async with ControlServer(lab, socket):
-        said = await asyncio.to_thread(
-            run, "sim", "hand", str(socket), "bring", "board-corner", "--corner", "lower left"
-        )
-        assert said == "The tip is at the board-corner, lower left.\n"
+        words = ("sim", "hand", socket, "bring", "board-corner", "--corner", "lower left")
+        ran = await asyncio.to_thread(brushloop, *words)
+        assert ran.stdout == "The tip is at the board-corner, lower left.\n"
