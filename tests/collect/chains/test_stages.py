@@ -23,9 +23,9 @@ from brushloop.calibrate.validate import command
 from brushloop.calibrate.validate.command import ValidationOutput
 from brushloop.calibrate.writing import FILE as PLAN
 from brushloop.calibrate.writing import PROTOCOL, Figure, Plan, PlannedBy
-from brushloop.collect.chains import LoopRequest, WritingRequest, demo, writing
+from brushloop.collect.chains import LoopRequest, WritingRequest, demo, loop, writing
 from brushloop.collect.chains.loop import SETTINGS as FILE
-from brushloop.collect.chains.loop import Settings, begun_with, check_recovered, keep_settings
+from brushloop.collect.chains.loop import Settings, begun_with, check_recovered, keep_settings, run_loop
 from brushloop.collect.chains.writing import FOOTPRINT, Writing
 from brushloop.collect.engine import CollectRequest
 from brushloop.collect.errors import ConfigError, StrokesLeftOut
@@ -41,6 +41,7 @@ from tests.sessions.conftest import Make
 
 
 RIG = rig_toml(SimConfig())
+GRID = 'kind = "grid"\ndepths_mm = [11.0]\ntilts_deg = [0.0]\nrepeats = 1\nseed = 1\n'
 
 
 class Chain:
@@ -176,6 +177,21 @@ def test_a_loop_goes_on_with_what_it_was_begun_with_and_nothing_else(tmp_path: P
         begun_with(folder)
 
 
+def test_presses_that_cannot_be_made_again_are_refused_before_anything_is_computed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop, "calibrated", pytest.fail)
+    rig, protocol = tmp_path / "rig.toml", tmp_path / "protocol.toml"
+    rig.write_text(RIG, encoding="utf-8")
+    protocol.write_text(GRID, encoding="utf-8")
+    session = finished(rig, protocol, tmp_path / "sessions", 1)
+    with pytest.raises(ConfigError, match="would press on whatever sheet is in"):
+        run_loop(LoopRequest(session, rig))
+    rig.write_text(RIG.replace("simulated bristle bundle", "goat hair"), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"brush\.name: 'goat hair, seed 1': the original was pressed with"):
+        run_loop(LoopRequest(session, rig, sheet=1))
+
+
 def test_a_fit_that_does_not_describe_the_brush_is_not_pressed(tmp_path: Path) -> None:
     path = tmp_path / "recovered.csv"
     path.write_text("stroke_id,flags\na,\nb,at_bound\nc,\nd,at_bound\n")
@@ -192,7 +208,7 @@ def test_a_fit_that_does_not_describe_the_brush_is_not_pressed(tmp_path: Path) -
 def test_a_session_of_another_ink_is_not_the_one_that_a_chain_asks_for(tmp_path: Path) -> None:
     """The same protocol was pressed with two inks: each rig.toml finds its own session, and a third ink finds none."""
     protocol = tmp_path / "protocol.toml"
-    protocol.write_text('kind = "grid"\ndepths_mm = [11.0]\ntilts_deg = [0.0]\nrepeats = 1\nseed = 1\n')
+    protocol.write_text(GRID)
     rigs = {ink: tmp_path / f"{ink}.toml" for ink in ("sumi", "walnut", "red")}
     for ink, path in rigs.items():
         path.write_text(RIG.replace("simulated ink", ink), encoding="utf-8")
