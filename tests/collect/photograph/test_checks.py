@@ -15,7 +15,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from bench.brushes import DATA as SHARED
 from brushloop.calibrate.board.pix2len import Plane
@@ -175,11 +174,6 @@ def test_the_edge_of_a_sheet_is_no_ink_in_the_patches_along_it() -> None:
     assert of(seen, sheet_mm=sheet_mm).check_blank(patch).passed
     first = press(stroke(seen.copy(), 50.0, 48.0), 10.0, patch, sheet_mm=sheet_mm)
     assert next(check for check in first.checks if check.name == Failure.NEIGHBOUR).passed
-
-
-def test_limits_that_contradict_each_other_are_refused() -> None:
-    with pytest.raises(ValidationError, match="dark_level"):
-        QualityConfig(dark_level=200.0, bright_level=150.0)
 
 
 @pytest.mark.parametrize("photo_px_per_mm", [6.25, 3.3, 2.5])

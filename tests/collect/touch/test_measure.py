@@ -134,11 +134,6 @@ async def test_an_arm_that_was_stopped_or_failed_is_left_where_it_is(
     assert not bench.lifted
 
 
-def test_by_camera_three_points_are_needed() -> None:
-    with pytest.raises(ValueError, match="by camera three are needed"):
-        TouchConfig(method="camera", points_mm=[(4.0, 4.0)])
-
-
 async def test_a_patch_that_does_not_fit_on_the_sheet_is_refused(make_bench: MakeBench) -> None:
     bench = make_bench()
     with pytest.raises(StepError, match=r"do not fit on the sheet: spot \d+ would lie at"):
