@@ -150,10 +150,13 @@ def test_a_sheet_that_leans_is_checked_as_it_lies(tmp_path: Path, config: RigCon
 
 def test_a_drawn_stroke_goes_through_its_points_at_its_depths(config: RigConfig) -> None:
     wanted = example("protocol-write.toml")
-    [draw, *_] = [w for w in walk(config, wanted) if w.step.kind == StepKind.DRAW]
+    draw, again = [w for w in walk(config, wanted) if w.step.kind == StepKind.DRAW]
+    assert isinstance(draw.step, DrawStep)
+    assert isinstance(again.step, DrawStep)
+    assert (draw.step.press.stroke_id, again.step.press.stroke_id) == ("shi-r01", "shi-r02")
+    assert draw.step.press.condition.depth_mm == 9.0, "the deepest of its points"
     moves = moves_of(config, PaperPlane(config.paper.touch_z_mm), draw.step, draw.patches)
     ways = [part for part in moves.segments if isinstance(part, MotionPath)]
-    assert isinstance(draw.step, DrawStep)
     drawn = draw.step.drawn
     assert [len(way.poses) for way in ways] == [len(stroke) - 1 for stroke in drawn.strokes]
     patch = sheet_of(config, wanted).patch(0)

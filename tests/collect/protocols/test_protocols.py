@@ -36,7 +36,6 @@ from brushloop.collect.protocols.kinds import (
 from brushloop.collect.protocols.steps import (
     MARKING,
     CaptureStep,
-    DrawStep,
     Planned,
     PressStep,
     Step,
@@ -159,27 +158,6 @@ def test_a_list_keeps_its_order_and_names_and_shuffles_only_for_a_seed() -> None
     assert [s.stroke_id for s in as_written][5] == "light-r02"
     assert [s.dwell_s for s in as_written][:3] == [0.2, 0.2, 0.5]
     assert [s.stroke_id for s in listed.planned()] != [s.stroke_id for s in as_written]
-
-
-def test_a_replayed_stroke_is_found_by_the_one_that_it_repeats() -> None:
-    config = load_protocol(EXAMPLES / "protocol-replay.toml")
-    assert isinstance(config, ReplayConfig)
-    assert config.of == "2026-11-21-grid-01"
-    for step in run(config):
-        if isinstance(step, PressStep | CaptureStep):
-            assert step.press.stroke_id.rpartition("~")[0] == step.again_of
-    assert {s.again_of for s in config.planned()} == {"H11-a0-r01", "H13-a5-r01", "H20-a10-r01"}
-
-
-def test_a_figure_is_one_step_that_holds_its_trajectories() -> None:
-    config = load_protocol(EXAMPLES / "protocol-write.toml")
-    assert isinstance(config, WriteConfig)
-    drawn = [step for step in run(config) if isinstance(step, DrawStep)]
-    assert [step.press.stroke_id for step in drawn] == ["shi-r01", "shi-r02"]
-    strokes = drawn[0].drawn.strokes
-    assert [len(stroke) for stroke in strokes] == [6, 6]
-    assert tuple(map(tuple, strokes[0])) == config.figures[0].strokes[0].points
-    assert config.planned()[0].condition.depth_mm == 9.0
 
 
 def test_a_calibration_touches_and_looks_and_leaves_no_mark() -> None:
