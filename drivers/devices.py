@@ -201,8 +201,8 @@ class Ink(Device, Protocol):
         """Add ink to the well. Raises `LimitExceeded` before anything is sent."""
         ...
 
-    async def replenish(self, dips: int) -> Well:
-        """Before a dip, after so many of this run: add ink if the table asks for it.
+    async def replenish(self) -> Well:
+        """Before a dip: add ink if the table asks for it.
 
         Raises `InkRefused` or `DoseLost` where only a person can help, else `DeviceError`.
         """

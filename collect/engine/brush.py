@@ -38,8 +38,7 @@ async def fill_brush(context: StepContext) -> Well | None:
     run, well = context.run, None
     with run.progress.meanwhile("dip"):
         if run.rig.ink is not None:
-            well = await run.rig.ink.replenish(run.dips)
-            run.dips += 1
+            well = await run.rig.ink.replenish()
             state = InkState(level=well.level, dosed_ml=well.dosed_ml, light=run.light)
             context.recorder.event(Topic.INK, state)
         await context.guard.guarded(run.procedures.dip())

@@ -248,8 +248,6 @@ class RunContext:
     """Newest valid gray photograph of the current sheet."""
     looked_at_sheet: int | None = None
     """Sheet whose free patches were seen to be blank."""
-    dips: int = 0
-    """Times that the well was filled up for a dip since the run began: a dip that fails is not paid for twice."""
     light: float | None = None
     """Light of the ink station as it was set; None without one."""
 

@@ -113,10 +113,11 @@ class ModbusPump(InkDevice):
         self._running = asyncio.Lock()
         self._connected = False
         self._may_run = False
+        self._dips = 0
 
     async def connect(self) -> Identity:
         """Open the port, check that the line does not echo, and stop the pump. `DeviceError` leaves the port closed."""
-        self._connected, self._dosed_ml = False, 0.0
+        self._connected, self._dosed_ml, self._dips = False, 0.0, 0
         async with self._port.opening():
             await self._refuse_echo()
             await self._halt()
@@ -160,10 +161,11 @@ class ModbusPump(InkDevice):
                     remedy="Something held the host up.",
                 )
 
-    async def replenish(self, dips: int) -> Well:
-        """Dose before every `every_dips`-th dip. Raises as `dose` does."""
-        if dips % self._every_dips == self._every_dips - 1:
+    async def replenish(self) -> Well:
+        """Dose before every `every_dips`-th dip since `connect`. Raises as `dose` does, and does not count that dip."""
+        if self._dips % self._every_dips == self._every_dips - 1:
             await self.dose(self._table.dose_ml)
+        self._dips += 1
         return Well(None, self._dosed_ml)
 
     async def close(self) -> None:

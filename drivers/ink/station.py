@@ -136,7 +136,7 @@ class InkStation(InkDevice):
         if abs(given_ml - volume_ml) > max(2 * SMALLEST_ML, 0.05 * volume_ml):
             raise DeviceError(DEVICE, "dose", f"gave {given_ml:.3f} ml instead of {volume_ml:.3f} ml")
 
-    async def replenish(self, dips: int) -> Well:
+    async def replenish(self) -> Well:
         """Dose until the gauge shows `keep_level`. Raises `DoseLost` if a dose does not arrive, and as `dose` does."""
         level, dose_ml = await self.level(), self._table.dose_ml
         while level < self._keep_level:

@@ -40,7 +40,7 @@ class SyringePump(InkDevice):
         if (answer := await self._ask(f"DOSE {volume_ml:.3f}")) != "OK":
             raise ProtocolViolation("ink", "dose", f"answered {answer!r}, expected 'OK'")
 
-    async def replenish(self, dips: int) -> Well:
+    async def replenish(self) -> Well:
         await self.dose(self._table.dose_ml)
         return Well(level=None, dosed_ml=self._dosed_ml)
 

@@ -215,17 +215,17 @@ async def test_a_well_is_filled_up_to_its_level_and_a_dose_that_does_not_arrive_
     well: StationFirmware, station: InkStation, monkeypatch: pytest.MonkeyPatch
 ):
     well.well.ml = 0.4 * well.well.capacity_ml
-    filled = await station.replenish(dips=0)
+    filled = await station.replenish()
     assert filled.level is not None
     assert filled.level >= 0.5
     assert filled.dosed_ml == pytest.approx(well.well.ml - 0.4 * well.well.capacity_ml)
-    assert await station.replenish(dips=1) == filled, "it is full"
+    assert await station.replenish() == filled, "it is full"
     well.well.ml = 1.0
     monkeypatch.setattr(well.well, "add", lambda _volume_ml: None)  # the tube has come off
     with pytest.raises(DoseLost, match="Look at the tube"):
-        await station.replenish(dips=2)
+        await station.replenish()
     well.well.ml = 19.0  # somebody poured
-    assert (await station.replenish(dips=3)).dosed_ml == filled.dosed_ml + 2.0, "the lost dose was given as well"
+    assert (await station.replenish()).dosed_ml == filled.dosed_ml + 2.0, "the lost dose was given as well"
 
 
 # ---------------------------------------------------------------- the pump
@@ -287,7 +287,7 @@ async def test_a_dose_sets_the_speed_starts_and_stops():
 async def test_it_doses_before_every_nth_dip(pump_line: PatientLine):
     pump = pump_at(pump_line.path, dose_ml=0.02, every_dips=3)
     await pump.connect()
-    assert [(await pump.replenish(dips)).dosed_ml for dips in range(7)] == [0.0, 0.0, 0.02, 0.02, 0.02, 0.04, 0.04]
+    assert [(await pump.replenish()).dosed_ml for _ in range(7)] == [0.0, 0.0, 0.02, 0.02, 0.02, 0.04, 0.04]
     await pump.close()
     assert pump._table.doses_ml(7) == pytest.approx(0.04)
 
