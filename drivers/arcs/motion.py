@@ -143,21 +143,21 @@ def durations_s(start: Pose, lines: Sequence[QueuedLine], acc_mm_s2: float) -> l
 
 async def feed(
     controller: Controller,
+    start: Pose,
     lines: Sequence[QueuedLine],
     acc_mm_s2: float,
     *,
-    longest_s: float,
     go: Callable[[], None],
     notice: Callable[[str], None],
 ) -> None:
-    """Queue every line, none of which takes longer than `longest_s`, at most `MOST_QUEUED` at a time; return once the
-    last one is queued.
+    """Queue every line from `start` on, at most `MOST_QUEUED` at a time; return once the last one is queued.
 
     `go` raises if the arm was stopped: it is asked before every line, with nothing awaited between, because after a
     stop none may follow. Raises `RobotNotSafe`, `MotionRefused`, and `MotionFailed` where the arm was stopped meanwhile
     or does not advance.
     """
     loop = asyncio.get_running_loop()
+    longest_s = max(durations_s(start, lines, acc_mm_s2))
     room, sent = MOST_QUEUED, 0
     queue, advanced_at = EMPTY, loop.time()
 

@@ -125,10 +125,9 @@ class AuboArcs:
         lines = [QueuedLine(pose, speed_mm_s) for pose in poses]
         start = await self._depart("moveLine", lines, acc_mm_s2)
         lines = as_sent(start, lines, self._limits, blend_mm)
-        planned_s = durations_s(start, lines, acc_mm_s2)
         async with self._under_way("moveLine", poses[-1]) as go:
-            await feed(self._motion, lines, acc_mm_s2, longest_s=max(planned_s), go=go, notice=self._notice)
-            await until_settled(self._motion.rest, poses[-1], sum(planned_s))
+            await feed(self._motion, start, lines, acc_mm_s2, go=go, notice=self._notice)
+            await until_settled(self._motion.rest, poses[-1], sum(durations_s(start, lines, acc_mm_s2)))
 
     async def sequence(self, lines: Sequence[QueuedLine], *, acc_mm_s2: float) -> list[Pose]:
         """Queue all lines while the controller holds its path, release it, and wait as `follow` does; return the poses
