@@ -37,10 +37,10 @@ from bench.prior import BRISTLE
 from brushloop.calibrate.compare import TABLE_2
 from brushloop.calibrate.fit.descent import Prior, fit_presses, learned
 from brushloop.calibrate.fit.heldout import BEZIER, FITTED, Refit, held_out_scores, leave_condition_out, refit
-from brushloop.calibrate.loop import read_loop
+from brushloop.calibrate.loop import LoopRecord
 from brushloop.calibrate.presses import read_for_fit
 from brushloop.calibrate.stats import CEILING
-from brushloop.calibrate.writing.compare import HEADLINE, REFERENCE, SIMULATED, read_written
+from brushloop.calibrate.writing.compare import HEADLINE, REFERENCE, SIMULATED, WrittenRecord
 from brushloop.drivers.sim.brush.spec import PAPER, load_brush
 from brushloop.model.fitted import FittedPress
 from brushloop.model.generator import SHIPPED_GENERATOR
@@ -169,7 +169,7 @@ def loop(*, n: int | None = None, seed: int = 1) -> Sequence[Result]:
             with simulated_rig(folder, brush, RATE, seed) as rig:
                 session = collect_grid(folder, rig, LOOP_DEPTHS_MM, LOOP_TILTS_DEG, LOOP_REPEATS, seed)
                 rig.run("repress", session, "--seed", str(seed))
-            record = read_loop(session / "loop")
+            record = LoopRecord.read(session / "loop")
         lost = [points for points, *_ in record.lost]
         where = f"{record.source}, {record.pairs} pairs, {len(record.refused)} not compared; {machine()}"
         for what, points in (("worst of 8", max(lost)), ("mean of 8", statistics.fmean(lost))):
@@ -193,7 +193,7 @@ def written(*, n: int | None = None, seed: int = 1) -> Sequence[Result]:
             with simulated_rig(folder, brush, RATE, seed) as rig:
                 words = ("--out", out, "--sessions", folder / "sessions", "--repeats", str(WRITINGS))
                 rig.run("write", CHARACTERS, *words, "--practice", "--learn", str(ROUNDS))
-            records = [read_written(place) for place in (out / "round-1", out)]
+            records = [WrittenRecord.read(place) for place in (out / "round-1", out)]
             tables = [
                 {
                     (row.character, row.pair): row

@@ -14,7 +14,8 @@ from typing import Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from brushloop.calibrate.errors import CalibrationError, invalid
-from brushloop.calibrate.files import read_bounded, write_whole
+from brushloop.calibrate.files import write_whole
+from brushloop.sessions.disk import read_bounded
 
 FOLDER, FITS = "calibration", "brushfit"
 """Folders of a session that hold its calibrations, and the fits of its brush."""
@@ -69,12 +70,17 @@ class SessionFit(Artefact):
 
 
 class FittedValue(Frozen):
-    """A fitted parameter; the interval is missing where the data do not determine the parameter."""
+    """A fitted number; the interval is missing where the data do not determine the number."""
 
     value: float
     low: float | None
     high: float | None
     """Ends of the 95 % interval."""
+
+    def __str__(self) -> str:
+        """The number and its interval, as tables show it."""
+        interval = "not determined" if self.low is None else f"{self.low:.2f} to {self.high:.2f}"
+        return f"{self.value:.2f} ({interval})"
 
 
 A = TypeVar("A", bound=Artefact)

@@ -1,26 +1,22 @@
 """Errors of calibration and validation.
 
-CalibrationError       the captures do not allow the requested result; says which and why
- +-- CaptureRefused    one capture cannot be used: blank, cut, no contrast; named in every report
+InputError                  of `brushloop.sessions`
+ +-- CalibrationError       the captures or files do not allow the requested result; says which and why
+      +-- CaptureRefused    one capture cannot be used: blank, cut, no contrast; named in every report
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
+
+from brushloop.sessions.errors import InputError
 
 if TYPE_CHECKING:
     from pydantic import ValidationError
 
 
-class CalibrationError(Exception):
+class CalibrationError(InputError):
     """The captures or files do not allow the requested result."""
-
-    exit_code: ClassVar[int] = 2
-
-    def __init__(self, where: str, what: str) -> None:
-        self.where = where
-        self.what = what
-        super().__init__(f"{where}: {what}")
 
 
 def invalid(where: str, error: ValidationError) -> CalibrationError:

@@ -10,16 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.sessions import disk
-from brushloop.sessions.disk import check_writable
-from brushloop.sessions.errors import InputError
+from brushloop.sessions.disk import check_writable, read_bounded
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-MAX_BYTES = 1024 * 1024
-"""Largest file that people or this software write: a table, an artefact."""
 MAX_PHOTOGRAPH_BYTES = 256 * 1024 * 1024
 
 
@@ -76,16 +72,8 @@ def write_whole(path: Path, text: str) -> None:
             shutil.copymode(path, part)
 
 
-def read_bounded(path: Path, most_bytes: int = MAX_BYTES) -> bytes:
-    """Read a file of at most `most_bytes` bytes. Raises `CalibrationError` if it is larger or cannot be read."""
-    try:
-        return disk.read_bounded(path, most_bytes)
-    except InputError as error:
-        raise CalibrationError(str(path), error.what) from None
-
-
 def read_gray(path: Path) -> NDArray[np.uint8]:
-    """Read a PNG or JPEG photograph as (h, w) gray. Raises `CalibrationError` for other files and larger ones."""
+    """Read a PNG or JPEG photograph as (h, w) gray. Raises `InputError` for other files and larger ones."""
     from brushloop.sessions.errors import SessionDamaged
     from brushloop.sessions.messages import decode_gray
 

@@ -35,13 +35,12 @@ from brushloop.calibrate.report import (
     Sealed,
     about,
     ink_uri,
-    load_sealed,
     overlay_uri,
     render,
     source_point,
     write_files,
 )
-from brushloop.calibrate.scores import MEASURES, Scores, Stat, find_stat, scores_csv, similarities, statistics
+from brushloop.calibrate.scores import MEASURES, Scores, Stat, scores_csv, similarities, statistics
 from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.calibrate.stats import Floats, Interval, Summary, is_near
 from brushloop.model.ccdbsm import DomainError
@@ -53,7 +52,7 @@ from brushloop.sessions.terminal import Progress, unseen
 if TYPE_CHECKING:
     from brushloop.model.strokes import StrokeModel
 
-FILE, PAGE, TABLE = "loop.json", "loop.html", "loop.csv"
+PAGE, TABLE = "loop.html", "loop.csv"
 AGAIN, ANOTHER, SIMULATED = "re-pressed", "another press", "recovered, simulated"
 """What is compared with an original: its repetition, other originals of its condition, the model's image of it."""
 GOAL_POINTS = 1.0
@@ -74,6 +73,7 @@ class Pair:
 class LoopRecord(Sealed):
     """A closed loop as stored in `loop.json`: everything but the images and the individual scores."""
 
+    FILE: ClassVar[str] = "loop.json"
     FORMAT: ClassVar[str] = "brushloop-loop-4"
     MADE_BY: ClassVar[str] = "brushloop repress compare"
 
@@ -101,10 +101,6 @@ class LoopRecord(Sealed):
     def rows(self, key: Key) -> list[Stat]:
         """The rows of the table in one alignment and tone."""
         return [row for row in self.stats if (row.alignment, row.tone) == key]
-
-    def stat(self, compared: str, key: Key) -> Stat | None:
-        """One row of the table, or None if nothing was compared in this way."""
-        return find_stat(self.stats, compared, key)
 
     @property
     def lost(self) -> list[tuple[float, Interval | None, str, Stat]]:
@@ -135,11 +131,6 @@ class LoopRecord(Sealed):
             f"than other presses of the same condition, at worst ({measure.upper()}, {row.alignment}, {row.tone}); the "
             f"goal is at most {self.goal_points:g}{sure}.",
         )
-
-
-def read_loop(folder: Path) -> LoopRecord:
-    """Read the `loop.json` in a folder. Raises `CalibrationError` if it is invalid or was edited."""
-    return load_sealed(folder / FILE, LoopRecord)
 
 
 def compare(request: CompareLoopRequest, progress: Progress = unseen) -> Written:
@@ -260,14 +251,14 @@ def write_loop(
         header=header,
         record=record,
         trust=list(_trust(record)),
-        beside=(TABLE, FILE),
+        beside=(TABLE, record.FILE),
         tables=[(key, record.rows(key)) for key in KEYS],
         paper=TABLE_1[ROBOT_WRITING],
         rows=[_shown(pairs[k], percent[k]) for k in worst_first],
         ssim_settings=SSIM_SETTINGS,
         sessions=sessions,
     )
-    write_files(folder, {TABLE: scores_csv(scores), FILE: record.to_json(), PAGE: page})
+    write_files(folder, {TABLE: scores_csv(scores), record.FILE: record.to_json(), PAGE: page})
     return folder / PAGE
 
 

@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,8 @@ from pydantic import ValidationError
 
 from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.errors import CalibrationError, invalid
-from brushloop.calibrate.files import read_bounded, write_whole
+from brushloop.calibrate.files import write_whole
+from brushloop.sessions.disk import read_bounded
 from brushloop.sessions.records import Header, Source
 
 Image = NDArray[np.float32]
@@ -216,6 +217,7 @@ class Sealed(Frozen):
     The digest is not a signature: it guards results and their source against accidental edits.
     """
 
+    FILE: ClassVar[str]
     FORMAT: ClassVar[str]
     MADE_BY: ClassVar[str]
     """The command that writes such a file."""
@@ -233,27 +235,28 @@ class Sealed(Frozen):
         """The text that is written to disk."""
         return json.dumps(self.model_dump(mode="json"), indent=1, ensure_ascii=False) + "\n"
 
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Read such a file, or the one in a folder.
 
-S = TypeVar("S", bound=Sealed)
-
-
-def load_sealed(path: Path, kind: type[S]) -> S:
-    """Read a JSON report. Raises `CalibrationError`, naming the file, if it is not one, is too new or was edited."""
-    try:
-        fields: Any = json.loads(read_bounded(path, MAX_SEALED_BYTES))
-        # Digest of the file, not of the model: a field that was added to the model later is not an edit.
-        known, digest, fields_format = fields["digest"], _digest(fields), fields["format"]
-    except (ValueError, RecursionError, TypeError, KeyError):  # no JSON, text that is no Unicode, or something else
-        what = f"is not a report with a digest: write it with `{kind.MADE_BY}`"
-        raise CalibrationError(str(path), what) from None
-    if fields_format != kind.FORMAT:
-        raise CalibrationError(str(path), f"format is {str(fields_format)[:40]!r}, expected {kind.FORMAT!r}")
-    if known != digest:
-        raise CalibrationError(str(path), "was edited: its digest does not match its contents")
-    try:
-        return kind.model_validate(fields)
-    except ValidationError as error:
-        raise invalid(str(path), error) from None
+        Raises `InputError`, naming the file, if there is none, or it is something else, is too new or was edited.
+        """
+        path = path / cls.FILE if path.is_dir() else path
+        try:
+            fields: Any = json.loads(read_bounded(path, MAX_SEALED_BYTES))
+            # Digest of the file, not of the model: a field that was added to the model later is not an edit.
+            known, digest, fields_format = fields["digest"], _digest(fields), fields["format"]
+        except (ValueError, RecursionError, TypeError, KeyError):  # no JSON, text that is no Unicode, or something else
+            what = f"is not a report with a digest: write it with `{cls.MADE_BY}`"
+            raise CalibrationError(str(path), what) from None
+        if fields_format != cls.FORMAT:
+            raise CalibrationError(str(path), f"format is {str(fields_format)[:40]!r}, expected {cls.FORMAT!r}")
+        if known != digest:
+            raise CalibrationError(str(path), "was edited: its digest does not match its contents")
+        try:
+            return cls.model_validate(fields)
+        except ValidationError as error:
+            raise invalid(str(path), error) from None
 
 
 def _digest(contents: dict[str, Any]) -> str:

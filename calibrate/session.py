@@ -13,9 +13,9 @@ from brushloop.calibrate.board.lens import Lens
 from brushloop.calibrate.board.pix2len import Plane
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.calibrate.errors import CalibrationError, invalid
-from brushloop.calibrate.files import read_bounded
 from brushloop.calibrate.work import FOLDER as FINISHED
 from brushloop.calibrate.work import Store
+from brushloop.sessions.disk import read_bounded
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Header, Stroke
 

@@ -23,6 +23,8 @@ from typing import IO, Any
 
 from brushloop.sessions.errors import DiskFull, InputError, SessionDamaged, SessionError, disk_error, in_one_line
 
+MAX_TEXT_BYTES = 1024 * 1024
+"""Largest file that people or this software write for people: a table, an artefact."""
 SPARE_BYTES = 16 * 1024 * 1024
 """Space that is always kept free, so that the journal's last lines fit."""
 MAX_SNAPSHOT_BYTES = 64 * 1024 * 1024
@@ -49,7 +51,7 @@ def check_room(folder: Path, need_bytes: int) -> None:
         raise DiskFull(folder, f"the disk has {free_mb:.0f} MB left, {need_mb:.0f} MB are needed; make room")
 
 
-def read_bounded(path: Path, max_bytes: int) -> bytes:
+def read_bounded(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> bytes:
     """Bytes of a file from a person or from elsewhere. Raises `InputError` where it is larger or cannot be read.
 
     At most `max_bytes` + 1 are read, even where the file grows meanwhile.

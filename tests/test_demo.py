@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from brushloop.calibrate.validate.tables import load_report, table_1
+from brushloop.calibrate.validate.tables import Report, table_1
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.verify import verify_session
 from tests.journal_lines import read_lines
@@ -78,7 +78,7 @@ def test_killed_in_mid_collection_the_same_command_ends_with_every_stroke_exactl
     assert Path(printed[2]).is_file()
     assert "pix2len" in (out / "demo.log").read_text()  # what the steps print does not drown the answer
     assert "pix2len" not in ran.stdout
-    report = load_report(Path(printed[1]).with_name("report.json"))
+    report = Report.read(Path(printed[1]).with_name("report.json"))
     rows = {row.label: row.scores for row in table_1(report)}
     assert rows.pop("another press") is rows.pop("ceiling") is None  # no condition was pressed twice
     assert set(rows) == {"CCD-BSM", "CCD-BSMG", "robot writing", "CCD-BSM calibrated"}

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.artefact import made_by
+from brushloop.calibrate.artefact import FittedValue, made_by
 from brushloop.calibrate.commands import TwinRequest
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written, check_target, write_whole
@@ -80,24 +80,16 @@ PAPER_GRAY = 215
 TRIED = np.arange(0.0, 12.1, 0.5)
 
 
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """A constant of the twin with its 95 % interval."""
+def fitted_value(constant: Constant, scales: float, error: float) -> FittedValue:
+    """A constant at a point of the search, with its standard error in scales.
 
-    constant: Constant
-    value: float
-    low: float
-    high: float
-    determined: bool
-    """False where the presses do not determine it; the prior then does."""
-
-    @staticmethod
-    def of(constant: Constant, scales: float, error: float) -> Estimate:
-        """The estimate at a point of the search; the standard error in scales."""
-        ends = (constant.value(scales + way * NORMAL_95 * error) for way in (-1.0, 1.0))
-        low, high = constant.bounds
-        determined = error < MOST_SD and low + 0.01 < scales < high - 0.01
-        return Estimate(constant, constant.value(scales), *ends, determined=bool(determined))
+    It has no interval where the presses do not determine it; the prior then does.
+    """
+    value, low, high = (constant.value(scales + way * NORMAL_95 * error) for way in (0.0, -1.0, 1.0))
+    least, most = constant.bounds
+    if error < MOST_SD and least + 0.01 < scales < most - 0.01:
+        return FittedValue(value=value, low=low, high=high)
+    return FittedValue(value=value, low=None, high=None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +97,7 @@ class Twin:
     """A fitted twin, and all that is reported about it."""
 
     spec: BrushSpec
-    estimates: tuple[Estimate, ...]
+    values: dict[Constant, FittedValue]
     spread: Spread | None
     """None where no cell has enough captures; the spread is then the default brush's."""
     held_out: tuple[Stat, ...]
@@ -200,12 +192,13 @@ def fit_twin(presses: Presses, pool: Executor, progress: Progress = unseen, stor
         points.append(without.point)
         predicted += _predicted(presses, [target.cells[k] for k in part], without, target)
     errors = WIDER * np.sqrt(variance + of_parts(points))
-    estimates = [Estimate.of(*one) for one in zip(SHAPE, solution.point, errors, strict=False)]
+    found = [*zip(SHAPE, solution.point, errors, strict=False)]
     if spread is not None:
         spec = with_values(spec, SPREAD, spread.point)
-        estimates += [Estimate.of(*one) for one in zip(SPREAD, spread.point, spread.error, strict=True)]
+        found += [*zip(SPREAD, spread.point, spread.error, strict=True)]
     held_out = tuple(held_out_scores(predicted, (TWIN, BEZIER)))
-    return Twin(spec, tuple(estimates), spread, held_out, sound_head(spec, target.cells, grid))
+    values = {constant: fitted_value(constant, scales, error) for constant, scales, error in found}
+    return Twin(spec, values, spread, held_out, sound_head(spec, target.cells, grid))
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,10 +296,10 @@ def twin_toml(twin: Twin, session_id: str, noise_gray: float | None) -> Iterator
     yield f"radius_mm = {twin.spec.radius_mm:g}    # as recorded with the session"
     yield f"length_mm = {twin.spec.length_mm:g}    # as recorded with the session"
     yield f"seed = {twin.spec.seed}    # of the individuals tried, the one nearest to the captures"
-    for one in twin.estimates:
-        known = f"{one.low:.4g} to {one.high:.4g}" if one.determined else "not determined by these presses"
-        unit = f"{one.constant.unit}; " if one.constant.unit else ""
-        yield f"{one.constant.name} = {one.value:.6g}    # {unit}{known}; default {one.constant.default:.4g}"
+    for constant, fitted in twin.values.items():
+        known = "not determined by these presses" if fitted.low is None else f"{fitted.low:.4g} to {fitted.high:.4g}"
+        unit = f"{constant.unit}; " if constant.unit else ""
+        yield f"{constant.name} = {fitted.value:.6g}    # {unit}{known}; default {constant.default:.4g}"
     for row in twin.held_out:
         scores = f"CSIM {row.csim.avg:.2f} %, SSIM {row.ssim.avg:.2f} %, n = {row.csim.n}"
         yield f"# a third of the conditions left out in turn: {row.model}: {scores}"

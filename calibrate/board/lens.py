@@ -62,11 +62,6 @@ class Lens(Frozen):
         fx, fy, cx, cy = self.matrix
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
-    @property
-    def coefficients(self) -> Floats:
-        """OpenCV's distortion coefficients, (5,)."""
-        return np.array(self.distortion)
-
     def check_size(self, image: Gray, where: str) -> None:
         """Raise `CaptureRefused` for an (h, w) photograph of another size: the lens does not apply to it."""
         if image.shape[::-1] != self.size_px:
@@ -76,19 +71,19 @@ class Lens(Frozen):
     def undistorted(self, pixels: Floats) -> Floats:
         """(n, 2) pixels of a photograph -> where they lie in the undistorted one."""
         points, camera = pixels.reshape(-1, 1, 2).astype(np.float64), self.camera
-        flat = cv2.undistortPointsIter(points, camera, self.coefficients, np.eye(3), camera, ROUNDS)
+        flat = cv2.undistortPointsIter(points, camera, np.array(self.distortion), np.eye(3), camera, ROUNDS)
         return np.asarray(flat, np.float64).reshape(-1, 2)
 
     def distorted(self, pixels: Floats) -> Floats:
         """(n, 2) pixels of the undistorted photograph -> where they lie in the photograph as it was taken."""
         focal, centre = np.array(self.matrix[:2]), np.array(self.matrix[2:])
         rays = np.column_stack([(pixels - centre) / focal, np.ones(len(pixels))])
-        bent, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), self.camera, self.coefficients)
+        bent, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), self.camera, np.array(self.distortion))
         return np.asarray(bent, np.float64).reshape(-1, 2)
 
     def undistort(self, image: Gray) -> Gray:
         """The photograph as a lens without distortion would have taken it, same size and camera matrix."""
-        return cast("Gray", cv2.undistort(image, self.camera, self.coefficients))
+        return cast("Gray", cv2.undistort(image, self.camera, np.array(self.distortion)))
 
 
 def rms(residuals: Floats) -> float:

@@ -239,10 +239,6 @@ class DragArtefact(SessionFit):
             raise ValueError(f"parameters: expected {', '.join(DragModel.names())}")
         return self
 
-    def model(self) -> DragModel:
-        """The fitted drag model."""
-        return model_of(self.parameters)
-
 
 def fit_drags(drags: Drags, progress: Progress = unseen) -> DragArtefact:
     """Fit all strokes, leave out each fifth of their commands in turn, and make the artefact.
@@ -271,7 +267,7 @@ def adapt_drags(drags: Drags, prior: DragArtefact, strokes: int) -> DragArtefact
     weight = STROKE_MM2 * float(drawings.x_mm[1] - drawings.x_mm[0]) ** 2
     known = drags.commands if prior.kept is None else np.array(prior.kept.commands)
     freedom = {name: sd * weight**0.5 for name, sd in session_change(known).items()}
-    values, origin = fit_values(drawings, prior.model(), freedom), f"{prior.session_id}, {prior.source}"
+    values, origin = fit_values(drawings, model_of(prior.parameters), freedom), f"{prior.session_id}, {prior.source}"
     about = {"prior": prior.digest, "prior_session": origin, "refitted": tuple(values)}
     return _artefact(drags, images, prior.parameters | values, **about)
 

@@ -19,7 +19,16 @@ from rich.table import Table
 from brushloop.calibrate.artefact import load_artefact, made_by, put_to_use
 from brushloop.calibrate.commands import FitRequest
 from brushloop.calibrate.drags import Drags, read_drags
-from brushloop.calibrate.drags.fit import FOLDER, LAG, PREDICTED, DragArtefact, adapt_drags, fit_drags, predicted
+from brushloop.calibrate.drags.fit import (
+    FOLDER,
+    LAG,
+    PREDICTED,
+    DragArtefact,
+    adapt_drags,
+    fit_drags,
+    model_of,
+    predicted,
+)
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written
 from brushloop.calibrate.report import (
@@ -127,7 +136,7 @@ def validate_drags(session: Path, fit: Path | None, progress: Progress = unseen)
     if artefact is None:
         return DragValidation(drags, None, [])
     captured = drags.drawings.ink
-    rows = predicted(artefact.model(), artefact.kept, drags, np.arange(len(captured)))
+    rows = predicted(model_of(artefact.parameters), artefact.kept, drags, np.arange(len(captured)))
     scores = {name: binary_scores(ink, captured > 0.5) for name, ink in rows.items()}
     scores[CEILING] = _ceiling(drags.conditions, captured > 0.5)
     known = artefact.fitted_strokes if artefact.recording_sha256 == drags.session.sha256 else ()

@@ -17,7 +17,7 @@ from typing import Any, Self
 import numpy as np
 from pydantic import model_validator
 
-from brushloop.calibrate.artefact import FITS, SessionFit, load_artefact, made_by, put_to_use
+from brushloop.calibrate.artefact import FITS, FittedValue, SessionFit, load_artefact, made_by, put_to_use
 from brushloop.calibrate.commands import FitRequest
 from brushloop.calibrate.compare import MM_PER_PX, brush_of
 from brushloop.calibrate.errors import CalibrationError
@@ -98,43 +98,17 @@ class BrushFit(SessionFit):
         return self
 
 
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """A number with its 95 % interval."""
-
-    value: float
-    low: float
-    high: float
-
-    @classmethod
-    def of(cls, value: float, variance: float, factor: float) -> Estimate:
-        """The interval of `factor` standard errors on either side."""
-        off = factor * math.sqrt(variance)
-        return cls(value, value - off, value + off)
-
-    def __str__(self) -> str:
-        return f"{self.value:.2f} ({self.low:.2f} to {self.high:.2f})"
+Sizes = dict[str, tuple[FittedValue, ...]]
+"""Each size of the marks by its name: mm in the middle of the session's depths and tilts, mm per mm of depth, mm per
+degree of tilt."""
 
 
-@dataclass(frozen=True, slots=True)
-class Size:
-    """One size of the marks in the middle of the session's depths and tilts."""
-
-    name: str
-    here: Estimate
-    """mm"""
-    by_depth: Estimate
-    """mm per mm of depth"""
-    by_tilt: Estimate
-    """mm per degree of tilt"""
-
-
-def sizes_of(presses: Presses) -> list[Size]:
+def sizes_of(presses: Presses) -> Sizes:
     """Every size; empty where the conditions are too few for an interval, or do not span depth and tilt without one."""
     inked = presses.pick(np.flatnonzero((presses.ink > 0.5).any(axis=(1, 2))).tolist())
     groups = list(inked.cells.values())
     if len(groups) < FEWEST_CONDITIONS:
-        return []
+        return {}
     measured = np.array([measure(ink, inked.grid) for ink in inked.ink])
 
     def plane(rows: Sequence[int]) -> Floats:
@@ -144,13 +118,14 @@ def sizes_of(presses: Presses) -> list[Size]:
     try:
         whole, without = plane(every), np.array([plane([k for k in every if k not in group]) for group in groups])
     except ValueError:
-        return []
+        return {}
     variance = (1.0 - 1.0 / len(groups)) * ((without - whole) ** 2).sum(axis=0)
-    factor = student_95(len(groups) - 1)
-    return [
-        Size(name, *(Estimate.of(float(v), float(s), factor) for v, s in zip(values, squares, strict=True)))
-        for name, values, squares in zip(SIZES, whole.T, variance.T, strict=True)
-    ]
+    reach = student_95(len(groups) - 1) * np.sqrt(variance)
+    ends = np.stack([whole, whole - reach, whole + reach], axis=-1).swapaxes(0, 1).tolist()
+    return {
+        name: tuple(FittedValue(value=value, low=low, high=high) for value, low, high in each)
+        for name, each in zip(SIZES, ends, strict=True)
+    }
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +138,7 @@ class FitResult:
     """Presses that cannot be used or are cut by the edge of their photograph."""
     fit: BrushFit
     """The contents of the file."""
-    sizes: list[Size]
+    sizes: Sizes
     """Empty where the session has too few conditions for an interval."""
     held_out: list[Stat]
     """Empty with one condition only."""
@@ -187,8 +162,8 @@ class FitResult:
             title = f"sizes of the marks with 95 % intervals ({label})"
             at = "at {:g} mm, {:g}°".format(*self.presses.middle)
             sizes = Table("size, mm", at, "per mm of depth", "per degree of tilt", title=title)
-            for size in self.sizes:
-                sizes.add_row(size.name, str(size.here), str(size.by_depth), str(size.by_tilt))
+            for name, values in self.sizes.items():
+                sizes.add_row(name, *map(str, values))
             yield sizes
         else:
             yield f"Intervals of the sizes of the marks need {FEWEST_CONDITIONS} combinations of depth and tilt."

@@ -24,21 +24,18 @@ from brushloop.calibrate.commands import DiffRequest, ValidateRequest
 from brushloop.calibrate.drags.report import DragValidation, validate_drags, write_drags
 from brushloop.calibrate.drags.report import summary as drag_summary
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.files import read_bounded
 from brushloop.calibrate.fit.fit import BrushFit
-from brushloop.calibrate.loop import FILE as LOOP_FILE
-from brushloop.calibrate.loop import LoopRecord, read_loop
+from brushloop.calibrate.loop import LoopRecord
 from brushloop.calibrate.report import data_uri, framed, write_files
 from brushloop.calibrate.scores import MEASURES, scores_csv, write_parquet
 from brushloop.calibrate.session import open_session as open_recording
 from brushloop.calibrate.stats import Paired, holm, paired
 from brushloop.calibrate.validate.page import Curve, page_of, read_curve, terminal_lines
 from brushloop.calibrate.validate.run import FittedSession, Outcome, Refused, validate_presses
-from brushloop.calibrate.validate.tables import Report, check_gates, load_report, parse_gate, report_of, summary_csv
+from brushloop.calibrate.validate.tables import Report, check_gates, parse_gate, report_of, summary_csv
 from brushloop.calibrate.work import cluster, threads
-from brushloop.calibrate.writing.compare import FILE as WRITTEN_FILE
-from brushloop.calibrate.writing.compare import PICTURE, WrittenRecord, read_written
-from brushloop.sessions.disk import as_text, check_writable, csv_text, file_sha256
+from brushloop.calibrate.writing.compare import PICTURE, WrittenRecord
+from brushloop.sessions.disk import as_text, check_writable, csv_text, file_sha256, read_bounded
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.recording import Recording
@@ -182,17 +179,17 @@ def find_beside(sessions: Sequence[FittedSession]) -> Beside:
             beside.notes.append(f"{path} is left out: {foreign}; `{record.MADE_BY}` compares again")
         return not foreign
 
-    for path in (home / LOOP / LOOP_FILE for home in homes):
+    for path in (home / LOOP / LoopRecord.FILE for home in homes):
         if path.is_file():
-            loop = read_loop(path.parent)
+            loop = LoopRecord.read(path)
             foreign = "" if loop.original_sha256 in originals else f"it is of another recording of {loop.original}"
             if belongs(path, loop, foreign):
                 beside.loops.append(loop)
     for folder in dict.fromkeys(place / WRITTEN for home in homes for place in (home, home.parent.parent)):
-        if (folder / WRITTEN_FILE).is_file():
-            record = read_written(folder)
+        if (path := folder / WrittenRecord.FILE).is_file():
+            record = WrittenRecord.read(path)
             foreign = "" if {record.brush} == brushes else f"it was written with another brush, {record.brush}"
-            if belongs(folder / WRITTEN_FILE, record, foreign):
+            if belongs(path, record, foreign):
                 beside.written.append(record)
                 beside.figures_13.append((record.session, figure_13(folder / PICTURE, record)))
     return beside
@@ -202,7 +199,7 @@ def figure_13(path: Path, record: WrittenRecord) -> str:
     """Figure 13 as a data URI. Raises `CalibrationError` unless it is the picture written with the record."""
     data = read_bounded(path, MAX_PICTURE_BYTES)
     if hashlib.sha256(data).hexdigest() != record.figure_13_sha256:
-        raise CalibrationError(str(path), f"is not the picture of {WRITTEN_FILE} beside it: its SHA-256 differs")
+        raise CalibrationError(str(path), f"is not the picture of {record.FILE} beside it: its SHA-256 differs")
     return data_uri(data)
 
 
@@ -212,7 +209,7 @@ def _write(outcome: Outcome, folder: Path, curves: Sequence[Curve], beside: Besi
     report = report_of(outcome, hashlib.sha256(files["scores.csv"].encode()).hexdigest(), beside.loops, beside.written)
     files["summary.csv"] = summary_csv(report)
     files["failures.csv"] = csv_text(Refused._fields, report.refused)
-    files["report.json"] = report.to_json()
+    files[report.FILE] = report.to_json()
     names = [*files, *write_parquet(outcome.scores, report.label, folder / "scores.parquet")]
     files["report.html"] = page_of(outcome, report, curves, names, beside.figures_13)
     write_files(folder, files)
@@ -272,7 +269,7 @@ class Difference:
     def lines(self) -> Iterator[object]:
         """What the command prints: what is compared, and the changes."""
         for words, side in (("Before", self.before), ("After", self.after)):
-            names = ", ".join(session.session_id for session in side.sessions[:4])
+            names = ", ".join(session.header.session_id for session in side.sessions[:4])
             yield f"{words}: {names}, brushloop {side.software['brushloop']}."
         what = "the same stroke" if self.by_stroke else "the average of the same (H, α)"
         test = self.changes[0].test
@@ -298,7 +295,7 @@ class Difference:
 def compare(request: DiffRequest, _progress: Progress = unseen) -> Difference:
     """Compare two reports, or two validated sessions. Raises `CalibrationError` if they are not comparable."""
     paths = report_path(request.before), report_path(request.after)
-    old, new = (load_report(path) for path in paths)
+    old, new = (Report.read(path) for path in paths)
     if old.source != new.source:
         what = f"is of {new.source}, {paths[0]} of {old.source}: they cannot be compared"
         raise CalibrationError(str(paths[1]), what)
@@ -329,7 +326,7 @@ def report_path(place: Path) -> Path:
         return place
     # Search only a recording's own folder: a report next to a session's folder may be about several sessions.
     folder = place.parent if place.is_file() else place
-    for path in (folder / "report.json", folder / "validation" / "report.json"):
+    for path in (folder / Report.FILE, folder / FOLDER / Report.FILE):
         if path.is_file():
             return path
     why = f"was not validated: run `brushloop validate {shlex.quote(str(place))}` first, or give a report.json"
@@ -344,7 +341,7 @@ def _scores(path: Path, report: Report, *, by_stroke: bool) -> dict[Series, Stro
     table = path.with_name("scores.csv")
     if not table.is_file() or file_sha256(table) != report.scores_sha256:
         raise CalibrationError(str(table), f"is not the table of {path.name}: its SHA-256 differs")
-    recordings = {s.session_id: s.recording_sha256 for s in report.sessions}
+    recordings = {s.header.session_id: s.recording_sha256 for s in report.sessions}
     scores: defaultdict[Series, defaultdict[tuple[str, ...], list[float]]] = defaultdict(lambda: defaultdict(list))
     with table.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):

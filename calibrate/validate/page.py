@@ -86,7 +86,7 @@ def page_of(
 
     `figures_13` are sessions of characters and their pictures as data URIs.
     """
-    best_model, names = report.model(report.shown), [session.session_id for session in report.sessions]
+    best_model, names = report.model(report.shown), [session.header.session_id for session in report.sessions]
     best, worst = extremes(outcome, report.shown)
     columns = [model for name in CONDITION_COLUMNS if (model := report.model(name)) is not None]
     return render(
@@ -312,7 +312,7 @@ def trust(report: Report) -> Iterator[Point]:
         yield Point(True, "Every stroke that counted was used.")
     for session in report.sessions:
         for point in _session(session):
-            yield Point(point.good, f"{session.session_id}: {point.text}")
+            yield Point(point.good, f"{session.header.session_id}: {point.text}")
     yield from _models(report)
     for loop in report.loops:
         yield loop.answer
@@ -383,7 +383,7 @@ def _label(report: Report, name: str) -> str:
 
 def terminal_lines(report: Report) -> Iterator[object]:
     """Tables and lines for the terminal; the extremes of the scores are on the page."""
-    names = ", ".join(session.session_id for session in report.sessions[:4])
+    names = ", ".join(session.header.session_id for session in report.sessions[:4])
     yield f"{names}: {source_note(report.source)}"
     yield measured(report)
     rows = [[*table_2(report, key), *robot_writing(report, key)] for key in (NORMAL, STRICT)]

@@ -30,7 +30,7 @@ from brushloop.calibrate.compare import (
 )
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.loop import AGAIN, LoopRecord
-from brushloop.calibrate.report import Sealed, load_sealed, source_label
+from brushloop.calibrate.report import Sealed, source_label
 from brushloop.calibrate.scores import MEASURES, Scores, Stat, find_stat, statistics
 from brushloop.calibrate.session import Calibration
 from brushloop.calibrate.stats import CEILING, DepthTilt, Floats, Summary, ceiling_values
@@ -115,15 +115,11 @@ class Session(Frozen):
     collected: Collected | None = None
     """None without a journal: for imports, and for recordings sent without it."""
 
-    @property
-    def session_id(self) -> str:
-        """Its name."""
-        return self.header.session_id
-
 
 class Report(Sealed):
     """All results of a validation."""
 
+    FILE: ClassVar[str] = "report.json"
     FORMAT: ClassVar[str] = "brushloop-validation-5"
     MADE_BY: ClassVar[str] = "brushloop validate"
 
@@ -167,11 +163,6 @@ class Report(Sealed):
     def label(self) -> str:
         """Label of every table and figure."""
         return source_label(self.source, (session.header.brush for session in self.sessions))
-
-
-def load_report(path: Path) -> Report:
-    """Read a report.json. Raises `CalibrationError` if it is not one or was edited."""
-    return load_sealed(path, Report)
 
 
 def report_of(
@@ -289,7 +280,7 @@ def robot_writing(report: Report, key: Key = NORMAL) -> list[TableRow]:
     rows: list[TableRow] = []
     for loop in report.loops:
         basis = f"{loop.original} pressed again as {loop.again}, recovered by {loop.model}"
-        rows.append(TableRow(ROBOT_WRITING, basis, loop.stat(AGAIN, key), TABLE_1[ROBOT_WRITING]))
+        rows.append(TableRow(ROBOT_WRITING, basis, find_stat(loop.stats, AGAIN, key), TABLE_1[ROBOT_WRITING]))
     return rows
 
 

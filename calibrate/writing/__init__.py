@@ -18,7 +18,7 @@ from brushloop.calibrate.artefact import Frozen, SessionFit, load_artefact, made
 from brushloop.calibrate.commands import PlanRequest
 from brushloop.calibrate.compare import SIZE_PX, Image
 from brushloop.calibrate.errors import CalibrationError, invalid
-from brushloop.calibrate.files import Written, read_bounded
+from brushloop.calibrate.files import Written
 from brushloop.calibrate.report import BLUE, picture_grid, save_picture, write_files
 from brushloop.calibrate.session import OpenSession
 from brushloop.model.ccdbsm import Brush, DomainError
@@ -27,7 +27,7 @@ from brushloop.model.characters.plan import Patch, Reach, StrokePath, covered, d
 from brushloop.model.drag import NAMES, Floats, Footprint
 from brushloop.model.similarity import csim, ssim
 from brushloop.model.strokes import StrokeModel, stroke_model
-from brushloop.sessions.disk import check_writable
+from brushloop.sessions.disk import check_writable, read_bounded
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.messages import decode_gray, encode_png
 from brushloop.sessions.records import Header

@@ -38,7 +38,6 @@ from brushloop.calibrate.report import (
     about,
     data_uri,
     ink_uri,
-    load_sealed,
     overlay,
     overlay_uri,
     picture_grid,
@@ -57,7 +56,7 @@ from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.records import Source
 from brushloop.sessions.terminal import Progress, counted, unseen
 
-FILE, PICTURE, PAGE, TABLE = "written.json", "figure-13.png", "written.html", "written.csv"
+PICTURE, PAGE, TABLE = "figure-13.png", "written.html", "written.csv"
 Key = tuple[Alignment, Tone, Polarity]
 KEYS: tuple[Key, ...] = tuple(itertools.product(Alignment, Tone, Polarity))
 HEADLINE: Key = (Alignment.MM, Tone.BINARY, Polarity.INK)
@@ -127,6 +126,7 @@ class Table3Row(Frozen):
 class WrittenRecord(Sealed):
     """Written characters as their `written.json` holds them: everything but the images and the single scores."""
 
+    FILE: ClassVar[str] = "written.json"
     FORMAT: ClassVar[str] = "brushloop-written-2"
     MADE_BY: ClassVar[str] = "brushloop write compare"
 
@@ -148,11 +148,6 @@ class WrittenRecord(Sealed):
     def characters(self) -> tuple[str, ...]:
         """Their names, in the table's order."""
         return tuple(dict.fromkeys(row.character for row in self.table_3))
-
-
-def read_written(path: Path) -> WrittenRecord:
-    """Read `written.json`, or that in a report's folder. Raises `CalibrationError` if it is not one or was edited."""
-    return load_sealed(path / FILE if path.is_dir() else path, WrittenRecord)
 
 
 @dataclass(frozen=True)
@@ -316,7 +311,7 @@ def write_written(written: WritingComparison, folder: Path, command: str) -> Pat
         header=header.model_copy(update={"protocol": ""}),  # the plan, point by point
         provenance=(("compared with", record.software), ("command", command)),
     )
-    write_files(folder, {TABLE: scores_csv(written), FILE: record.sealed().to_json(), PAGE: page})
+    write_files(folder, {TABLE: scores_csv(written), record.FILE: record.sealed().to_json(), PAGE: page})
     return folder / PAGE
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from brushloop.calibrate.commands import CompareLoopRequest, RecoverRequest, show_work
-from brushloop.calibrate.files import read_bounded, write_whole
+from brushloop.calibrate.files import write_whole
 from brushloop.collect.chains import LoopRequest
 from brushloop.collect.engine import CollectRequest
 from brushloop.collect.engine.open_or_resume import check_fresh_sheet
@@ -22,6 +22,7 @@ from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.config_file import read_text
 from brushloop.collect.start import calibrated, collected_session, fitted
+from brushloop.sessions.disk import read_bounded
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import BareName
 from brushloop.sessions.terminal import say

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import write_whole
 from brushloop.collect.commission.arm import ArmStep
 from brushloop.collect.commission.brush import BrushStep, ForceStep
@@ -19,6 +18,7 @@ from brushloop.collect.errors import CollectAborted, ConfigError, NotAccepted, S
 from brushloop.collect.operator import Choice
 from brushloop.drivers.errors import DeviceError
 from brushloop.sessions.disk import set_aside
+from brushloop.sessions.errors import InputError
 
 STEPS = (
     ArmStep(),
@@ -33,7 +33,7 @@ STEPS = (
 )
 AGAIN, AFRESH = Choice("a", "try this step again, where it was"), Choice("f", "teach this step from its beginning")
 STOPPED = "stopped; the same command resumes from there"
-REFUSED = (NotAccepted, DeviceError, CalibrationError, StepError, ConfigError)
+REFUSED = (NotAccepted, DeviceError, InputError, StepError, ConfigError)
 
 
 class Wizard:

@@ -15,13 +15,13 @@ from pydantic import Field, ValidationError, model_validator
 
 from brushloop.calibrate.board.lens import Lens, read_lens
 from brushloop.calibrate.board.spec import BoardSpec
-from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.config_file import Config, Finite, PaperSide, Positive, Range, place, read_toml, refusal
 from brushloop.drivers.arcs.settings import ArcsTable
 from brushloop.drivers.camera import CameraTable
 from brushloop.drivers.force.sri_m8123 import ForceTable
 from brushloop.drivers.ink import AnyInkTable
+from brushloop.sessions.errors import InputError
 
 PREFIX, DELIMITER = "BRUSHLOOP_", "__"
 MAX_CONFIG_BYTES = 1024 * 1024
@@ -384,6 +384,6 @@ def rig_from(path: Path, values: dict[str, Any], environment: Mapping[tuple[str,
         optics = read_lens(path.parent / lens_file)
     except ValidationError as error:
         raise refusal(path, error, RigConfig, environment=environment) from None
-    except CalibrationError as error:
+    except InputError as error:
         raise ConfigError(path, "camera.lens_file", str(error)) from None
     return rig.model_copy(update={"camera": rig.camera.model_copy(update={"optics": optics})})

@@ -100,7 +100,7 @@ class Review:
         try:
             # As the session recorded it: lens files lie beside the rig's own rig.toml, not beside its snapshot here.
             self._rig = rig_of(folder)
-        except CalibrationError as error:
+        except InputError as error:
             self.shown_whole = str(error)
         self.read()
 
@@ -152,7 +152,7 @@ class Review:
             if (path := current(self.folder, FITS)) is None:
                 return pictures, "no fit yet: run `brushloop fit`"
             fit = load_artefact(path, BrushFit)
-        except CalibrationError as error:
+        except InputError as error:
             return pictures, str(error)
         pictures = replace(pictures, model=mark_of(fit.press(), capture.press.condition))
         return pictures, f"CCD-BSM fitted to {fit.strokes} strokes of {fit.session_id}"

@@ -89,7 +89,8 @@ def test_dragged_strokes_are_fitted_and_written(session: Path, fitted: tuple[Pat
     assert len(fit.fitted_strokes) == 6
     assert fit.held_out.keys() == {PREDICTED, LAG}
     assert all(csim > 80.0 for csim, _ in fit.held_out.values())
-    assert fit.model().leash_mm + 6.0 * fit.model().leash_per_mm > 1.0
+    model = model_of(fit.parameters)
+    assert model.leash_mm + 6.0 * model.leash_per_mm > 1.0
     assert fit.parameters["half_mm"].low is not None
     assert fit.parameters["settle_mm"].low is None  # each depth is constant along its path
     assert fit_command(session)[0] == path, "equal inputs give an equal file"

@@ -37,10 +37,10 @@ from brushloop.calibrate.writing.compare import (
     SIMULATED,
     Character,
     WritingComparison,
+    WrittenRecord,
     aligned,
     as_ink,
     compare_ink,
-    read_written,
     round_of,
     write_written,
 )
@@ -63,6 +63,7 @@ from brushloop.model.characters.plan import (
 from brushloop.model.drag import NAMES, START, Drawings, Footprint, inked
 from brushloop.model.similarity import csim, ssim
 from brushloop.model.strokes import stroke_model
+from brushloop.sessions.errors import InputError
 from brushloop.sessions.records import Header, Source
 from tests.calibrate.given import CALIBRATION
 from tests.calibrate.records import written_record
@@ -140,7 +141,7 @@ def test_bad_input_is_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     ran = CliRunner().invoke(app, ["write", "plan", *arguments])
-    assert isinstance(ran.exception, CalibrationError)
+    assert isinstance(ran.exception, InputError)
     assert words in str(ran.exception)
     assert "\n" not in str(ran.exception)
     assert list(tmp_path.iterdir()) == []
@@ -191,13 +192,13 @@ def test_table_3_has_a_row_for_each_comparison_and_survives_the_disk(tmp_path: P
 
     path = tmp_path / "written.json"
     path.write_text(written_record(table_3=rows).to_json())
-    assert read_written(tmp_path).table_3 == rows
+    assert WrittenRecord.read(tmp_path).table_3 == rows
     path.write_text(path.read_text().replace("loopback rig", "real capture"))
     with pytest.raises(CalibrationError, match=r"written\.json: was edited"):
-        read_written(path)
+        WrittenRecord.read(path)
     path.write_text("{}")
     with pytest.raises(CalibrationError, match="not a report with a digest: write it with `brushloop write compare`"):
-        read_written(path)
+        WrittenRecord.read(path)
 
 
 def test_a_plan_keeps_its_images_and_its_points(tmp_path: Path) -> None:

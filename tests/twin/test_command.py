@@ -16,13 +16,14 @@ import pytest
 from typer.testing import CliRunner
 
 import brushloop.__main__
+from brushloop.calibrate.artefact import FittedValue
 from brushloop.calibrate.compare import Alignment, Tone
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.scores import Stat
 from brushloop.calibrate.stats import Summary
 from brushloop.drivers.sim.brush.spec import BrushSpec, CameraNoise, SoundHead, load_brush
 from brushloop.twin.brush import SHAPE
-from brushloop.twin.run import PARTS, Estimate, Twin, TwinStopped, noise_of, twin_toml, workers
+from brushloop.twin.run import PARTS, Twin, TwinStopped, noise_of, twin_toml, workers
 from brushloop.twin.search import Solution
 from tests.photographed import imported_presses
 from tests.twin.test_search import Serial
@@ -89,8 +90,11 @@ def test_a_session_gets_a_twin_and_a_run_that_was_broken_off_goes_on(
 
 def test_a_twin_is_read_back_and_what_is_not_determined_has_no_interval(tmp_path: Path) -> None:
     spec = BrushSpec(radius_mm=5.0, length_mm=42.0, friction=0.3, set_deg=9.0, seed=7)
-    estimates = tuple(Estimate(one, float(getattr(spec, one.name)), 0.1, 0.4, one.name != "set_deg") for one in SHAPE)
-    fitted = Twin(spec, estimates, None, (HELD_OUT,), SoundHead(head_mm=2.2, misplaced_mm=4.0))
+    values = {
+        one: FittedValue(value=getattr(spec, one.name), low=None if one.name == "set_deg" else 0.1, high=0.4)
+        for one in SHAPE
+    }
+    fitted = Twin(spec, values, None, (HELD_OUT,), SoundHead(head_mm=2.2, misplaced_mm=4.0))
     path = tmp_path / "twin.toml"
     path.write_text("\n".join(twin_toml(fitted, 'session "1"\n', 1.234)))
     found = load_brush(path)

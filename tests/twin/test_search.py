@@ -19,7 +19,7 @@ from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 from brushloop.drivers.sim.brush.spec import ALLOWED, PAPER, load_brush
 from brushloop.model.presses import Grid, Presses
 from brushloop.twin.brush import HERE, SHAPE, SPREAD, Constant, draw, with_values
-from brushloop.twin.run import LEAST_MISPLACED_MM, Estimate, fit_twin, sound_head
+from brushloop.twin.run import LEAST_MISPLACED_MM, fit_twin, fitted_value, sound_head
 from brushloop.twin.search import (
     Solution,
     Target,
@@ -116,7 +116,7 @@ def test_what_the_parts_disagree_on_is_not_determined() -> None:
     assert of_parts(points) == pytest.approx([0.0, 2.0 / 3.0 * 18.0])
     assert of_parts(points[:1]) == 0.0
     errors = np.sqrt(of_parts(points))
-    assert [Estimate.of(SHAPE[k], 1.0, float(errors[k])).determined for k in (0, 1)] == [True, False]
+    assert [fitted_value(SHAPE[k], 1.0, float(errors[k])).low is not None for k in (0, 1)] == [True, False]
 
 
 @pytest.mark.parametrize(("name", "value", "least"), [("place_wander_mm", 0.4, 0.25), ("reach_wander_mm", 1.0, 0.2)])

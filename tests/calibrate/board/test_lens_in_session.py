@@ -23,6 +23,7 @@ from brushloop.calibrate.presses import prepare_press
 from brushloop.calibrate.session import Calibration
 from brushloop.calibrate.stroke import PX_PER_MM
 from brushloop.collect.tui.review_screen import Review
+from brushloop.sessions.errors import InputError
 from brushloop.sessions.recording import Recording
 from tests.calibrate.given import kept_lens
 from tests.calibrate.simulated_rigs import CAMERAS, Shot, collected, sheet, true_mask, true_scale
@@ -101,7 +102,7 @@ def test_a_session_that_was_collected_with_a_lens_needs_no_other(tmp_path: Path,
         (rig_lens(tmp_path / "small", -0.15, (1024, 768)), "is 2048 x 1536 px, the lens was calibrated at 1024 x 768"),
         (tmp_path / "nosuch.json", "no such file"),
     ):
-        with pytest.raises(CalibrationError, match=why):
+        with pytest.raises(InputError, match=why):
             calibrate_session(session, given)
 
 

@@ -19,7 +19,7 @@ from brushloop.calibrate.fit.fit import fit_presses as fit_session
 from brushloop.calibrate.fit.heldout import FITTED, leave_condition_out
 from brushloop.calibrate.session import open_session
 from brushloop.calibrate.stats import CEILING
-from brushloop.calibrate.validate.tables import load_report
+from brushloop.calibrate.validate.tables import Report
 from brushloop.model.fitted import NAME, NAMES, PARAMETERS, TERMS, FittedPress, command_terms, published
 from brushloop.model.presses import Grid, Presses
 from tests.photographed import imported_presses
@@ -72,17 +72,18 @@ def test_sizes_of_marks_are_those_of_the_brush_with_intervals_that_narrow() -> N
     truth = a_brush()
     at = truth.sizes(15.5, 5.0)
     few = sizes_of(presses(truth, CONDITIONS, noise=0.2))
-    assert [size.name for size in few] == ["reach toward the tip", "reach toward the heel", "width"]
-    assert few[2].here.low < 2.0 * (at.half + 0.4) < few[2].here.high
-    assert few[2].by_depth.low > 0.0, "it opens as it is pressed deeper"
+    assert [*few] == ["reach toward the tip", "reach toward the heel", "width"]
+    here, by_depth, _ = few["width"]
+    assert here.low < 2.0 * (at.half + 0.4) < here.high
+    assert by_depth.low > 0.0, "it opens as it is pressed deeper"
     every = [(height, tilt) for height in (11.0, 13.0, 15.0, 17.0, 20.0) for tilt in (0.0, 5.0, 10.0)]
-    many = sizes_of(presses(truth, every, noise=0.2))
-    assert many[2].here.high - many[2].here.low < 0.7 * (few[2].here.high - few[2].here.low)
+    more, *_ = sizes_of(presses(truth, every, noise=0.2))["width"]
+    assert more.high - more.low < 0.7 * (here.high - here.low)
 
 
 def test_too_few_conditions_give_no_interval() -> None:
-    assert sizes_of(presses(a_brush(), CONDITIONS[: FEWEST_CONDITIONS - 1] * 3)) == []
-    assert sizes_of(presses(a_brush(), [(h, 0.0) for h in range(11, 18)])) == [], "one tilt shows no slope"
+    assert sizes_of(presses(a_brush(), CONDITIONS[: FEWEST_CONDITIONS - 1] * 3)) == {}
+    assert sizes_of(presses(a_brush(), [(h, 0.0) for h in range(11, 18)])) == {}, "one tilt shows no slope"
 
 
 def test_products_of_the_jacobian_are_those_of_the_whole_image() -> None:
@@ -204,7 +205,7 @@ def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> Non
     assert ran.exit_code == 0, ran.output
     assert "paper's" in ran.output
     assert "…" not in ran.output
-    report = load_report(session / "validation" / "report.json")
+    report = Report.read(session / "validation" / "report.json")
     fitted = report.model(NAME)
     assert fitted is not None
     assert fitted.basis == "fitted, in sample"
@@ -220,7 +221,7 @@ def test_one_command_leads_from_photographs_to_the_report(session: Path) -> None
     assert ran.exit_code == 0, ran.output
     assert "CCD-BSMG" in ran.output
     assert ran.output.splitlines()[-1] == f"Report: {session / 'validation' / 'report.html'}"
-    assert load_report(session / "validation" / "report.json").model(NAME) is not None
+    assert Report.read(session / "validation" / "report.json").model(NAME) is not None
 
 
 def test_a_single_condition_gives_neither_intervals_nor_held_out_scores(tmp_path: Path) -> None:

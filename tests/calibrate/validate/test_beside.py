@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from brushloop.__main__ import app
 from brushloop.calibrate.compare import TABLE_1
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.validate.tables import NORMAL, STRICT, Report, load_report, table_1, table_3
+from brushloop.calibrate.validate.tables import NORMAL, STRICT, Report, table_1, table_3
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Source
 from tests.calibrate.records import loop_record, table_of, written_record
@@ -42,7 +42,7 @@ def refused(place: Path) -> str:
 
 def report_of(place: Path) -> tuple[Report, str]:
     folder = place / "validation"
-    return load_report(folder / "report.json"), (folder / "report.html").read_text()
+    return Report.read(folder), (folder / "report.html").read_text()
 
 
 @pytest.fixture

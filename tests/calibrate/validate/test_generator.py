@@ -15,7 +15,7 @@ from brushloop.__main__ import app
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.calibrate.training import captures_of
-from brushloop.calibrate.validate.tables import NORMAL, load_report
+from brushloop.calibrate.validate.tables import NORMAL, Report
 from brushloop.model.generator.stroke import load_generator
 from brushloop.sessions.records import Source
 from tests.calibrate.validate.conftest import MakeSession
@@ -66,7 +66,7 @@ def test_a_generator_is_scored_beside_what_it_was_trained_on(session: Path, gene
     training = generator.parent
     given = ("--generator", generator, "--curves", f"CCD-BSMG={training}", "--no-held-out")
     invoke("validate", session, "--out", tmp_path, *given)
-    report = load_report(tmp_path / "report.json")
+    report = Report.read(tmp_path)
     drawn, exact = (report.stat(name, NORMAL) for name in ("ccd-bsmg", "ccd-bsm"))
     assert drawn is not None
     assert exact is not None

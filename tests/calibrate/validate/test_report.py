@@ -25,7 +25,7 @@ from brushloop.calibrate.validate import run as validation
 from brushloop.calibrate.validate.command import compare, validate
 from brushloop.calibrate.validate.page import provenance, trust
 from brushloop.calibrate.validate.run import BEZIER_REFITTED, FITTED_HELD_OUT
-from brushloop.calibrate.validate.tables import Collected, GateMissed, Report, check_gates, collected_in, load_report
+from brushloop.calibrate.validate.tables import Collected, GateMissed, Report, check_gates, collected_in
 from brushloop.sessions.events import CaptureResult, Condition, DipResult, Remark, ZeroTouchResult
 from brushloop.sessions.events import Press as Pressed
 from brushloop.sessions.recording import Recording, add_remark
@@ -55,7 +55,7 @@ def folder(session: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def report(folder: Path) -> Report:
-    return load_report(folder / "report.json")
+    return Report.read(folder)
 
 
 def test_every_model_is_scored_in_both_alignments_and_tones(report: Report) -> None:
@@ -138,7 +138,7 @@ def test_what_is_no_gate_is_refused_before_any_work(text: str) -> None:
 
 def test_only_the_models_asked_for_and_an_unknown_one_is_refused(session: Path, tmp_path: Path) -> None:
     run(session, "--out", tmp_path, *QUICK, "--model", "circle")
-    report = load_report(tmp_path / "report.json")
+    report = Report.read(tmp_path)
     assert {stat.model for stat in report.stats} == {"line", "circle", "another press", "ceiling"}
     ran = CliRunner().invoke(app, ["validate", str(session), "--out", str(tmp_path), "--model", "square"])
     assert isinstance(ran.exception, CalibrationError)
@@ -152,7 +152,7 @@ def test_a_capture_that_a_person_marked_bad_is_left_out_by_name(session: Path, t
     for bad in (True, False):  # also where the work of before is still there
         add_remark(marked, Remark(t_ns=1, still=still, stroke_id="003", bad=bad, note="<b>hair</b> in it"))
         run(marked, "--out", tmp_path / "out", *QUICK)
-        reasons = {press.stroke_id: press.why for press in load_report(tmp_path / "out" / "report.json").refused}
+        reasons = {press.stroke_id: press.why for press in Report.read(tmp_path / "out").refused}
         assert reasons.get("003") == ("was marked bad: <b>hair</b> in it" if bad else None)
         assert ("&lt;b&gt;hair" in (tmp_path / "out" / "report.html").read_text()) == bad
 
@@ -163,7 +163,7 @@ def test_ablations_show_lambda_and_the_number_of_strokes(session: Path, tmp_path
     (curve / "validation.csv").write_text("step,mse,iou,csim\n10,0.1,0.5,0.6\n20,0.01,0.9,0.95\n")
     given = ("--model", "ccd-bsm", "--model", "ccd-bsm-lambda-1", "--model", "ccd-bsm-lambda-pi/2")
     run(session, "--out", tmp_path / "out", *given, "--ablations", "--curves", f"QBC={curve}")
-    report = load_report(tmp_path / "out" / "report.json")
+    report = Report.read(tmp_path / "out")
     assert report.stat("ccd-bsm-lambda-1") is not None
     by_count = {step.strokes: step.csim for step in report.by_strokes if step.model == "CCD-BSM"}
     assert sorted(by_count) == [1, 2, 3, 5]

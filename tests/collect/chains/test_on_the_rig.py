@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from brushloop.calibrate.loop import read_loop
-from brushloop.calibrate.writing.compare import ANOTHER, PLANNED, REFERENCE, SIMULATED, read_written
+from brushloop.calibrate.loop import LoopRecord
+from brushloop.calibrate.writing.compare import ANOTHER, PLANNED, REFERENCE, SIMULATED, WrittenRecord
 from brushloop.drivers.loopback import LoopbackRig, simulate
 from brushloop.sessions.recording import Recording
 
@@ -70,7 +70,7 @@ def test_the_loop_is_closed(bench: Bench) -> None:
     originals = sorted(stroke.stroke_id for stroke in Recording(session).stroke_records())
     assert sorted(str(stroke.again_of) for stroke in Recording(replay).stroke_records()) == originals
 
-    record = read_loop(session / "loop")
+    record = LoopRecord.read(session / "loop")
     assert (record.source, record.pairs, record.refused) == ("loopback rig", 6, ())
     # No patch was pressed twice: the brush's repeatability is not known, and nothing is claimed.
     assert record.lost == []
@@ -98,7 +98,7 @@ def test_a_character_is_written_twice_and_compared(bench: Bench) -> None:
     [session] = bench.sessions.iterdir()
     assert [stroke.stroke_id for stroke in Recording(session).stroke_records()] == ["cross-r01", "cross-r02"]
 
-    record = read_written(out)
+    record = WrittenRecord.read(out)
     assert record.source == "loopback rig"
     binary = [row for row in record.table_3 if (row.tone, row.polarity) == ("binary", "ink = 1")]
     rows = {(row.pair, row.alignment): row for row in binary}
