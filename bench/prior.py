@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.brushes import BRISTLE_SETS, CELLS, bristle_session
-from brushloop.calibrate.fit.descent import FILE, KnownBrush, about, fit_presses
+from brushloop.calibrate.fit.descent import FILE, KnownBrush, Prior, fit_presses
 from brushloop.calibrate.presses import read_for_fit
-from brushloop.model.fitted import chance_within, published
+from brushloop.model.fitted import NAMES, chance_within
 from brushloop.model.presses import Grid, Presses
 
 BRISTLE = "bristle simulation"
@@ -149,7 +149,8 @@ def known() -> Iterator[KnownBrush]:
 
 
 def _fitted(name: str, family: str, presses: Presses) -> KnownBrush:
-    press = fit_presses(presses, residual=False, prior=about(published()))
+    about_published = Prior(np.zeros(len(NAMES)), np.eye(len(NAMES)))
+    press = fit_presses(presses, residual=False, prior=about_published)
     return KnownBrush(name=name, family=family, values=tuple(round(float(v), 5) for v in press.values))
 
 

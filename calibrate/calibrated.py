@@ -101,16 +101,13 @@ def calibrate_session(
     compared = [_moved(calibration, before, (last_ns - t_ns) / 60e9, where) for t_ns, before in looked_at]
     moved = tuple(filter(None, compared))
     path = put_to_use(calibration, recording.path.parent)
-    edge: list[list[float]] = []
-    if rig.sheet_mm is not None:
-        edge = _outline(calibration, rig.sheet_mm).round(1).tolist()
     page = write_page(
         path.with_suffix(".html"),
         "calibration.html.j2",
         **about(recording.header),
         calibration=calibration,
         picture=_picture(calibration, image, view),
-        sheet=edge,
+        sheet=[] if rig.sheet_mm is None else _outline(calibration, rig.sheet_mm).round(1).tolist(),
         trust=[source_point(recording.header.source), *_trust(calibration, moved)],
         contours=_contours(calibration, image.shape[1], image.shape[0]),
         recorded=recording,
@@ -155,21 +152,17 @@ def _picture(calibration: Calibration, image: Gray, view: BoardView) -> dict[str
     height, width = image.shape
     expected = calibration.to_image(paper_mm(view, calibration.board))
     off = view.pixels - expected
-    dropped = np.zeros(len(off), np.bool_)
-    dropped[np.argsort(-np.linalg.norm(off, axis=1))[: calibration.corners_dropped]] = True
+    off_px = np.linalg.norm(off, axis=1)
     ends = expected + ARROW_TIMES * off
-    rows = zip(view.pixels.round(1).tolist(), expected.round(1).tolist(), ends.round(1).tolist(), strict=True)
-    corners = [
-        {"at": at, "from": start, "to": end, "off_px": round(float(np.hypot(*residual)), 2), "dropped": bool(out)}
-        for (at, start, end), residual, out in zip(rows, off, dropped, strict=True)
-    ]
+    corners = (*(each.round(1).tolist() for each in (view.pixels, expected, ends)), off_px.round(2).tolist())
     return {
         "uri": photograph_uri(image),
         "width": width,
         "height": height,
         "unit": round(width / 1000, 2),
         "times": ARROW_TIMES,
-        "corners": corners,
+        "corners": list(zip(*corners, strict=True)),
+        "dropped": np.argsort(-off_px)[: calibration.corners_dropped].tolist(),
     }
 
 

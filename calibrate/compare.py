@@ -78,6 +78,8 @@ KEYS: tuple[Key, ...] = tuple(itertools.product(Alignment, Tone))
 MM_BINARY, MM_GRAY = (KEYS.index((Alignment.MM, tone)) for tone in Tone)
 SHOWN_ROWS = slice(32, 96)
 """Rows to show: the middle half of a field, as a press is at most half as thick as the field is high."""
+SHOWN_MM = tuple(round(mm, 3) for mm in (-ANCHOR_MM[0], -0.25 * FIELD_MM, FIELD_MM, 0.5 * FIELD_MM))
+"""Left, top, width and height of these rows, y downward from the point of touch."""
 
 
 def field_around(anchor_mm: tuple[float, float]) -> tuple[float, float, float, float]:

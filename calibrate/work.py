@@ -19,7 +19,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -59,16 +59,13 @@ def key_of(*parts: object) -> str:
 
 
 class Store:
-    """The entries of one folder by key. What cannot be written stays in memory, so that read-only sessions work too."""
+    """The entries of one folder by key. Where they cannot be written, the work of a read-only session is done again."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._unwritten: dict[str, Arrays] = {}
 
     def get(self, key: str) -> Arrays | None:
         """The arrays of an entry; None where there is none, or it is damaged: it is then put again."""
-        if key in self._unwritten:
-            return self._unwritten[key]
         try:
             with gzip.open(self._path(key)) as file:
                 data = file.read(MAX_ENTRY_BYTES)  # a larger entry is cut off, and so damaged
@@ -78,15 +75,13 @@ class Store:
             return None
 
     def put(self, key: str, arrays: Arrays) -> None:
-        """Add an entry; once this returns, killing the process does not lose it."""
+        """Add an entry, if the folder can be written; once this returns, killing the process does not lose it."""
         buffer = io.BytesIO()
         np.savez(buffer, allow_pickle=False, **dict(arrays))
-        try:
+        with suppress(OSError):
             self._folder.mkdir(parents=True, exist_ok=True)
             with replacing(self._path(key)) as part:
                 part.write_bytes(gzip.compress(buffer.getvalue(), compresslevel=1, mtime=0))
-        except OSError:
-            self._unwritten[key] = arrays
 
     def _path(self, key: str) -> Path:
         return self._folder / f"{key}.npz.gz"

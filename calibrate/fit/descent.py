@@ -111,11 +111,6 @@ def spreads() -> Floats:
     return np.array([parameter.spread for parameter in PARAMETERS])
 
 
-def about(values: Floats) -> Prior:
-    """A prior that holds only the plausible spread of each parameter about these values (17,)."""
-    return Prior((values - published()) / spreads(), np.eye(len(NAMES)))
-
-
 @cache
 def learned(without_families: tuple[str, ...] = ()) -> Prior:
     """The prior from `prior.json`; a bench leaves out the family that it scores."""

@@ -19,7 +19,7 @@ from pydantic import model_validator
 
 from brushloop.calibrate.artefact import FITS, FittedValue, SessionFit, load_artefact, made_by, put_to_use
 from brushloop.calibrate.commands import FitRequest
-from brushloop.calibrate.compare import MM_PER_PX, brush_of
+from brushloop.calibrate.compare import MM_PER_PX, SHOWN_MM, SHOWN_ROWS, brush_of
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written
 from brushloop.calibrate.fit.descent import SPREAD_MM, Floats
@@ -44,7 +44,6 @@ from brushloop.calibrate.session import OpenSession
 from brushloop.calibrate.stats import NEAR_POINTS, is_near, student_95
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.fitted import MODES, NAMES, TERMS, FittedPress, fitted_model
-from brushloop.model.outline import Outline
 from brushloop.model.presses import SIZES, Cell, Presses, measure, plane_at
 from brushloop.model.similarity import csim
 from brushloop.model.strokes import StrokeModel, stroke_model
@@ -53,7 +52,6 @@ from brushloop.sessions.records import Header
 from brushloop.sessions.terminal import Progress, unseen
 
 FEWEST_CONDITIONS = 5
-MARGIN_MM = 1.5
 SMOOTH_POINTS = 24
 
 
@@ -231,9 +229,9 @@ def _write_page(result: FitResult, press: FittedPress) -> None:
         "fit.html.j2",
         **about(header),
         session=session,
-        window=_window(presses, (press, published)),
+        window=SHOWN_MM,
         conditions=[_picture(presses, at, numbers, press, published) for at, numbers in presses.cells.items()],
-        verdict=list(_verdict(result)),
+        presses=len(presses),
         trust=[source_point(header.source), *_trust(result)],
         chart=_chart(presses, press, header),
         measured=result.sizes,
@@ -245,26 +243,11 @@ def _write_page(result: FitResult, press: FittedPress) -> None:
     )
 
 
-def _window(presses: Presses, brushes: tuple[FittedPress, ...]) -> tuple[float, float, float, float]:
-    """The (left, top, width, height) in mm, y downward, that holds all ink and every outline."""
-    grid, inked = presses.grid, np.any(presses.ink > 0.5, axis=0)
-    x, y = grid.x_mm[inked.any(axis=0)], -grid.y_mm[inked.any(axis=1)]
-    low, high = np.array([x[0], y[0]]), np.array([x[-1], y[-1]])
-    for loop in (_outline(brush, condition) for brush in brushes for condition in presses.cells):
-        if loop is not None:
-            points = loop.points.reshape(-1, 2) * np.array([1.0, -1.0])
-            low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
-    (left, top), (width, height) = (low - MARGIN_MM).tolist(), (high - low + 2.0 * MARGIN_MM).tolist()
-    return round(left, 3), round(top, 3), round(width, 3), round(height, 3)
-
-
 def _picture(
     presses: Presses, condition: Cell, numbers: list[int], press: FittedPress, published: FittedPress
 ) -> dict[str, Any]:
     """One picture: the mean ink of the condition's presses, and both outlines as SVG paths in mm."""
     grid, ink = presses.grid, presses.ink[numbers]
-    left, top = float(grid.x_mm[0]) - 0.5 * grid.px_mm, -float(grid.y_mm[0]) - 0.5 * grid.px_mm
-    across, down = len(grid.x_mm) * grid.px_mm, len(grid.y_mm) * grid.px_mm
     alike: list[float] = []
     with contextlib.suppress(DomainError):  # so light that the brush leaves no mark
         drawn = np.asarray(press.chance(*condition, grid.x_mm, grid.y_mm, SPREAD_MM) > 0.5, np.float32)
@@ -274,25 +257,18 @@ def _picture(
         "depth_mm": f"{condition[0]:g}",
         "tilt_deg": f"{condition[1]:g}",
         "presses": len(numbers),
-        "ink": ink_uri(ink.mean(axis=0).astype(np.float32)),
-        "place": (round(left, 3), round(top, 3), round(across, 3), round(down, 3)),
+        "ink": ink_uri(ink.mean(axis=0).astype(np.float32)[SHOWN_ROWS]),
         "fitted": _path(press, condition),
         "published": _path(published, condition),
         "csim": f"{100.0 * np.mean(alike):.1f}" if alike else "",
     }
 
 
-def _outline(press: FittedPress, condition: Cell) -> Outline | None:
-    try:
-        return press.outline(*condition)
-    except DomainError:  # so light that the brush leaves no mark
-        return None
-
-
 def _path(press: FittedPress, condition: Cell) -> str:
     """The outline as an SVG path, x to the right and y downward in mm; empty where the brush leaves no mark."""
-    loop = _outline(press, condition)
-    if loop is None:
+    try:
+        loop = press.outline(*condition)
+    except DomainError:  # so light that the brush leaves no mark
         return ""
     points = np.round(np.asarray(loop.points[0], np.float64) * [1.0, -1.0], 2)
     x, y = points[0, 0].tolist()
@@ -328,15 +304,6 @@ def _fitted(press: FittedPress, depth_mm: float, tilt_deg: float, x_mm: Floats) 
     except DomainError:
         return math.nan, math.nan
     return float(sizes.tip + sizes.heel), float(width)
-
-
-def _verdict(result: FitResult) -> Iterator[str]:
-    brush = result.session.header.brush or "a brush without a name"
-    presses, conditions = len(result.presses), len(result.presses.cells)
-    yield f"The stroke model was fitted to {presses} presses at {conditions} combinations of H and α: {brush}."
-    if result.held_out:
-        scores = ", ".join(f"{row.model} {row.csim.avg:.1f} %" for row in result.held_out)
-        yield f"On combinations that were left out of the fit, the CSIM is: {scores}."
 
 
 def _trust(result: FitResult) -> Iterator[Point]:

@@ -32,11 +32,11 @@ Predicted = tuple[Floats, Mapping[str, Images]]
 """The ink of the presses of one condition, (n, rows, columns), and what each model predicts there without them."""
 
 
-def leave_out(conditions: Mapping[Cell, Sequence[int]]) -> list[tuple[list[Cell], list[int]]]:
+def leave_out(presses: Presses, conditions: Mapping[Cell, Sequence[int]]) -> list[tuple[list[Cell], Presses]]:
     """Conditions left out together, and the presses of all others that a fit uses; none if no press is left."""
     conditions = dict(sorted(conditions.items()))
     folds = [list(conditions)[k::MAX_FOLDS] for k in range(min(len(conditions), MAX_FOLDS))]
-    return [(fold, others) for fold in folds if (others := _without(conditions, fold))]
+    return [(fold, presses.pick(others)) for fold in folds if (others := _without(conditions, fold))]
 
 
 def _without(conditions: Mapping[Cell, Sequence[int]], fold: Sequence[Cell]) -> list[int]:
@@ -94,7 +94,7 @@ def leave_condition_out(
     """
     conditions = presses.cells
     published = FittedPress(presses.radius_mm, presses.length_mm)
-    left_out = [(fold, presses.pick(others)) for fold, others in leave_out(conditions)]
+    left_out = leave_out(presses, conditions)
     jobs = [Refit(others, prior, press.values) for _, others in left_out]
     with threads(1) as scheduler:  # a fit holds Python's lock nearly all the time: two at once take half as long again
         brushes = refits(jobs, store, scheduler, "conditions left out in turn", progress)

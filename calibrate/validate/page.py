@@ -33,7 +33,7 @@ from brushloop.calibrate.report import (
     source_point,
 )
 from brushloop.calibrate.scores import MEASURES, Stat
-from brushloop.calibrate.stats import CEILING, NEAR_POINTS, DepthTilt, Floats, Interval, Summary, is_near
+from brushloop.calibrate.stats import CEILING, NEAR_POINTS, Floats, Interval, Summary, is_near
 from brushloop.calibrate.validate.run import (
     BEZIER_REFITTED,
     FITTED_HELD_OUT,
@@ -88,7 +88,6 @@ def page_of(
     """
     best_model, names = report.model(report.shown), [session.header.session_id for session in report.sessions]
     best, worst = extremes(outcome, report.shown)
-    columns = [model for name in CONDITION_COLUMNS if (model := report.model(name)) is not None]
     return render(
         "report.html.j2",
         report=report,
@@ -100,15 +99,17 @@ def page_of(
         trust=list(trust(report)),
         table_one=table_1(report),
         table_two=table_2(report),
-        table_three=list(_table_three(report)),
+        table_three=table_3,
         figures_13=figures_13,
         paper_three=list(TABLE_3.values()),
         plot=distributions(outcome, report),
         keys=KEYS,
+        strict=STRICT,
+        normal=NORMAL,
         headline=list(headline(report)),
         scores=[(key, _scores(report, key)) for key in KEYS],
-        condition_columns=columns,
-        conditions=[_row_of_condition(report, condition, columns) for condition in report.conditions],
+        condition_columns=[model for name in CONDITION_COLUMNS if (model := report.model(name)) is not None],
+        conditions=outcome.scores.conditions() if report.conditions else {},
         samples=[pictured(outcome, k, report.shown) for k in first_of_conditions(outcome, MAX_SAMPLES)],
         side=side_by_side(outcome),
         shown=best_model.label if best_model is not None else "",
@@ -123,30 +124,11 @@ def page_of(
     )
 
 
-def _table_three(report: Report) -> Iterator[tuple[str, list[TableRow]]]:
-    """Title and rows of Table 3 of every character in either alignment."""
-    for record in report.written:
-        where = f"written in {record.session} with {record.brush or 'an unnamed brush'}"
-        where += f" on patches of {record.cell_mm:g} mm"
-        for name in record.characters:
-            yield f"{name}, {where} — {NORMAL[0]}, binary", table_3(record, name, NORMAL[0])
-            title = f"{name}, {where} — {STRICT[0]}, binary: where size and place count"
-            yield title, table_3(record, name, STRICT[0])
-
-
 def _scores(report: Report, key: Key) -> list[tuple[ModelInfo, Stat, int, int]]:
     """Each model with its scores in one alignment and tone, and its rank by average CSIM and SSIM."""
     rows = [(model, stat) for model in report.models if (stat := report.stat(model.name, key)) is not None]
     by_csim, by_ssim = (np.argsort(np.argsort([-getattr(stat, of).avg for _, stat in rows])) for of in MEASURES)
     return [(*row, int(first), int(second)) for row, first, second in zip(rows, by_csim, by_ssim, strict=True)]
-
-
-def _row_of_condition(
-    report: Report, condition: DepthTilt, columns: Sequence[ModelInfo]
-) -> tuple[DepthTilt, int, list[Stat | None]]:
-    """A condition, its number of presses, and the scores of these models there."""
-    stats = [report.stat(model.name, STRICT, condition) for model in columns]
-    return condition, max((stat.csim.n for stat in stats if stat is not None), default=0), stats
 
 
 def provenance(session: Session) -> tuple[tuple[str, str], ...]:

@@ -253,7 +253,7 @@ def _held_out(
         return
     whole = for_fit([press for press in presses if not press.cut], session.header)
     conditions = {(press.condition.depth_mm, press.condition.tilt_deg): list[int]() for press in presses} | whole.cells
-    left_out = [(fold, whole.pick(others)) for fold, others in leave_out(conditions)]
+    left_out = leave_out(whole, conditions)
     if not left_out:
         return
     if session.fit is not None:

@@ -172,11 +172,6 @@ class WritingComparison:
                 rows.append(Table3Row.model_validate(dict(zip(Table3Row.model_fields, row, strict=True))))
         return tuple(rows)
 
-    @property
-    def writings(self) -> int:
-        """Number of writings of all characters."""
-        return sum(len(character.captured) for character in self.characters)
-
 
 def compare(request: CompareWrittenRequest, progress: Progress = unseen) -> Written:
     """Compare written characters with their simulation and reference; write the report. Raises `CalibrationError`."""
@@ -268,8 +263,8 @@ def round_of(character: Character, side_mm: float) -> Round:
 
 def summary(written: WritingComparison) -> Iterator[str]:
     """Lines for the terminal: the strict and the lenient comparison, ink = 1."""
-    source = written.session.header.source
-    yield f"{written.writings} characters written, {len(written.refused)} not compared ({source})"
+    source, writings = written.session.header.source, sum(len(each.captured) for each in written.characters)
+    yield f"{writings} characters written, {len(written.refused)} not compared ({source})"
     for row in written.table_3:
         if row.polarity is Polarity.INK and row.tone is Tone.BINARY:
             csim, ssim = ("{:.2f} / {:.2f} / {:.2f}".format(*of.range_and_avg) for of in (row.csim, row.ssim))
