@@ -25,7 +25,7 @@ from brushloop.calibrate.presses import Press, for_fit, read_presses, too_thin, 
 from brushloop.calibrate.scores import Scores, similarities
 from brushloop.calibrate.session import OpenSession
 from brushloop.calibrate.stats import CEILING, others_of
-from brushloop.calibrate.work import Arrays, Scheduler, Store, key_of
+from brushloop.calibrate.work import Arrays, Scheduler, key_of
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.fitted import NAME as FITTED
 from brushloop.model.outline import Outline
@@ -163,8 +163,7 @@ class Outcome:
 
     def predicted(self, press: Press) -> dict[str, Pixels]:
         """(len(KEYS), 128, 128) of a press by the models that predict it."""
-        [store] = (session.store for session in self.sessions if session.header.session_id == press.session)
-        return predicted(self.models[press.session], press.condition, store)[0]
+        return predicted(self.models[press.session], press.condition)[0]
 
 
 def validate_presses(
@@ -279,25 +278,15 @@ def _left_out(info: ModelInfo, outlines: Mapping[Cell, Draw | None]) -> Model:
     return Model(info, mark)
 
 
-def predicted(models: Iterable[Model], at: Condition, store: Store) -> tuple[dict[str, Pixels], dict[str, str]]:
-    """(len(KEYS), 128, 128) of a condition by model, and why there is none by model that does not predict it.
-
-    Marks that were drawn before are in the store.
-    """
-    marks: dict[str, Mark] = {}
-    refused: dict[str, str] = {}
+def predicted(models: Iterable[Model], at: Condition) -> tuple[dict[str, Pixels], list[str]]:
+    """(len(KEYS), 128, 128) of a condition by model, and why models do not predict it."""
+    images, refused = dict[str, Pixels](), list[str]()
     for model in models:
         try:
-            marks[model.name] = model.mark(at)
+            images[model.name] = images_of(*model.mark(at))
         except DomainError as error:
-            refused[model.name] = f"{model.name} does not predict it: {error}"
-    parts = ((mark.points, mark.weights, origin_x_mm) for mark, origin_x_mm in marks.values())
-    key = key_of("drawn", *itertools.chain.from_iterable(parts))
-    drawn = store.get(key)
-    if drawn is None:
-        drawn = {str(k): images_of(*mark) for k, mark in enumerate(marks.values())}
-        store.put(key, drawn)
-    return dict(zip(marks, (drawn[str(k)] for k in range(len(marks))), strict=True)), refused
+            refused.append(f"{model.name} does not predict it: {error}")
+    return images, refused
 
 
 ScoreJob = tuple[Pixels, tuple[Sequence[Pixels], ...]]
@@ -326,8 +315,8 @@ def _score(
     def jobs() -> Iterator[tuple[str, ScoreJob]]:
         for group in groups:
             presses = [scores.presses[k] for k in group]
-            images, reasons = predicted(models, presses[0].condition, session.store)
-            for why in reasons.values():
+            images, reasons = predicted(models, presses[0].condition)
+            for why in reasons:
                 refused.extend(Refused(press.session, press.stroke.stroke_id, why) for press in presses)
             predictions = [[images[model.name]] if model.name in images else [] for model in models]
             for number, press in enumerate(presses):
