@@ -9,7 +9,24 @@ import sys
 from pathlib import Path
 from unittest import mock
 
-from brushloop.__main__ import main
+from typer.testing import CliRunner
+
+from brushloop.__main__ import app, main
+
+
+def said(*words: object) -> str:
+    """What a command printed that ended well, in one line."""
+    ran = CliRunner().invoke(app, [*map(str, words)])
+    assert ran.exit_code == 0, (ran.output, ran.exception)
+    return " ".join(ran.output.split())
+
+
+def refused(*words: object) -> str:
+    """Why a command refuses its input: one line, with exit code 2."""
+    ran = CliRunner().invoke(app, [*map(str, words)])
+    assert getattr(ran.exception, "exit_code", None) == 2, (ran.output, ran.exception)
+    assert "\n" not in str(ran.exception)
+    return str(ran.exception)
 
 
 def brushloop(*words: str | Path, cwd: Path | None = None, encoding: str = "utf-8") -> subprocess.CompletedProcess[str]:

@@ -43,7 +43,7 @@ FIRST = (
     "tests/collect/tui/test_session.py",
     "tests/collect/photograph/test_recognised.py",
     "tests/calibrate/fit",
-    "tests/model/test_train.py",
+    "tests/model/test_generator.py",
     "tests/collect/commission/test_first_day.py",
 )
 """The longest tests and groups, longest first, so that no worker is left alone with one of them at the end."""
@@ -53,11 +53,10 @@ TOGETHER = {
     "tests/calibrate/test_scores.py": "comparing",
     "tests/calibrate/test_recover.py": "comparing",
     "tests/calibrate/fit/": "comparing",
-    "tests/calibrate/test_loop.py": "comparing",
     "tests/calibrate/test_writing.py": "comparing",
     "tests/calibrate/test_drags.py": "drags",
     "tests/calibrate/test_pages.py": "pages",
-    "tests/calibrate/board/test_lens_in_session.py": "lens",
+    "tests/calibrate/test_calibration.py": "lens",
     "tests/model/": "model",
 }
 """What one worker runs: its first test imports, compiles or records for seconds, which the others then do without."""

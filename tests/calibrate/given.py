@@ -1,4 +1,4 @@
-"""What several tests are given: a session of few photographs, a camera straight above the paper, and a lens file."""
+"""What several tests are given: a session of few photographs, a camera above the paper, a lens file, and records."""
 
 from __future__ import annotations
 
@@ -8,16 +8,29 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from brushloop.calibrate.board.lens import Lens, LensFile, unknown_lens
 from brushloop.calibrate.board.pix2len import Plane
 from brushloop.calibrate.board.spec import BoardSpec
+from brushloop.calibrate.compare import KEYS, Tone
+from brushloop.calibrate.loop import AGAIN, ANOTHER, SIMULATED, LoopRecord, statistics_of
+from brushloop.calibrate.presses import Press, prepare_job, press_of
+from brushloop.calibrate.scores import Scores
 from brushloop.calibrate.session import Calibration
-from brushloop.sessions.events import BoardResult, CaptureResult, Condition, Press, StepResult
+from brushloop.calibrate.stroke import Measured
+from brushloop.calibrate.writing import Figure
+from brushloop.calibrate.writing.compare import KEYS as WRITTEN_KEYS
+from brushloop.calibrate.writing.compare import PAIRS, PLANNED, Character, Table3Row, WritingComparison, WrittenRecord
+from brushloop.model.raster import coverage
+from brushloop.model.strokes import StrokeModel
+from brushloop.sessions.events import BoardResult, CaptureResult, Condition, StepResult
+from brushloop.sessions.events import Press as Pressed
 from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.messages import encode_png, image_message
+from brushloop.sessions.recording import Capture
 from brushloop.sessions.records import Header, Source, Stroke, Topic
 from brushloop.sessions.store import SessionStore
 
@@ -53,7 +66,7 @@ def photographed(
         take(number, image, board)
     for number, (stroke, image) in enumerate(presses, start=len(boards)):
         condition = Condition(depth_mm=stroke.depth_mm or 0.0, tilt_deg=stroke.tilt_deg or 0.0)
-        press = Press(stroke_id=stroke.stroke_id, condition=condition)
+        press = Pressed(stroke_id=stroke.stroke_id, condition=condition)
         take(number, image, CaptureResult(press=press, still=number), stroke.model_copy(update={"still": number}))
     session.close()
     session.release()
@@ -89,6 +102,28 @@ CALIBRATION = Calibration(
 )
 
 
+ANCHOR_MM, PATCH_MM = (60.0, 40.0), (30.0, 28.0, 40.0, 24.0)
+"""Where a press touches the page of `drawn_press`, and the patch around it."""
+
+
+def drawn_press(stroke: Stroke, model: StrokeModel, depth_mm: float, tilt_deg: float) -> Press:
+    """A model's mark on a page of 100 x 80 mm at 10 px/mm, found and laid on the field as a press of this stroke."""
+    axis_x = ANCHOR_MM[0] + depth_mm * math.tan(math.radians(tilt_deg))
+    origin = (axis_x, 80.0 - ANCHOR_MM[1])
+    mark = coverage(model.profile(depth_mm, tilt_deg), origin, size_px=1000, px_mm=0.1)[0][:800]
+    page = np.rint(230.0 * (1.0 - 0.92 * mark)).astype(np.uint8)
+    stroke = stroke.model_copy(update={"cell_mm": PATCH_MM, "anchor_mm": ANCHOR_MM})
+    header = Header(session_id="grid", source=Source.LOOPBACK, software="test")
+    return press_of(header, stroke, prepare_job((Capture(stroke, encode_png(page), stroke.stroke_id), CALIBRATION)))
+
+
+def blank_press(stroke_id: str, depth_mm: float, tilt_deg: float, session: str = "grid") -> Press:
+    """A press of which only the name and the condition matter."""
+    stroke = Stroke(stroke_id=stroke_id, kind="press", still=0, depth_mm=depth_mm, tilt_deg=tilt_deg)
+    images, coverage = np.zeros((len(KEYS), 128, 128), np.uint8), np.zeros((128, 128), np.float32)
+    return Press(session, "", stroke, images, coverage, (0.0, 0.0), Measured(1.0, 1.0, 1.0, 1.0, 1.0), False)
+
+
 def kept_lens(
     folder: Path,
     size_px: tuple[int, int],
@@ -113,3 +148,70 @@ def kept_lens(
         guidance=(),
         warnings=(),
     ).save(folder)
+
+
+# What `brushloop repress` and `brushloop write` leave behind, without a rig: small records of a few scores
+
+
+LEVELS = {AGAIN: 0.94, ANOTHER: 0.95, SIMULATED: 0.9}
+
+
+def pair_scores(step: float = 0.001) -> Scores:
+    """Six presses of three conditions, each pressed again: .94 like its original, another press .95."""
+    scores = Scores([blank_press(f"{k:03d}", 11.0 + k // 2, 0.0) for k in range(6)], tuple(LEVELS))
+    levels = np.array(list(LEVELS.values())) + step * np.arange(6)[:, None]
+    scores.values[:] = np.stack([levels, levels - 0.1], axis=-1)[:, :, None]
+    return scores
+
+
+def loop_record(original: str, original_sha256: str, source: Source = Source.LOOPBACK, **changes: Any) -> LoopRecord:
+    """A sealed loop of that session; `changes` are made before it is sealed."""
+    scores = pair_scores()
+    record = LoopRecord(
+        source=source,
+        original=original,
+        original_sha256=original_sha256,
+        again=f"{original}-replay",
+        again_sha256="0" * 64,
+        model="CCD-BSM fitted",
+        in_sample=True,
+        mm_per_px=0.3,
+        pairs=6,
+        goal_points=1.0,
+        stats=tuple(statistics_of(scores)),
+        refused=(),
+        software="brushloop test",
+        command="brushloop repress compare",
+    )
+    return record.model_copy(update=changes).sealed()
+
+
+def table_of(character: str = "字", reference: str = "a font") -> tuple[Table3Row, ...]:
+    """Table 3 of one character, written twice: CSIM .8 and .9, where paper counts .99."""
+    ink = np.zeros((128, 128), np.float32)
+    figure = Figure(name=character, source=reference)
+    written = Character(figure, {f"x-r{k}": dict.fromkeys(Tone, ink) for k in range(2)})
+    twice = np.array([[0.8, 0.7], [0.9, 0.8]])
+    # Takes the place of what would be computed from the images.
+    written.__dict__["scores"] = {
+        (pair, key): twice[: 1 if pair == PLANNED else 2] for key, pair in itertools.product(WRITTEN_KEYS, PAIRS)
+    }
+    return WritingComparison(None, None, [written]).table_3
+
+
+def written_record(source: Source = Source.LOOPBACK, **changes: Any) -> WrittenRecord:
+    """A sealed record of one character; `changes` are made before it is sealed."""
+    record = WrittenRecord(
+        source=source,
+        session="write-01",
+        recording_sha256="1" * 64,
+        brush="",
+        model="CCD-BSM",
+        cell_mm=70.0,
+        table_3=table_of(),
+        refused=(),
+        figure_13_sha256="2" * 64,
+        software="brushloop test",
+        command="brushloop write compare",
+    )
+    return record.model_copy(update=changes).sealed()

@@ -23,8 +23,7 @@ from brushloop.calibrate.writing.compare import Character, WritingComparison, wr
 from brushloop.sessions.messages import decode_gray
 from brushloop.sessions.records import Header, Source
 from tests.browser import BROWSER, content_widths_px
-from tests.calibrate.given import CALIBRATION, photographed
-from tests.calibrate.records import loop_record, pair_scores
+from tests.calibrate.given import CALIBRATION, loop_record, pair_scores, photographed
 from tests.photographed import imported_presses
 
 SPEC = BoardSpec(squares=(9, 7), square_mm=20.0, marker_mm=15.0, dictionary="DICT_5X5_100", origin_mm=(0.0, 0.0))
@@ -53,7 +52,7 @@ def run(*arguments: object) -> str:
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """A page of every command but `train` (tests/model/test_train.py), by the command's name."""
+    """A page of every command but `train` (tests/model/test_generator.py), by the command's name."""
     folder = tmp_path_factory.mktemp("pages")
     (folder / "photos").mkdir()
     conditions = [(11.0, 0.0), (15.0, 0.0)]

@@ -1,8 +1,9 @@
-"""CSIM is the plain cosine, SSIM is scikit-image's, and a capture drawn by a model scores 1 with that model."""
+"""CSIM is the plain cosine, SSIM is scikit-image's; presses are scored with models, and with their repetitions."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 import pytest
@@ -18,18 +19,23 @@ from brushloop.calibrate.compare import (
     similarity,
     simulated,
 )
-from brushloop.calibrate.presses import Press, prepare_job
-from brushloop.calibrate.scores import Scores, similarities
-from brushloop.calibrate.stroke import Measured
+from brushloop.calibrate.loop import (
+    AGAIN,
+    ANOTHER,
+    SIMULATED,
+    Pair,
+    pair_up,
+    score_pairs,
+    statistics_of,
+)
+from brushloop.calibrate.presses import Press
+from brushloop.calibrate.scores import Scores, find_stat, similarities
 from brushloop.calibrate.validate.run import score_job
 from brushloop.model.ccdbsm import Brush
-from brushloop.model.raster import coverage
 from brushloop.model.similarity import binary_scores, csim, ssim
-from brushloop.model.strokes import stroke_models
-from brushloop.sessions.messages import encode_png
-from brushloop.sessions.recording import Capture
+from brushloop.model.strokes import stroke_model, stroke_models
 from brushloop.sessions.records import Condition, Stroke
-from tests.calibrate.given import CALIBRATION
+from tests.calibrate.given import blank_press, drawn_press, loop_record
 
 
 def image(*ink: tuple[int, int]) -> np.ndarray:
@@ -124,33 +130,24 @@ def test_many_pairs_at_once_are_scored_as_one_by_one() -> None:
 
 
 MODELS = stroke_models(Brush())
-ANCHOR, PATCH = (60.0, 40.0), (30.0, 28.0, 40.0, 24.0)
 MM, NORMAL = (Alignment.MM, Tone.BINARY), (Alignment.SIZE_NORMALISED, Tone.BINARY)
 
 
-def page_of(depth_mm: float, tilt_deg: float, model: str = "ccd-bsm") -> np.ndarray:
-    """A 100 x 80 mm page, photographed straight from above at 10 px/mm, with a model's mark at the anchor."""
-    axis_x = ANCHOR[0] + depth_mm * math.tan(math.radians(tilt_deg))
-    mark = coverage(MODELS[model].profile(depth_mm, tilt_deg), (axis_x, 80.0 - ANCHOR[1]), size_px=1000, px_mm=0.1)
-    return np.rint(230.0 * (1.0 - 0.92 * mark[0][:800])).astype(np.uint8)
+def images_of(depth_mm: float, tilt_deg: float, model: str = "ccd-bsm") -> np.ndarray:
+    """(KEYS, 128, 128): a press that left a model's mark, as it is compared."""
+    return drawn_press(Stroke(stroke_id="a", kind="press", still=0), MODELS[model], depth_mm, tilt_deg).images
 
 
-def images_of(page: np.ndarray) -> np.ndarray:
-    """(KEYS, 128, 128): the press of a page, as it is compared."""
-    stroke = Stroke(stroke_id="a", kind="press", still=0, cell_mm=PATCH, anchor_mm=ANCHOR)
-    return prepare_job((Capture(stroke, encode_png(page), "test"), CALIBRATION))["images"]
-
-
-def scores_of(page: np.ndarray, depth_mm: float, tilt_deg: float) -> dict[str, np.ndarray]:
+def scores_of(images: np.ndarray, depth_mm: float, tilt_deg: float) -> dict[str, np.ndarray]:
     """(KEYS, 2) scores of every model's press of that command."""
-    images = tuple([simulated(model, depth_mm, tilt_deg)] for model in MODELS.values())
-    return dict(zip(MODELS, score_job((images_of(page), images))["values"], strict=True))
+    drawn = tuple([simulated(model, depth_mm, tilt_deg)] for model in MODELS.values())
+    return dict(zip(MODELS, score_job((images, drawn))["values"], strict=True))
 
 
 @pytest.mark.parametrize("model", ["ccd-bsm", "ellipse", "line"])
 @pytest.mark.parametrize(("depth_mm", "tilt_deg"), [(11.0, 0.0), (15.0, 5.0), (20.0, 10.0)])
 def test_a_mark_drawn_by_a_model_is_recognised_by_it(model: str, depth_mm: float, tilt_deg: float) -> None:
-    for name, values in scores_of(page_of(depth_mm, tilt_deg, model), depth_mm, tilt_deg).items():
+    for name, values in scores_of(images_of(depth_mm, tilt_deg, model), depth_mm, tilt_deg).items():
         if name == model:
             assert min(values[KEYS.index(MM), 0], values[KEYS.index(NORMAL), 0]) > 0.985
             assert values[KEYS.index(NORMAL), 1] > 0.94
@@ -159,22 +156,22 @@ def test_a_mark_drawn_by_a_model_is_recognised_by_it(model: str, depth_mm: float
 
 
 @pytest.mark.parametrize(
-    ("page", "command", "strict"),
+    ("images", "command", "strict"),
     [
-        (np.roll(page_of(15.0, 0.0), 10, axis=0), (15.0, 0.0), 0.95),  # a millimetre off
-        (page_of(20.0, 0.0), (10.0, 0.0), 0.8),  # twice as deep as commanded
+        (np.roll(images_of(15.0, 0.0), 3, axis=1), (15.0, 0.0), 0.95),  # a millimetre off
+        (images_of(20.0, 0.0), (10.0, 0.0), 0.8),  # twice as deep as commanded
     ],
 )
 def test_a_wrong_place_or_size_is_forgiven_when_normalised_but_not_in_mm(
-    page: np.ndarray, command: tuple[float, float], strict: float
+    images: np.ndarray, command: tuple[float, float], strict: float
 ) -> None:
-    values = scores_of(page, *command)["ccd-bsm"][:, 0]
+    values = scores_of(images, *command)["ccd-bsm"][:, 0]
     assert values[KEYS.index(NORMAL)] > 0.985
     assert values[KEYS.index(MM)] < strict
 
 
 def test_scores_of_several_images_are_averaged_and_of_none_are_missing() -> None:
-    near, far = images_of(page_of(13.0, 5.0)), images_of(page_of(15.0, 5.0))
+    near, far = images_of(13.0, 5.0), images_of(15.0, 5.0)
     one, other, both, none = similarities(near, ([near], [far], [near, far], []))
     assert one == pytest.approx(1.0)
     assert both == pytest.approx((one + other) / 2)
@@ -195,14 +192,90 @@ def test_the_field_holds_every_condition_of_the_grid() -> None:
 def test_the_table_is_in_order_of_capture_and_its_groups_in_order_of_session_and_condition() -> None:
     shallow, upright, tilted = Condition(20.0, 0.0), Condition(11.0, 0.0), Condition(11.0, 10.0)
     order = [("b", shallow), ("b", upright), ("b", tilted), ("b", shallow), ("a", shallow), ("a", upright)]
-    sizes, blank = Measured(1.0, 1.0, 1.0, 1.0, 1.0), np.zeros((4, 128, 128), np.uint8)
-    presses: list[Press] = []
-    for k, (name, at) in enumerate(order):
-        stroke = Stroke(stroke_id=str(k), kind="press", still=k, depth_mm=at.depth_mm, tilt_deg=at.tilt_deg)
-        presses.append(Press(name, "", stroke, blank, np.zeros((128, 128), np.float32), (0.0, 0.0), sizes, False))
+    presses = [blank_press(str(k), at.depth_mm, at.tilt_deg, name) for k, (name, at) in enumerate(order)]
     scores = Scores(presses, ["line", "circle"])
     assert scores.groups == [[1], [2], [0, 3], [5], [4]]
     assert scores.group_of.tolist() == [2, 0, 1, 2, 4, 3]
     assert scores.conditions() == {upright: [1, 5], tilted: [2], shallow: [0, 3, 4]}
     scores.values[4, 1] = 0.5
     assert [(s.session_id, s.stroke_id, s.model, s.csim) for s in scores] == [("a", "4", "circle", 0.5)] * len(KEYS)
+
+
+# Presses made again: pairs by name, scored against the brush's own repeatability
+
+
+MODEL = stroke_model("ccd-bsm", Brush())
+STRICT = (Alignment.MM, Tone.BINARY)
+
+
+def press(name: str, shown: tuple[float, float], asked: tuple[float, float], of: str | None = None) -> Press:
+    stroke = Stroke(stroke_id=name, kind="press", still=0, depth_mm=asked[0], tilt_deg=asked[1], again_of=of)
+    return drawn_press(stroke, MODEL, *shown)
+
+
+def paired(originals: Iterable[Press], again: Iterable[Press]) -> tuple[list[Pair], dict[str, str]]:
+    """Pairs, and why presses are in none."""
+    refused: list[tuple[str, str]] = []
+    return pair_up(list(originals), list(again), MODEL, refused), dict(refused)
+
+
+ORIGINALS = [
+    press("a-r01", (14.6, 5.0), (15.0, 5.0)),
+    press("a-r02", (15.4, 5.0), (15.0, 5.0)),
+    press("b-r01", (19.0, 0.0), (19.0, 0.0)),
+]
+
+
+def test_a_press_made_again_as_it_was_beats_the_other_press_of_its_condition() -> None:
+    again = [
+        press("a-r01~1", (14.6, 5.0), (14.6, 5.0), "a-r01"),
+        press("a-r02~1", (15.4, 5.0), (15.4, 5.0), "a-r02"),
+    ]
+    pairs, refused = paired(ORIGINALS, again)
+    names = [(pair.original.stroke.stroke_id, pair.again.stroke.stroke_id) for pair in pairs]
+    assert names == [("a-r01", "a-r01~1"), ("a-r02", "a-r02~1")]
+    assert refused == {"b-r01": "was not pressed again"}
+    scores = score_pairs(pairs, ORIGINALS)
+    csim = {what: scores.of_key(what, STRICT)[:, 0] for what in scores.models}
+    assert csim[AGAIN].min() == pytest.approx(1.0)
+    assert csim[ANOTHER].max() < 0.98
+    assert csim[SIMULATED].mean() > 0.99
+    record = loop_record("grid", "ab", stats=tuple(statistics_of(scores)))
+    assert len(record.lost) == 8
+    assert all(points < 0.0 and row.csim.n == 2 for points, _, _, row in record.lost)
+    assert record.answer.good
+    assert "so few strokes do not make it certain" in record.answer.text, "two presses of one condition"
+
+
+def test_a_press_made_again_too_deep_fails_and_says_so() -> None:
+    again = [press("a-r01~1", (18.0, 5.0), (18.0, 5.0), "a-r01")]
+    scores = score_pairs(paired(ORIGINALS, again)[0], ORIGINALS)
+    record = loop_record("grid", "ab", stats=tuple(statistics_of(scores)))
+    stat = find_stat(record.stats, AGAIN, STRICT)
+    assert stat is not None
+    assert stat.csim.below_ceiling > 2.0
+    assert record.answer.good is False
+
+
+def test_what_repeats_nothing_is_named() -> None:
+    again = [
+        press("x~1", (15.0, 5.0), (15.0, 5.0), "x"),
+        press("y", (15.0, 5.0), (15.0, 5.0)),
+        press("a-r01~1", (15.0, 5.0), (15.0, 5.0), "a-r01"),
+    ]
+    pairs, refused = paired(ORIGINALS, again)
+    assert len(pairs) == 1
+    assert refused == {
+        "x~1": "repeats x: it has no original that can be used",
+        "y": "repeats no stroke: it has no original that can be used",
+        "a-r02": "was not pressed again",
+        "b-r01": "was not pressed again",
+    }
+
+
+def test_an_original_alone_in_its_condition_has_no_repeatability() -> None:
+    again = [press("b-r01~1", (19.0, 0.0), (19.0, 0.0), "b-r01")]
+    scores = score_pairs(paired(ORIGINALS, again)[0], ORIGINALS)
+    assert np.isnan(scores.of(ANOTHER)).all()
+    record = loop_record("grid", "ab", stats=tuple(statistics_of(scores)))
+    assert (record.lost, record.answer.good) == ([], None)

@@ -1,4 +1,4 @@
-"""The stroke models, the regressed ones, and that a new file is a new model."""
+"""The stroke models, the regressed ones, and CCD-BSM against published numbers, its cone and integration."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.integrate import quad
+from scipy.optimize import brentq
 
-from brushloop.model.ccdbsm import Brush, CcdBsm, DomainError, ccdbsm
+from brushloop.model.ccdbsm import Brush, CcdBsm, DomainError, basic_lengths, ccdbsm
 from brushloop.model.outline import Outline, as_batch
 from brushloop.model.raster import coverage
 from brushloop.model.strokes import UnknownModelError, fit_plane, stroke_model, stroke_models
@@ -133,3 +135,121 @@ def test_models_are_drawn_without_torch() -> None:
     code = "import sys; from brushloop import predict, Condition, models; [predict(Condition(15.0, 5.0), model=m) "
     code += "for m in models()]; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+# CCD-BSM against the published numbers, the cone it is cut from, and numerical integration
+
+
+# (H, alpha): O3A, O3C, O4O3, length, width, all mm, for R = 6, L = 48 and lambda = pi.
+TABLE = {
+    (11, 0): (1.375, 1.375, 12.461, 13.836, 8.639),
+    (11, 5): (1.371, 1.380, 12.378, 13.749, 8.672),
+    (11, 10): (1.387, 1.396, 12.401, 13.788, 8.773),
+    (13, 0): (1.625, 1.625, 14.726, 16.351, 10.210),
+    (13, 5): (1.620, 1.631, 14.629, 16.248, 10.249),
+    (13, 10): (1.639, 1.650, 14.656, 16.295, 10.368),
+    (15, 0): (1.875, 1.875, 16.992, 18.867, 11.781),
+    (15, 5): (1.869, 1.882, 16.879, 18.748, 11.826),
+    (15, 10): (1.892, 1.904, 16.911, 18.802, 11.963),
+    (17, 0): (2.125, 2.125, 19.257, 21.382, 13.352),
+    (17, 5): (2.118, 2.133, 19.130, 21.248, 13.403),
+    (17, 10): (2.144, 2.158, 19.165, 21.309, 13.558),
+    (20, 0): (2.500, 2.500, 22.656, 25.156, 15.708),
+    (20, 5): (2.492, 2.510, 22.506, 24.998, 15.768),
+    (20, 10): (2.522, 2.539, 22.547, 25.070, 15.950),
+}
+BRUSH = Brush()
+
+
+@st.composite
+def presses(draw: st.DrawFn) -> tuple[Brush, float, float]:
+    """A brush, H and alpha in the domain, away from the last degree, where the mark becomes endless."""
+    brush = Brush(radius_mm=draw(st.floats(1, 15)), length_mm=draw(st.floats(20, 80)))
+    limit_deg = 89 - math.degrees(math.atan(float(brush.radius_mm) / float(brush.length_mm)))
+    tilt_deg = draw(st.floats(0, limit_deg))
+    deepest_mm = float(brush.length_mm) * math.cos(math.radians(tilt_deg))
+    return brush, draw(st.floats(0.01, 0.999)) * deepest_mm, tilt_deg
+
+
+@pytest.mark.parametrize("condition", TABLE)
+def test_lengths_match_the_published_grid(condition: tuple[int, int]) -> None:
+    mark = ccdbsm(BRUSH, *condition)
+    ours = [mark.o3a_mm, mark.o3c_mm, mark.o4o3_mm, mark.length_mm, mark.width_mm]
+    assert [value.item() for value in ours] == pytest.approx(TABLE[condition], abs=1e-3)
+
+
+@given(presses())
+def test_lengths_are_distances_in_a_cone_cut_by_the_paper(press: tuple[Brush, float, float]) -> None:
+    brush, h, tilt_deg = press
+    a = math.radians(tilt_deg)
+    axis = np.array([math.sin(a), 0.0, math.cos(a)])
+    apex = np.array([0.0, 0.0, -h])  # the tip, H below the paper z = 0
+    o3 = apex + axis * (h / math.cos(a))
+    slope = float(brush.radius_mm) / float(brush.length_mm)
+
+    def outside(point: np.ndarray) -> float:
+        """Positive outside the cone: distance to the axis less the cone's radius there."""
+        along = float((point - apex) @ axis)
+        return float(np.linalg.norm(point - apex - along * axis)) - slope * along
+
+    def wall(direction: list[float]) -> float:
+        """The distance on the paper from O3 to the cone's wall."""
+        return brentq(lambda s: outside(o3 + s * np.array(direction)), 0.0, 50 * h, xtol=1e-13)
+
+    mark = ccdbsm(brush, h, tilt_deg)
+    toward_tip = wall([-1.0, 0.0, 0.0])
+    assert mark.o3a_mm.item() == pytest.approx(toward_tip, rel=1e-7)
+    assert mark.o3c_mm.item() == pytest.approx(wall([0.0, 1.0, 0.0]), rel=1e-7)
+    # The tip hinges about the wall point A: the wall below the paper is laid down on it.
+    hinge = o3 - np.array([toward_tip, 0.0, 0.0])
+    below = float(np.linalg.norm(hinge - apex))
+    assert mark.o4o3_mm.item() == pytest.approx(toward_tip + below, rel=1e-7)
+
+
+@given(presses(), st.floats(0.5, 4.0))
+def test_the_area_matches_quadrature(press: tuple[Brush, float, float], lam: float) -> None:
+    mark = ccdbsm(*press, lam)
+    a, b, t = mark.o3a_mm.item(), lam * mark.o3c_mm.item(), mark.o4o3_mm.item()
+    tip, _ = quad(lambda x: b * (1 - (x / t) ** 2), -t, 0)
+    heel, _ = quad(lambda x: b * math.sqrt(max(0.0, 1 - (x / a) ** 2)), 0, a)
+    assert mark.area_mm2.item() == pytest.approx(2 * (tip + heel), rel=1e-6)
+
+
+def test_a_batch_is_its_presses_one_by_one_also_in_scalars() -> None:
+    mark = ccdbsm(BRUSH, np.array([11.0, 20.0]), 5)
+    assert mark.o3a_mm.shape == mark.lam.shape == (2,)
+    scalar = basic_lengths(11.0, math.radians(5), 6.0, 48.0, math)
+    assert scalar == pytest.approx((mark.o3a_mm[0], mark.o3c_mm[0], mark.o4o3_mm[0]), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("depth_mm", "tilt_deg", "name", "value", "says"),
+    [
+        (15, -5, "tilt_deg", -5, "heading + 180"),
+        (15, 82.9, "tilt_deg", 82.9, "[0, 82.875) deg"),
+        (15, math.nan, "tilt_deg", math.nan, "[0, 82.875) deg"),
+        (0, 5, "depth_mm", 0, "(0, 47.8173] mm"),
+        (48, 5, "depth_mm", 48, "(0, 47.8173] mm"),
+        (math.nan, 5, "depth_mm", math.nan, "(0, 47.8173] mm"),
+    ],
+)
+def test_presses_outside_the_domain_are_refused(
+    depth_mm: float, tilt_deg: float, name: str, value: float, says: str
+) -> None:
+    with pytest.raises(DomainError) as caught:
+        ccdbsm(BRUSH, np.array([15.0, depth_mm]), tilt_deg)
+    assert caught.value.name == name
+    assert caught.value.value == pytest.approx(value, nan_ok=True)
+    assert says in str(caught.value)
+    assert ccdbsm(BRUSH, 48, 0).o3c_mm.item() == pytest.approx(6.0)  # the deepest press is inside
+
+
+def test_impossible_brush_dilation_and_shape_are_refused() -> None:
+    with pytest.raises(DomainError, match=r"radius_mm = 0 is outside \(0, inf\)"):
+        Brush(radius_mm=0)
+    with pytest.raises(DomainError, match="length_mm = -1"):
+        Brush(length_mm=-1)
+    with pytest.raises(DomainError, match="lam = 0"):
+        ccdbsm(BRUSH, 15, 5, 0)
+    with pytest.raises(ValueError, match=r"\(2, 2\)"):
+        ccdbsm(BRUSH, np.ones((2, 2)), 5)

@@ -13,9 +13,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from pydantic import ValidationError
-from typer.testing import CliRunner
 
-from brushloop.__main__ import app
 from brushloop.calibrate.board.detect import BoardView, find_board
 from brushloop.calibrate.board.lens import Lens, LensFile, apply, guidance, unknown_lens
 from brushloop.calibrate.board.lens import fit_lens as fit
@@ -35,6 +33,7 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.stroke import PX_PER_MM as RASTER_PX_PER_MM
 from brushloop.calibrate.stroke import prepare, rectify_by
 from tests.calibrate.simulated_rigs import CAMERAS, Shot, boards, sheet, true_mask, true_scale
+from tests.command import refused
 
 DATA = Path(__file__).parents[4] / "shared" / "data" / "opencv_calib"
 real = pytest.mark.skipif(not DATA.is_dir(), reason="OpenCV's real photographs of boards are not here")
@@ -61,7 +60,7 @@ def charuco() -> np.ndarray:
 def view(name: str, turn: Sequence[float], place: Sequence[float], noise: np.ndarray, lens: Lens = TRUE) -> BoardView:
     """Corners as a lens sees them, each off by its noise (54, 2) px."""
     flat = np.column_stack([BOARD_MM, np.zeros(54)])
-    pixels, _ = cv2.projectPoints(flat, np.array(turn), np.array(place), lens.camera, lens.coefficients)
+    pixels, _ = cv2.projectPoints(flat, np.array(turn), np.array(place), lens.camera, np.array(lens.distortion))
     return BoardView(name, TRUE.size_px, pixels.reshape(-1, 2) + noise, BOARD_MM, IDS)
 
 
@@ -185,19 +184,17 @@ def test_the_command_says_of_every_photograph_why_it_was_of_no_use(tmp_path: Pat
     torn.write_bytes(blank.read_bytes()[:100])
     board = ("--charuco", "5x7", "--square-mm", "40", "--marker-mm", "20", "--dictionary", "DICT_6X6_250")
 
-    def refused(*photographs: Path, options: Sequence[str] = board) -> str:
-        words = ["camera", "intrinsics", *map(str, photographs), *options, "--out", str(tmp_path / "out")]
-        ran = CliRunner().invoke(app, words)
-        assert isinstance(ran.exception, CalibrationError), ran.output
+    def refusal(*photographs: Path, options: Sequence[str] = board) -> str:
+        why = refused("camera", "intrinsics", *photographs, *options, "--out", tmp_path / "out")
         assert not (tmp_path / "out").exists()
-        return str(ran.exception)
+        return why
 
-    why = refused(blank, mirrored)
+    why = refusal(blank, mirrored)
     assert why.startswith(f"2 photographs: 0 usable views of the board, at least 4 needed; {blank}: is blank")
     assert f"{mirrored}: the photograph is mirrored" in why
-    assert "not a complete PNG or JPEG" in refused(torn)
-    assert "inner_corners.1: Field required" in refused(blank, options=("--checkerboard", "9"))
-    assert "give one of --checkerboard" in refused(blank, options=())
+    assert "not a complete PNG or JPEG" in refusal(torn)
+    assert "inner_corners.1: Field required" in refusal(blank, options=("--checkerboard", "9"))
+    assert "give one of --checkerboard" in refusal(blank, options=())
 
 
 # The printed board and the plane

@@ -228,4 +228,4 @@ def test_a_single_condition_gives_neither_intervals_nor_held_out_scores(tmp_path
     pressed = imported_presses(tmp_path / "photos", tmp_path / "presses", CONDITIONS[:1], (300, 480), (380, 150))
     fitted = fit_session(FitRequest(pressed))
     assert fitted.held_out == []
-    assert fitted.sizes == []
+    assert fitted.sizes == {}

@@ -11,33 +11,18 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from brushloop.__main__ import app
 from brushloop.calibrate.compare import TABLE_1
-from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.validate.tables import NORMAL, STRICT, Report, table_1, table_3
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Source
-from tests.calibrate.records import loop_record, table_of, written_record
+from tests.calibrate.given import loop_record, table_of, written_record
+from tests.command import refused, said
 
 FAST = ("--model", "line", "--no-held-out")
 HALF = '{"format": "brushloop-loop-4", "digest": "\\ud800"}'
 """Half a surrogate: JSON, but no text that a page could hold."""
 PICTURE = cv2.imencode(".png", np.full((20, 40), 200, np.uint8))[1].tobytes()
-
-
-def invoke(place: Path) -> str:
-    ran = CliRunner().invoke(app, ["validate", str(place), *FAST])
-    assert ran.exit_code == 0, (ran.output, ran.exception)
-    return " ".join(ran.output.split())
-
-
-def refused(place: Path) -> str:
-    """What the front door would print, and end with exit code 2."""
-    ran = CliRunner().invoke(app, ["validate", str(place), *FAST])
-    assert isinstance(ran.exception, CalibrationError), ran.output
-    return str(ran.exception)
 
 
 def report_of(place: Path) -> tuple[Report, str]:
@@ -74,7 +59,7 @@ def characters(folder: Path, **fields: Any) -> Path:
 
 def test_a_loop_in_the_session_is_the_third_row_of_table_1(place: Path) -> None:
     put(place / "loop", loop_text(place))
-    assert "points less similar to their originals" in invoke(place)
+    assert "points less similar to their originals" in said("validate", place, *FAST)
     report, page = report_of(place)
     [row] = [row for row in table_1(report) if row.label == "robot writing"]
     assert row.scores is not None
@@ -99,14 +84,14 @@ def test_a_loop_in_the_session_is_the_third_row_of_table_1(place: Path) -> None:
 )
 def test_an_edited_loop_is_refused_by_name(place: Path, edit: tuple[str, str], words: str) -> None:
     path = put(place / "loop", loop_text(place).replace(*edit))
-    assert refused(place) == f"{path.resolve()}: {words}"
+    assert refused("validate", place, *FAST) == f"{path.resolve()}: {words}"
     assert not (place / "validation").exists()
 
 
 @pytest.mark.parametrize("text", ["", "[]", "[" * 100_000, '{"format": 1, "digest": {}}', HALF])
 def test_what_is_no_loop_at_all_is_refused(place: Path, text: str) -> None:
     path = put(place / "loop", text)
-    assert refused(place).startswith(f"{path.resolve()}: ")
+    assert refused("validate", place, *FAST).startswith(f"{path.resolve()}: ")
 
 
 def test_what_belongs_to_other_strokes_ink_or_brushes_is_left_out_with_the_reason(place: Path) -> None:
@@ -115,13 +100,13 @@ def test_what_belongs_to_other_strokes_ink_or_brushes_is_left_out_with_the_reaso
         ({"original_sha256": "3" * 64}, f"it is of another recording of {place.name}"),
     ):
         put(place / "loop", loop_text(place, **changes))
-        assert words in invoke(place)
+        assert words in said("validate", place, *FAST)
     for changes, words in (
         ({"source": Source.LOOPBACK}, "it is of loopback rig, not imported photographs"),
         ({"brush": "goat hair"}, "it was written with another brush, goat hair"),
     ):
         characters(place.parent.parent / "written", **changes)
-        assert words in invoke(place)
+        assert words in said("validate", place, *FAST)
     report, _ = report_of(place)
     assert report.loops == report.written == ()
 
@@ -129,7 +114,7 @@ def test_what_belongs_to_other_strokes_ink_or_brushes_is_left_out_with_the_reaso
 @pytest.mark.parametrize("beside", ["sessions/presses/written", "written"])
 def test_table_3_has_the_papers_rows_beside_and_figure_13(place: Path, beside: str) -> None:
     characters(place.parent.parent / beside)
-    assert "Table 3: 字" in invoke(place)
+    assert "Table 3: 字" in said("validate", place, *FAST)
     report, page = report_of(place)
     like, strict = (table_3(report.written[0], "字", key[0]) for key in (NORMAL, STRICT))
     assert {row.label: None if row.paper is None else row.paper.csim[2] for row in like} == {
@@ -148,10 +133,10 @@ def test_an_edited_table_3_or_another_picture_is_refused(place: Path) -> None:
     path = characters(place / "written")
     text = path.read_text()
     path.write_text(text.replace('"字"', '"子"'))
-    assert "was edited: its digest does not match its contents" in refused(place)
+    assert "was edited: its digest does not match its contents" in refused("validate", place, *FAST)
     path.write_text(text)
     path.with_name("figure-13.png").write_bytes(PICTURE + b" ")
-    assert "is not the picture of written.json beside it: its SHA-256 differs" in refused(place)
+    assert "is not the picture of written.json beside it: its SHA-256 differs" in refused("validate", place, *FAST)
 
 
 def test_what_others_wrote_is_escaped(place: Path) -> None:
@@ -159,7 +144,7 @@ def test_what_others_wrote_is_escaped(place: Path) -> None:
     named = dict.fromkeys(("model", "session", "command", "software"), bad)
     characters(place / "written", table_3=table_of(bad, bad), **named)
     put(place / "loop", loop_text(place, command=bad, software=bad, model=bad))
-    assert "Table 3: <img" in invoke(place)  # a terminal shows it as it is
+    assert "Table 3: <img" in said("validate", place, *FAST)  # a terminal shows it as it is
     _, page = report_of(place)
     assert "<img src=x" not in page
     assert page.count("&lt;img src=x onerror=alert(1)&gt;{{ 7 * 7 }}") > 8

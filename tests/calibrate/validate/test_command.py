@@ -15,9 +15,7 @@ from pathlib import Path
 
 import pytest
 from filelock import FileLock
-from typer.testing import CliRunner
 
-from brushloop.__main__ import app
 from brushloop.calibrate import work
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.validate.command import open_session
@@ -25,7 +23,7 @@ from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.events import Closed, Open
 from brushloop.sessions.journal import Journal
 from brushloop.sessions.recording import Recording
-from tests.command import brushloop
+from tests.command import brushloop, refused
 from tests.waiting import PATIENCE_S, wait_until
 
 FILES = ("report.json", "report.html", "scores.csv", "summary.csv", "failures.csv", "scores.parquet")
@@ -63,8 +61,7 @@ def test_after_kill_9_the_same_command_gives_the_same_bytes_and_repeats_nothing(
 
 def test_two_at_a_time_in_one_folder_are_refused(session: Path, tmp_path: Path) -> None:
     with FileLock(tmp_path / ".lock"):
-        ran = CliRunner().invoke(app, ["validate", str(session), "--out", str(tmp_path)])
-    assert "another validation is writing there" in str(ran.exception)
+        assert "another validation is writing there" in refused("validate", session, "--out", tmp_path)
 
 
 def test_a_recording_that_is_not_the_one_its_journal_closed_is_damaged(session: Path, tmp_path: Path) -> None:

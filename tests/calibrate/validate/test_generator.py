@@ -9,9 +9,7 @@ from typing import cast
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
 
-from brushloop.__main__ import app
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.calibrate.training import captures_of
@@ -19,6 +17,7 @@ from brushloop.calibrate.validate.tables import NORMAL, Report
 from brushloop.model.generator.stroke import load_generator
 from brushloop.sessions.records import Source
 from tests.calibrate.validate.conftest import MakeSession
+from tests.command import refused, said
 
 # One word a line, as the file's owner would write it.
 TRAINING = """
@@ -48,24 +47,18 @@ def one_thread() -> object:
     torch.set_num_threads(before)
 
 
-def invoke(*arguments: str | Path) -> str:
-    ran = CliRunner().invoke(app, [str(argument) for argument in arguments])
-    assert ran.exit_code == 0, (ran.output, ran.exception)
-    return " ".join(ran.output.split())
-
-
 @pytest.fixture(scope="module")
 def generator(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("generator")
     (folder / "train.toml").write_text(TRAINING.replace("PLACEMENT", "centred"))
-    invoke("train", "--config", folder / "train.toml", "--out", folder / "made")
+    said("train", "--config", folder / "train.toml", "--out", folder / "made")
     return folder / "made" / "generator.safetensors"
 
 
 def test_a_generator_is_scored_beside_what_it_was_trained_on(session: Path, generator: Path, tmp_path: Path) -> None:
     training = generator.parent
     given = ("--generator", generator, "--curves", f"CCD-BSMG={training}", "--no-held-out")
-    invoke("validate", session, "--out", tmp_path, *given)
+    said("validate", session, "--out", tmp_path, *given)
     report = Report.read(tmp_path)
     drawn, exact = (report.stat(name, NORMAL) for name in ("ccd-bsmg", "ccd-bsm"))
     assert drawn is not None
@@ -88,7 +81,7 @@ def test_a_generator_is_tuned_on_the_presses_of_a_session(
             .replace("steps = 250", "steps = 60")
             .replace("px_mm = 1.0", "px_mm = 1.4")
         )
-        invoke("train", "--config", tmp_path / "train.toml", "--out", tmp_path / "made")
+        said("train", "--config", tmp_path / "train.toml", "--out", tmp_path / "made")
         generator = tmp_path / "made" / "generator.safetensors"
     images = captures_of([open_session(session)], generator)[0].images
     assert images.inputs.tolist()[:2] == [[11.0, 0.0], [11.0, 10.0]]
@@ -102,9 +95,9 @@ def test_a_generator_is_tuned_on_the_presses_of_a_session(
     assert np.abs(middle - (16 if placement == "centred" else 18)).max() < 4.0
 
     command = ("train", "tune", generator, session, "--out", tmp_path / "tuned", "--steps", "100")
-    said = invoke(*command, "--learning-rate", "0.001")
-    assert "left out: blank" in said
-    assert "10 presses (imported photographs)" in said
+    output = said(*command, "--learning-rate", "0.001")
+    assert "left out: blank" in output
+    assert "10 presses (imported photographs)" in output
     tuned = load_generator(tmp_path / "tuned" / "generator.safetensors")
     assert tuned.fitted
     assert "tuned on captured strokes" in tuned.definition
@@ -114,8 +107,7 @@ def test_a_generator_is_tuned_on_the_presses_of_a_session(
         float(np.square(model.file.images(inputs) - truth).mean()) for model in (load_generator(generator), tuned)
     )
     assert after < 0.8 * before
-    again = CliRunner().invoke(app, [*map(str, command), "--learning-rate", "0.02"])
-    assert "learning_rate: 0.001 -> 0.02" in str(again.exception)
+    assert "learning_rate: 0.001 -> 0.02" in refused(*command, "--learning-rate", "0.02")
 
 
 def test_presses_of_a_single_condition_are_refused_and_a_described_brush_keeps_its_remark(

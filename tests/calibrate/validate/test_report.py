@@ -11,10 +11,8 @@ from pathlib import Path
 
 import pyarrow.parquet
 import pytest
-from typer.testing import CliRunner
 
 import brushloop
-from brushloop.__main__ import app
 from brushloop.calibrate.commands import DiffRequest, FitRequest, ValidateRequest
 from brushloop.calibrate.compare import KEYS
 from brushloop.calibrate.errors import CalibrationError
@@ -32,24 +30,19 @@ from brushloop.sessions.recording import Recording, add_remark
 from brushloop.sessions.records import Header, Source, Stroke
 from brushloop.sessions.store import SessionStore
 from tests.browser import BROWSER, content_widths_px
+from tests.command import refused, said
 
 MODELS = ("ccd-bsm", "bezier", "bezier-refitted", "ellipse", "line", "circle", "qbc", "another press")
 QUICK = ("--model", "line", "--no-held-out")
 
 
-def run(*arguments: str | Path) -> str:
-    ran = CliRunner().invoke(app, ["validate", *map(str, arguments)])
-    assert ran.exit_code == 0, ran.output
-    return " ".join(ran.output.split())
-
-
 @pytest.fixture(scope="module")
 def folder(session: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("report")
-    said = run(session, "--out", out)
-    assert "10 brush presses at 5 combinations" in said
-    assert "1 more could not be used" in said
-    assert "imported photographs" in said
+    output = said("validate", session, "--out", out)
+    assert "10 brush presses at 5 combinations" in output
+    assert "1 more could not be used" in output
+    assert "imported photographs" in output
     return out
 
 
@@ -137,12 +130,10 @@ def test_what_is_no_gate_is_refused_before_any_work(text: str) -> None:
 
 
 def test_only_the_models_asked_for_and_an_unknown_one_is_refused(session: Path, tmp_path: Path) -> None:
-    run(session, "--out", tmp_path, *QUICK, "--model", "circle")
+    said("validate", session, "--out", tmp_path, *QUICK, "--model", "circle")
     report = Report.read(tmp_path)
     assert {stat.model for stat in report.stats} == {"line", "circle", "another press", "ceiling"}
-    ran = CliRunner().invoke(app, ["validate", str(session), "--out", str(tmp_path), "--model", "square"])
-    assert isinstance(ran.exception, CalibrationError)
-    assert "'square' is not one of: ccd-bsm" in str(ran.exception)
+    assert "'square' is not one of: ccd-bsm" in refused("validate", session, "--out", tmp_path, "--model", "square")
 
 
 def test_a_capture_that_a_person_marked_bad_is_left_out_by_name(session: Path, tmp_path: Path) -> None:
@@ -151,7 +142,7 @@ def test_a_capture_that_a_person_marked_bad_is_left_out_by_name(session: Path, t
     still = next(stroke.still for stroke in Recording(marked).stroke_records() if stroke.stroke_id == "003")
     for bad in (True, False):  # also where the work of before is still there
         add_remark(marked, Remark(t_ns=1, still=still, stroke_id="003", bad=bad, note="<b>hair</b> in it"))
-        run(marked, "--out", tmp_path / "out", *QUICK)
+        said("validate", marked, "--out", tmp_path / "out", *QUICK)
         reasons = {press.stroke_id: press.why for press in Report.read(tmp_path / "out").refused}
         assert reasons.get("003") == ("was marked bad: <b>hair</b> in it" if bad else None)
         assert ("&lt;b&gt;hair" in (tmp_path / "out" / "report.html").read_text()) == bad
@@ -162,7 +153,7 @@ def test_ablations_show_lambda_and_the_number_of_strokes(session: Path, tmp_path
     curve.mkdir()
     (curve / "validation.csv").write_text("step,mse,iou,csim\n10,0.1,0.5,0.6\n20,0.01,0.9,0.95\n")
     given = ("--model", "ccd-bsm", "--model", "ccd-bsm-lambda-1", "--model", "ccd-bsm-lambda-pi/2")
-    run(session, "--out", tmp_path / "out", *given, "--ablations", "--curves", f"QBC={curve}")
+    said("validate", session, "--out", tmp_path / "out", *given, "--ablations", "--curves", f"QBC={curve}")
     report = Report.read(tmp_path / "out")
     assert report.stat("ccd-bsm-lambda-1") is not None
     by_count = {step.strokes: step.csim for step in report.by_strokes if step.model == "CCD-BSM"}
@@ -173,9 +164,9 @@ def test_ablations_show_lambda_and_the_number_of_strokes(session: Path, tmp_path
         assert words in page
 
 
-@pytest.mark.parametrize(("off_mm", "said"), [(0.2, True), (0.05, False)])
+@pytest.mark.parametrize(("off_mm", "named"), [(0.2, True), (0.05, False)])
 def test_commanded_and_reached_depth_stand_side_by_side_and_a_large_difference_is_named(
-    session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, off_mm: float, said: bool
+    session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, off_mm: float, named: bool
 ) -> None:
     records = Recording.stroke_records
 
@@ -190,11 +181,11 @@ def test_commanded_and_reached_depth_stand_side_by_side_and_a_large_difference_i
         rows = {row["stroke_id"]: row for row in csv.DictReader(file)}
     assert rows["000"]["reached_mm"] == ""
     assert float(rows["003"]["depth_mm"]) - float(rows["003"]["reached_mm"]) == pytest.approx(off_mm)
-    assert any("003: " in point.text and "was reached" in point.text for point in trust(output.report)) == said
+    assert any("003: " in point.text and "was reached" in point.text for point in trust(output.report)) == named
 
 
 def test_what_was_left_out_selected_or_pressed_on_other_paper_stands_above_the_results(report: Report) -> None:
-    def said(**changes: object) -> str:
+    def told(**changes: object) -> str:
         collected = Collected(
             planned=8, photographed=8, pressed_again=(), left_out=(), touches=("taught 1 mm",), moved_mm=0.0
         )
@@ -202,12 +193,12 @@ def test_what_was_left_out_selected_or_pressed_on_other_paper_stands_above_the_r
         changed = report.model_copy(update={"sessions": (session,)})
         return " ".join([*(point.text for point in trust(changed)), *dict(provenance(session)).values()])
 
-    assert "left out during" not in said()
-    assert "8 planned, 8 photographed" in said()
-    assert "2 of 8 planned strokes were left out during collection: a, b." in said(left_out=("a", "b"))
-    assert "1 of 8 takes did not count and were pressed again" in said(pressed_again=("a",))
+    assert "left out during" not in told()
+    assert "8 planned, 8 photographed" in told()
+    assert "2 of 8 planned strokes were left out during collection: a, b." in told(left_out=("a", "b"))
+    assert "1 of 8 takes did not count and were pressed again" in told(pressed_again=("a",))
     touches = ("taught 1 mm", "jog 3 mm")
-    assert "two zero touches differ by 2.00 mm (taught 1 mm, jog 3 mm)" in said(moved_mm=2.0, touches=touches)
+    assert "two zero touches differ by 2.00 mm (taught 1 mm, jog 3 mm)" in told(moved_mm=2.0, touches=touches)
 
 
 def test_takes_that_did_not_count_are_distinguished_from_strokes_that_were_left_out(tmp_path: Path) -> None:
@@ -251,7 +242,7 @@ TWO = ("--model", "line", "--model", "ellipse", "--no-held-out")
 @pytest.fixture(scope="module")
 def before(session: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("before")
-    run(session, "--out", out, *TWO)
+    said("validate", session, "--out", out, *TWO)
     return out
 
 
@@ -267,7 +258,7 @@ def test_another_version_of_a_model_is_compared_stroke_by_stroke(
     session: Path, before: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(validation, "_pressed", lambda model, at: (model.profile(at.depth_mm, at.tilt_deg), -9.0))
-    run(session, "--out", tmp_path, *TWO)
+    said("validate", session, "--out", tmp_path, *TWO)
     changes = {change.series: change for change in compare(DiffRequest(before, tmp_path)).changes}
     # Every mark is drawn 9 mm too far to the left, in each of the five conditions.
     worse = changes[("line", "mm", "binary", "csim")]
@@ -276,14 +267,14 @@ def test_another_version_of_a_model_is_compared_stroke_by_stroke(
     assert worse.test.interval[1] < 0.0
     assert worse.test.p == pytest.approx(2 / 2**5)  # signs are flipped by condition: five alike are no proof yet
     assert worse.verdict == "no significant difference"
-    table = run("diff", before, tmp_path)
+    table = said("validate", "diff", before, tmp_path)
     assert "the same stroke" in table
     assert "n = 10 in 5 conditions" in table
 
 
 def test_two_sessions_are_compared_condition_by_condition(make_session: object, before: Path, tmp_path: Path) -> None:
     other = make_session(tmp_path, "other", seed=500, blank=False)  # pyright: ignore[reportCallIssue]
-    run(other, *TWO)
+    said("validate", other, *TWO)
     found = compare(DiffRequest(before, other))  # the session's own folder
     assert not found.by_stroke
     assert all(change.test.n == 5 for change in found.changes)

@@ -1,4 +1,4 @@
-"""Trajectories stay within what brush and arm can do, and refinement brings their image to the wanted one."""
+"""Trajectories within reach, refined to the wanted image; plans that lead the brush by its footprint; and the lag."""
 
 from __future__ import annotations
 
@@ -11,9 +11,34 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from brushloop.model.ccdbsm import Brush
-from brushloop.model.characters.glyph import parse_glyph, paths_of, reference
-from brushloop.model.characters.plan import Patch, Reach
+from brushloop.model.characters.glyph import parse_glyph, paths_of, reference, swept
+from brushloop.model.characters.plan import (
+    Patch,
+    Phase,
+    Reach,
+    StrokePath,
+    covered,
+    drawn,
+    first_lead,
+    grid,
+    lead,
+    phases_of,
+    resampled,
+)
 from brushloop.model.characters.presses import Stamps, depth_of, refine, trajectory, written
+from brushloop.model.drag import (
+    NAMES,
+    START,
+    DragModel,
+    Drawings,
+    Footprint,
+    fit_each,
+    fit_footprint,
+    inked,
+    lagging,
+    marks,
+    sampled,
+)
 from brushloop.model.raster import coverage
 from brushloop.model.strokes import stroke_model
 
@@ -100,3 +125,159 @@ def test_refinement_brings_a_character_to_its_image_within_reach() -> None:
     assert after < 0.15 * before
     for points in (*first, *better):
         assert_feasible(points, REACH)
+
+
+# The tip runs ahead, and the ink lands where it is wanted
+
+
+SIDE_MM, SIZE_PX = 48.0, 96
+HOOK = np.array([[12.0, 36.0], [20.0, 36.0], [28.0, 36.0], [34.0, 34.0], [34.0, 26.0], [33.0, 18.0], [30.0, 21.0]])
+
+
+def hook() -> StrokePath:
+    points = resampled(HOOK, 2.0)
+    half = np.full(len(points), 2.0)
+    half[-2:] = 1.0, 0.3
+    return StrokePath(points, half)
+
+
+def test_leading_the_brush_puts_the_ink_on_the_corner() -> None:
+    path, brush, reach = hook(), Footprint(), Reach()
+    wanted = swept([path], SIDE_MM, SIZE_PX)
+
+    def wrong(strokes: list[np.ndarray]) -> int:
+        seen = covered(drawn([brush] * len(strokes), strokes, SIDE_MM, SIZE_PX), SIDE_MM)
+        return np.count_nonzero((seen > 0.5) != (wanted > 0.5))
+
+    first = first_lead([path], brush, reach, SIDE_MM, 5.0)
+    led = lead([brush], first, wanted, SIDE_MM, reach)
+    assert wrong(led) < 0.5 * wrong(first)
+    assert led[0][:, 0].max() > HOOK[:, 0].max() + 0.5  # the tip goes on beyond the corner
+    assert np.all(np.linalg.norm(np.diff(led[0][:, :3], axis=0), axis=1) >= reach.apart_mm)
+    assert led[0][:, 2].max() <= reach.depth_mm[1]
+
+
+def test_a_footprint_is_found_again_from_its_ink() -> None:
+    true = Footprint(
+        tuple({**dict(zip(NAMES, Footprint().values, strict=True)), "leash_mm": 2.0, "half_mm_2": 0.9}.values())
+    )
+    x_mm, y_mm = grid(SIDE_MM, 64)
+    paths = [
+        np.array([[14.0, 24.0, depth, turn], [34.0, 24.0, depth, turn], [30.0, 14.0, 0.5 * depth, turn]])
+        for depth, turn in ((3.0, 0.0), (6.0, 30.0), (9.0, -20.0))
+    ]
+    ink = np.array([inked([true], [path], x_mm, y_mm) > 0.0 for path in paths], np.float32)
+    found = fit_footprint(Drawings(paths, np.arange(4), ink, x_mm, y_mm))
+
+    def wrong(brush: Footprint) -> int:
+        seen = [inked([brush], [path], x_mm, y_mm) > 0.0 for path in paths]
+        return np.count_nonzero(np.array(seen) != (ink > 0.5))
+
+    assert wrong(found) < 0.4 * wrong(Footprint())
+    with pytest.raises(ValueError, match="a footprint has 28 finite values, got 2"):
+        Footprint((1.0, 2.0))
+
+
+def test_pressing_deeper_on_the_spot_marks_like_landing_as_deep() -> None:
+    lands = np.array([[24.0, 24.0, 8.0, 30.0], [24.01, 24.0, 8.0, 30.0]])
+    deepens = np.array([[24.0, 24.0, 2.0, 30.0], [24.01, 24.0, 8.0, 30.0]])
+    ink, slid = (inked([Footprint()], [path], *grid(SIDE_MM, 64)) for path in (lands, deepens))
+    deep = ink > 0.3
+    assert deep.sum() > 30
+    assert np.all(slid[deep] > 0.0)
+    nodes = sampled(lands)
+    middle_disc = marks([nodes], np.array(START)).discs[1::3]
+    behind = np.hypot(*(middle_disc[:, :2] - (24.0, 24.0)).T)
+    assert behind[nodes[:, 2] == 8.0][0] == pytest.approx(4.5, abs=0.1)  # it slid there while the brush went down
+
+
+def test_each_stroke_has_a_footprint_of_its_own() -> None:
+    wide, narrow = (
+        Footprint(tuple({**dict(zip(NAMES, Footprint().values, strict=True)), "half_mm_2": half}.values()))
+        for half in (1.2, 0.4)
+    )
+    x_mm, y_mm = grid(SIDE_MM, 64)
+    paths = [np.array([[12.0, y, 5.0, 0.0], [36.0, y, 5.0, 0.0]]) for y in (16.0, 32.0)]
+    ink = (inked([wide, narrow], paths, x_mm, y_mm) > 0.0).astype(np.float32)[None]
+    upper, lower = fit_each(Drawings(paths, np.array([0, 2]), ink, x_mm, y_mm), Footprint())
+    depth = np.array([5.0])
+    assert upper.half_width_mm(depth) > lower.half_width_mm(depth) + 0.4
+    assert np.count_nonzero((inked([upper, lower], paths, x_mm, y_mm) > 0.0) != (ink[0] > 0.5)) < 40
+
+
+def test_a_path_is_sampled_densely_from_its_landing_to_its_lift() -> None:
+    path = np.array([[0.0, 0.0, 1.0, 0.0], [3.0, 0.0, 1.0, 0.0], [3.0, 4.0, 2.0, 90.0]])
+    dense = sampled(path)
+    assert np.linalg.norm(np.diff(dense[:, :3], axis=0), axis=1).max() <= 0.5
+    assert all((dense == corner).all(axis=1).any() for corner in path)
+    assert dense[0].tolist() == [0.0, 0.0, 0.0, 0.0]
+    assert dense[-1].tolist() == [3.0, 4.0, 0.0, 90.0]
+
+
+def test_a_brush_that_lifts_marks_ahead_of_where_it_was_dragged_to() -> None:
+    path = np.array([[14.0, 24.0, 8.0, 0.0], [34.0, 24.0, 8.0, 0.0]])
+    dragged, lifted = (marks([nodes], np.array(START)).discs for nodes in (path, sampled(path)))
+    assert dragged[-2, 0] == pytest.approx(34.0 - float(Footprint().lag_mm(np.array([8.0]))[0]))
+    assert lifted[-2, 0] == pytest.approx(34.0 - float(Footprint().lag_mm(np.array([0.0]))[0]))
+
+
+def test_a_stroke_is_divided_into_phases() -> None:
+    phases = phases_of(hook())
+    assert phases[0] is Phase.INITIATION_HIDDEN
+    assert phases[-1] is Phase.TERMINATION_EXPOSED
+    corner = int(np.argmin(np.linalg.norm(hook().points - (34.0, 34.0), axis=1)))
+    assert phases[corner] is Phase.TURNING
+    assert Phase.EXECUTION in phases
+    back = StrokePath(np.array([[x, 0.0] for x in range(10)] + [[8.0 - x, 1.0] for x in range(8)]), np.full(18, 1.0))
+    assert Phase.FOLDING in phases_of(back)
+
+
+# A brush drawn along the paper: the lag has closed forms on a straight line and on a corner
+
+
+STIFF = DragModel(half_mm=2.0, half_per_mm=0.0, leash_mm=0.0, leash_per_mm=0.0, settle_mm=0.0, front=0.0)
+X_MM, Y_MM = np.linspace(-10.0, 50.0, 121), np.linspace(-20.0, 20.0, 81)
+
+
+def away(model: DragModel, path: np.ndarray, x_mm: np.ndarray, y_mm: np.ndarray) -> np.ndarray:
+    """Signed distance in mm to the edge of one path's mark."""
+    return lagging([path], model.vector()).distances(x_mm, y_mm)[0]
+
+
+def line(length_mm: float, depth_mm: float = 5.0, nodes: int = 21) -> np.ndarray:
+    x = np.linspace(0.0, length_mm, nodes)
+    return np.column_stack([x, np.zeros(nodes), np.full(nodes, depth_mm)])
+
+
+def test_without_a_leash_the_mark_is_discs_along_the_path() -> None:
+    seen = away(STIFF, line(30.0), X_MM, Y_MM)
+    along = np.clip(X_MM, 0.0, 30.0)
+    wanted = 2.0 - np.hypot(X_MM[None] - along[None], Y_MM[:, None])
+    assert np.abs(seen - wanted).max() < 0.06  # a leash is never shorter than 0.05 mm
+
+
+@pytest.mark.parametrize("nodes", [2, 9, 200])
+def test_the_lag_is_that_of_first_order_however_the_path_is_cut(nodes: int) -> None:
+    model = DragModel(leash_mm=4.0, leash_per_mm=0.0, front=0.0)
+    trail = lagging([line(20.0, nodes=nodes)], model.vector()).discs
+    assert trail[-2, 0] == pytest.approx(20.0 - 4.0 * (1.0 - np.exp(-20.0 / 4.0)), abs=1e-9)
+
+
+def test_a_corner_is_cut_and_more_so_at_depth() -> None:
+    model = DragModel(leash_mm=1.0, leash_per_mm=0.5, half_per_mm=0.0)
+    leg = np.linspace(0.0, 25.0, 26)
+    cut = []
+    for depth in (2.0, 8.0):
+        corner = np.concatenate([np.column_stack([leg, 0 * leg]), np.column_stack([0 * leg[1:] + 25.0, -leg[1:]])])
+        trail = lagging([np.column_stack([corner, np.full(len(corner), depth)])], model.vector()).discs
+        cut.append(np.hypot(trail[:, 0] - 25.0, trail[:, 1]).min())
+    assert 0.2 < cut[0] < cut[1]
+
+
+def test_lifting_below_no_width_leaves_no_ink() -> None:
+    model = DragModel(half_mm=-1.0, half_per_mm=0.5, settle_mm=0.05)
+    path = line(30.0)
+    path[8:13, 2] = 1.0  # half width -0.5 mm in the middle
+    middle = away(model, path, np.array([15.0]), Y_MM)
+    assert middle.max() < 0.0
+    assert away(model, path, np.array([2.0]), np.array([0.0])).item() > 0.0
