@@ -45,16 +45,13 @@ async def each_frame(camera: Camera, shows: Sequence[Callable[[Frame], None]]) -
     """
 
     async def watch() -> None:
-        while True:
+        while shows:
             with contextlib.suppress(DeviceError):  # the run finds out when it takes a photograph itself
                 frame = await camera.fresh(Stamp(0))
                 for show in shows:
                     await asyncio.to_thread(show, frame)
             await asyncio.sleep(FRAME_PERIOD_S)
 
-    if not shows:
-        yield
-        return
     task = asyncio.create_task(watch(), name="camera picture")
     try:
         yield
