@@ -108,7 +108,7 @@ class Controller(RpcConnection):
     """One connection, with typed calls. Every method may raise what `call` raises."""
 
     robot = ""
-    """Name of the robot behind it, the first of `robot_names`; to be set before anything else is asked."""
+    """Name of the robot behind it, which `first_robot` tells; to be set before anything else is asked."""
     on_pose: Callable[[Pose, float], None] | None = None
     """Gets each pose that was asked for, and how long the answer took, in s."""
 
@@ -121,12 +121,13 @@ class Controller(RpcConnection):
         answer = await self.ask(method)
         return numbers(method.rpartition(".")[2], [answer] if count == 1 else answer, count)
 
-    async def robot_names(self) -> list[str]:
-        """Names of the robots, at least one. Raises `ProtocolViolation`."""
-        names = await self.call("getRobotNames")
-        if not isinstance(names, list) or not names:
-            raise ProtocolViolation(DEVICE, "getRobotNames", f"expected a list of names, got {names!r}")
-        return [str(name) for name in names]  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]
+    async def first_robot(self) -> str:
+        """Name of the first robot. Raises `ProtocolViolation`."""
+        match await self.call("getRobotNames"):
+            case [name, *_]:
+                return str(name)
+            case other:
+                raise ProtocolViolation(DEVICE, "getRobotNames", f"expected a list of names, got {other!r}")
 
     async def pose(self) -> Pose:
         """Where the tip is. Raises `ProtocolViolation`."""
@@ -301,7 +302,7 @@ async def only_asking(host: str, port: int, framing: Framing) -> AsyncGenerator[
     controller = Controller(host, port, framing=framing)
     try:
         await open_arcs(controller)
-        [controller.robot, *_] = await controller.robot_names()
+        controller.robot = await controller.first_robot()
         yield controller
     finally:
         await controller.close()

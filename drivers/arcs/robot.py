@@ -70,8 +70,7 @@ class AuboArcs:
             version = await self._state.call("SystemInfo.getInterfaceVersionCode")
             for controller in (self._stop, self._motion):
                 await controller.open()
-            [name, *_] = await self._state.robot_names()
-            self._motion.robot = self._state.robot = self._stop.robot = name
+            self._motion.robot = self._state.robot = self._stop.robot = await self._state.first_robot()
             self._connected = True
             model = str(await self._state.ask("RobotConfig.getRobotType"))
             box = str(await self._state.ask("RobotConfig.getControlBoxType"))
