@@ -58,6 +58,7 @@ TOGETHER = {
     "tests/calibrate/test_pages.py": "pages",
     "tests/calibrate/test_calibration.py": "lens",
     "tests/model/": "model",
+    "tests/test_recipes.py::test_a_stroke_model": "model",
 }
 """What one worker runs: its first test imports, compiles or records for seconds, which the others then do without."""
 

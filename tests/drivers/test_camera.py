@@ -322,7 +322,7 @@ PART = b"--b\r\nContent-Type: image/jpeg\r\ncontent-length: %d\r\n\r\n" % len(SO
     ],
     ids=["ends", "cut off", "garbage", "trickles in"],
 )
-async def test_pushed_jpegs_are_handed_over_as_they_came_until_the_stream_ends(
+async def test_pushed_jpegs_are_handed_over_as_they_came_until_the_stream_ends_or_only_trickles(
     answer: bytes, trickle: bytes, jpegs: int
 ):
     async with serving(answer, trickle) as address:

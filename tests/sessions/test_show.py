@@ -3,16 +3,21 @@
 import json
 
 import pytest
-from typer.testing import CliRunner
 
-from brushloop.sessions.cli import app
 from brushloop.sessions.events import CaptureResult, PressResult, StepKind
 from brushloop.sessions.imports import ImportOptions
 from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.recording import mark_bad_or_good
 from brushloop.sessions.show import Summary, details, summaries
+from tests.command import brushloop
 
 PROTOCOL = '{"kind":"grid","depths_mm":[13.0,15.0],"tilts_deg":[5.0],"repeats":2}'
+
+
+@pytest.fixture(autouse=True)
+def wide(monkeypatch):
+    """No line of what is printed is broken."""
+    monkeypatch.setenv("COLUMNS", "200")
 
 
 @pytest.fixture
@@ -63,8 +68,7 @@ def test_what_is_marked_bad_is_distinguished_from_what_counts(collected):
     shown = details(collected.folder)
     assert (shown.strokes, shown.marked_bad) == (1, 1)
     assert shown.conditions == {"H 13 mm, alpha 5 deg": "0 of 2", "H 15 mm, alpha 5 deg": "1 of 2"}
-    ran = CliRunner(env={"COLUMNS": "160"}).invoke(app, ["show", str(collected.folder)])
-    assert "1 of 4 planned, and 1 marked bad" in ran.output
+    assert "1 of 4 planned, and 1 marked bad" in brushloop("sessions", "show", collected.folder).stdout
 
 
 def test_a_closed_session_and_its_file_agree(collected):
@@ -77,12 +81,12 @@ def test_a_closed_session_and_its_file_agree(collected):
 
 
 def test_the_command_prints_it_and_json_holds_all_of_it(collected):
-    ran = CliRunner(env={"COLUMNS": "160"}).invoke(app, ["show", str(collected.folder)])
-    assert ran.exit_code == 0
+    ran = brushloop("sessions", "show", collected.folder)
+    assert ran.returncode == 0
     condition, running = "H 13 mm, alpha 5 deg: 1 of 2", "press H13-a5-r02 (under way"
     for words in ("2 of 4 planned", "3 patches used", condition, running, "goat"):
-        assert words in ran.output
-    as_json = json.loads(CliRunner().invoke(app, ["show", str(collected.folder), "--json"]).output)
+        assert words in ran.stdout
+    as_json = json.loads(brushloop("sessions", "show", collected.folder, "--json").stdout)
     assert as_json["sheets"] == {"1": [0, 1, 2], "2": [0]}
 
 
@@ -105,7 +109,7 @@ def test_every_session_is_reported_in_one_line(root):
         Summary("2026-01-02-grid-02", "open", "", 1, ""),
         Summary("from-elsewhere", "imported", "imported photographs", 1, "from-elsewhere.mcap"),
     ]
-    printed = CliRunner(env={"COLUMNS": "200"}).invoke(app, ["list", str(root)]).output
+    printed = brushloop("sessions", "list", root).stdout
     assert all(row.session_id in printed and row.file in printed for row in summaries(root))
 
 
