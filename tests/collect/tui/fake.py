@@ -307,6 +307,18 @@ def shown(app: App[None]) -> str:
     return "\n".join(lines)
 
 
+async def settled(pilot: Pilot[Any], polls: int = 5) -> str:
+    """The screen once it is laid out, every worker has done its work, and a run was looked at so many times more: the
+    first poll may come before the layout has its sizes, and the parts of a screen take turns."""
+    engine = pilot.app.engine  # pyright: ignore[reportAttributeAccessIssue]
+    enough = engine.looks + polls if engine is not None else 0
+    while engine is not None and engine.looks < enough:
+        await pilot.pause(0.02)
+    await pilot.app.workers.wait_for_complete()
+    await pilot.pause()
+    return shown(pilot.app)
+
+
 @dataclass(frozen=True)
 class Watched:
     """A run on the screen, and somebody at its keyboard."""
@@ -316,13 +328,9 @@ class Watched:
     pilot: Pilot[None]
 
     async def look(self, now: Snapshot | None = None) -> str:
-        """The screen after two polls: the first may come before the layout has its sizes."""
+        """The screen, with what is to be shown from now on."""
         self.engine.now = now or self.engine.now
-        enough = self.engine.looks + 2
-        while self.engine.looks < enough:
-            await self.pilot.pause(0.02)
-        await self.pilot.pause()
-        return shown(self.app)
+        return await settled(self.pilot, polls=2)
 
     async def press(self, *keys: str) -> None:
         await self.pilot.press(*keys)

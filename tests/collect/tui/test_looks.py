@@ -23,6 +23,7 @@ from tests.collect.tui.fake import (
     app_of,
     capture,
     full_picture,
+    settled,
 )
 
 SMALL, LARGE = (80, 24), (120, 40)
@@ -41,16 +42,6 @@ def pressing(*keys: str) -> Callable[[Pilot[None]], Awaitable[None]]:
             await settled(pilot)
 
     return press
-
-
-async def settled(pilot: Pilot[None]) -> None:
-    """As many polls as all parts of the screen take turns in, once it is laid out, and every worker's work."""
-    engine = pilot.app.engine  # pyright: ignore[reportAttributeAccessIssue]
-    enough = engine.looks + 5 if engine is not None else 0
-    while engine is not None and engine.looks < enough:
-        await pilot.pause(0.02)
-    await pilot.app.workers.wait_for_complete()
-    await pilot.pause()
 
 
 @pytest.mark.parametrize(

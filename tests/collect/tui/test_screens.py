@@ -13,13 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 from textual.geometry import Region
-from textual.pilot import Pilot
 from textual.widget import Widget
 from textual.widgets import Static
 
 from brushloop.collect.engine.control import State
 from brushloop.collect.operator import Choice, Prompt
-from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.capture_screen import COLOURS, over_photograph
 from brushloop.collect.tui.pictures import CellPicture, look_for_pixels, picture_widget
 from brushloop.collect.tui.run_screen import RunScreen
@@ -32,7 +30,7 @@ from tests.collect.tui.fake import (
     app_of,
     full_picture,
     picture,
-    shown,
+    settled,
     watched,
 )
 
@@ -118,32 +116,25 @@ async def test_a_key_answers_the_question_that_is_shown_and_the_next_one_comes()
         assert isinstance(run.app.screen, RunScreen)
 
 
-async def ready(app: OperatorApp, pilot: Pilot[None]) -> str:
-    await pilot.pause()
-    await app.workers.wait_for_complete()
-    await pilot.pause()
-    return shown(app)
-
-
 async def test_enter_goes_on_with_an_open_session_and_n_asks_for_a_blank_sheet_first() -> None:
     browser = FakeBrowser()
     app = app_of(browser=browser)
     async with app.run_test(size=(80, 24)) as pilot:
-        text = await ready(app, pilot)
+        text = await settled(pilot)
         for part in ("▶ 2026-11-21-grid-02 open", "13 of 30 planned", "13 capture", "the process", "H15-a5-r01"):
             assert part in text
         await pilot.press("n")
-        assert "30 strokes on 1 sheet" in await ready(app, pilot)
+        assert "30 strokes on 1 sheet" in await settled(pilot)
         await pilot.press("n")
         assert browser.asked == []
         await pilot.press("n")
-        await ready(app, pilot)
+        await settled(pilot)
         await pilot.press("y")
-        text = await ready(app, pilot)
+        text = await settled(pilot)
         assert browser.asked == [None]
         assert "rig.toml: robot: another brushloop is driving the arm" in text
         await pilot.press("enter")
-        await ready(app, pilot)
+        await settled(pilot)
         assert browser.asked[1:] == ["2026-11-21-grid-02"]
         assert isinstance(app.engine, FakeEngine)
         assert app.engine.calls == ["start"]
@@ -155,18 +146,18 @@ async def test_other_files_can_be_typed_and_letters_of_stop_keys_too() -> None:
     browser = FakeBrowser()
     app = app_of(browser=browser)
     async with app.run_test(size=(80, 24)) as pilot:
-        await ready(app, pilot)
+        await settled(pilot)
         await pilot.press("e", "ctrl+u", *"s2.toml", "enter", "ctrl+u", "enter")
-        text = await ready(app, pilot)
+        text = await settled(pilot)
         assert "rig s2.toml   protocol protocol.toml" in text, "an emptied field leaves the file as it was"
         await pilot.press("e", *"x", "escape", *"s", "enter")
-        assert "rig s2.toml   protocol protocol.tomls" in await ready(app, pilot)
+        assert "rig s2.toml   protocol protocol.tomls" in await settled(pilot)
 
 
 async def test_no_note_is_typed_while_a_run_is_in_progress(tmp_path: Path) -> None:
     async with watched(picture(state=State.PAUSED), (120, 40)) as run:
         run.app.push_screen(review := a_review(tmp_path, run.app))
-        text = await ready(run.app, run.pilot)
+        text = await settled(run.pilot)
         for words in ("red button", "s STOP"):
             assert words in text
         assert "o Note" not in text
@@ -190,14 +181,14 @@ async def test_after_a_session_the_next_commands_run_in_the_terminal(
     monkeypatch.setattr("subprocess.run", run)
     monkeypatch.setattr("sys.stdin", io.StringIO())
     async with app.run_test(size=(120, 40)) as pilot:
-        await ready(app, pilot)
+        await settled(pilot)
         app.push_screen(a_review(Path(), app))
-        await ready(app, pilot)
+        await settled(pilot)
         await pilot.press("f")
-        assert "c  brushloop calibrate" in await ready(app, pilot)
+        assert "c  brushloop calibrate" in await settled(pilot)
         for key in ("f", "c", "t", "w"):
             await pilot.press(key)
-            await ready(app, pilot)
+            await settled(pilot)
             assert isinstance(app.screen, AskScreen), "back at the question"
         await pilot.press("escape", "escape", "d")
     folder = "2026-11-21-grid-01"
