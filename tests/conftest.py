@@ -35,7 +35,7 @@ typer.main.get_command = typer.testing._get_command = functools.cache(typer.main
 # What comes late names the load of the computer; the words that tests compare must not depend on it.
 os.getloadavg = lambda: (0.0, 0.0, 0.0)
 
-TOLERATED = ("asyncio_", "pytest_timeout", "ThreadPoolExecutor", "tqdm")
+TOLERATED = ("asyncio_", "pytest_timeout", "ThreadPoolExecutor")
 """Pools that live as long as their loop or process; nothing of ours is called that."""
 
 FIRST = (

@@ -52,6 +52,12 @@ async def test_the_hand_brings_the_true_tip_to_the_thing():
     assert lab.world.presses == []
 
 
+def test_the_cabinet_begins_with_the_tool_and_the_payload_that_somebody_left_in_it():
+    lab = lab_of(4)
+    assert lab.arcs.cabinet.tcp_offset == list(lab.facts.cabinet_tcp)
+    assert lab.arcs.cabinet.payload[0] == lab.facts.payload_kg
+
+
 def test_the_labels_tell_where_to_connect_and_nothing_that_has_to_be_measured():
     lab = lab_of(4)
     words = " ".join(lab.labels())
