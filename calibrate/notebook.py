@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,12 +21,12 @@ from brushloop.calibrate.commands import (
     AnalyseRequest,
     CalibrateRequest,
     FitRequest,
-    Printable,
     RecoverRequest,
     ValidateRequest,
 )
 from brushloop.calibrate.compare import MM_GRAY, brush_of, simulated
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
+from brushloop.calibrate.files import Written
 from brushloop.calibrate.presses import Refused, read_presses, rectified
 from brushloop.calibrate.session import Calibration, OpenSession, open_session
 from brushloop.calibrate.stroke import Prepared
@@ -269,33 +268,22 @@ def validate(*sessions: Place, **options: Any) -> ValidationOutput:
     return output
 
 
-@dataclass(frozen=True, slots=True)
-class Analysed:
-    """What calibration, fit and validation found."""
+def analyse(request: AnalyseRequest, progress: Progress = unseen) -> Written:
+    """Calibrate, fit and validate one session, from photographs to the verdict. Raises as each of these does.
 
-    calibrated: Calibrated | None
-    """None for an import, which has its own scale."""
-    fitted: Printable
-    validated: ValidationOutput
-
-    def lines(self) -> Iterator[object]:
-        """What the command prints: lines and tables of each step; the report comes last."""
-        for step in filter(None, (self.calibrated, self.fitted, self.validated)):
-            yield from step.lines()
-
-
-def analyse(request: AnalyseRequest, progress: Progress = unseen) -> Analysed:
-    """Calibrate, fit and validate one session, from photographs to the verdict. Raises as each of these does."""
+    An import has its own scale and is not calibrated.
+    """
     from brushloop.calibrate import calibrated
     from brushloop.calibrate.fit.fit import fit as fit_strokes
     from brushloop.calibrate.validate.command import validate as compare_models
 
-    session, recording, known = request.session, Recording(request.session), None
+    session, recording, said = request.session, Recording(request.session), list[object]()
     if not recording.header.source.imported:
-        known = calibrated.calibrate_session(CalibrateRequest(session), progress, recording)
-    fitted = fit_strokes(FitRequest(session), progress, recording)
+        said += calibrated.calibrate_session(CalibrateRequest(session), progress, recording).lines()
+    said += fit_strokes(FitRequest(session), progress, recording).lines()
     wanted = ValidateRequest((session,), generators=(SHIPPED_GENERATOR,))
-    return Analysed(known, fitted, compare_models(wanted, progress, [recording]))
+    validated = compare_models(wanted, progress, [recording])
+    return Written(validated.page, (*said, *validated.lines()))
 
 
 def _path(session: Place) -> Path:

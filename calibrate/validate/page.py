@@ -326,9 +326,8 @@ def _session(session: Session) -> Iterator[Point]:
         words = f"{len(session.cut)} strokes are cut by the edge of their photograph or patch"
         yield Point(False, f"{words}: their scores are too low.")
     if scale is not None:
-        width = (scale.mm_per_px_high - scale.mm_per_px_low) / scale.mm_per_px
-        words = f"scale known to ±{50 * width:.3f} %, board seen to {scale.rms_px:.2f} px."
-        yield Point(width <= WIDE_SCALE, words)
+        words = f"scale known to ±{100 * scale.relative_reach:.3f} %, board seen to {scale.rms_px:.2f} px."
+        yield Point(2.0 * scale.relative_reach <= WIDE_SCALE, words)
 
 
 def _models(report: Report) -> Iterator[Point]:
