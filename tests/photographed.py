@@ -45,12 +45,17 @@ def imported(
 
 
 def imported_presses(
-    photos: Path, out: Path, at: Sequence[tuple[float, float]], size_px: tuple[int, int], touch_px: tuple[int, int]
+    under: Path,
+    at: Sequence[tuple[float, float]],
+    size_px: tuple[int, int] = (300, 480),
+    touch_px: tuple[int, int] = (380, 150),
 ) -> Path:
-    """The session of one press of the default brush for each (H, alpha), photographed at 10 px/mm."""
+    """`under / "presses"`: the session of one press of the default brush for each (H, alpha), taken at 10 px/mm."""
+    photos = under / "photos"
+    photos.mkdir(parents=True)
     lines = ["file,depth_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
     for k, (height, tilt) in enumerate(at):
         mark = Brush(BrushSpec()).press(height, tilt, ink_load=1.0, press_seed=k)
         photograph(photos / f"{k}.png", mark, size_px, touch_px)
         lines.append(f"{k}.png,{height},{tilt},10.0,{touch_px[0]:.1f},{touch_px[1]:.1f}")
-    return imported(photos, lines, out, "press")
+    return imported(photos, lines, under / "presses", "press")

@@ -8,6 +8,7 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -71,6 +72,12 @@ def photographed(
     session.close()
     session.release()
     return folder
+
+
+def opened(name: str, path: Path, brush: str = "", calibration: Calibration | None = None) -> Any:
+    """What a report needs of an open session, without a recording."""
+    header = Header(session_id=name, source=Source.LOOPBACK, software="test", brush=brush)
+    return SimpleNamespace(header=header, recording=SimpleNamespace(path=path), sha256="ab", calibration=calibration)
 
 
 def flat_plane(size_px: tuple[int, int], mm_per_px: tuple[float, float]) -> Plane:

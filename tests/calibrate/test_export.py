@@ -26,6 +26,7 @@ from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Check, Quality, Topic, Wrench
 from tests.calibrate.simulated_rigs import collected, sheet, true_mask
+from tests.command import refused, said
 
 
 @pytest.fixture
@@ -40,8 +41,7 @@ def rows_of(table):
 
 def test_the_photographs_are_those_of_the_recording_byte_for_byte(make, closed, to):
     to.mkdir()  # an empty folder is used
-    ran = CliRunner().invoke(app, ["sessions", "export", str(closed), str(to)])
-    assert (ran.exit_code, ran.output) == (0, f"Exported into {to}\n")
+    assert said("sessions", "export", closed, to) == f"Exported into {to}"
     strokes = rows_of(to / "strokes.csv")
     assert [row["stroke_id"] for row in strokes] == ["H13-a05-r00", "H13-a05-r01"]
     assert [(to / row["file"]).read_bytes() for row in strokes] == [make.png(0), make.png(1)]
@@ -141,12 +141,11 @@ def test_names_that_a_file_system_would_refuse_become_names(make, tmp_path, to):
 def test_crops_and_masks_lie_over_the_true_marks(tmp_path: Path, to: Path) -> None:
     shot = sheet(0, 2)
     session = collected(tmp_path / "pressed", shot)
-    words = ["sessions", "export", str(session), str(to), "--crops"]
-    refused = CliRunner().invoke(app, words)
-    assert f"is not calibrated: run `brushloop calibrate {session}`" in str(refused.exception)
+    words = "sessions", "export", session, to, "--crops"
+    assert f"is not calibrated: run `brushloop calibrate {session}`" in refused(*words)
     assert not to.exists()
     calibrate_session(CalibrateRequest(session))
-    assert CliRunner().invoke(app, words).exit_code == 0
+    said(*words)
     rows = rows_of(to / "strokes.csv")
     assert [row["stroke_id"] for row in rows] == ["s0", "s1"]
     for row, anchor in zip(rows, shot.anchors_mm, strict=True):

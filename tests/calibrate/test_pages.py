@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import re
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -21,9 +20,9 @@ from brushloop.calibrate.report import chart_uri, picture_grid, printable, sourc
 from brushloop.calibrate.writing import Figure, Plan, PlannedBy, as_points
 from brushloop.calibrate.writing.compare import Character, WritingComparison, write_written
 from brushloop.sessions.messages import decode_gray
-from brushloop.sessions.records import Header, Source
+from brushloop.sessions.records import Source
 from tests.browser import BROWSER, content_widths_px
-from tests.calibrate.given import CALIBRATION, loop_record, pair_scores, photographed
+from tests.calibrate.given import CALIBRATION, loop_record, opened, pair_scores, photographed
 from tests.photographed import imported_presses
 
 SPEC = BoardSpec(squares=(9, 7), square_mm=20.0, marker_mm=15.0, dictionary="DICT_5X5_100", origin_mm=(0.0, 0.0))
@@ -54,9 +53,7 @@ def run(*arguments: object) -> str:
 def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """A page of every command but `train` (tests/model/test_generator.py), by the command's name."""
     folder = tmp_path_factory.mktemp("pages")
-    (folder / "photos").mkdir()
-    conditions = [(11.0, 0.0), (15.0, 0.0)]
-    presses = imported_presses(folder / "photos", folder / "presses", conditions, (300, 480), (380, 150))
+    presses = imported_presses(folder, [(11.0, 0.0), (15.0, 0.0)])
     session = photographed(folder / "2026-03-02-board-01", SPEC, [board()], sheet_mm=(100.0, 80.0))
     return {
         "calibrate": run("calibrate", session),
@@ -70,17 +67,9 @@ def _loop(folder: Path) -> str:
     """The page of presses of three conditions, of which one was not pressed again."""
     scores = pair_scores()
     pairs = [Pair(press, press, press.images) for press in scores.presses]
-    original, again = (
-        SimpleNamespace(
-            header=Header(session_id=name, source=Source.LOOPBACK, software="test", brush=TWIN),
-            recording=SimpleNamespace(path=folder),
-            sha256="ab",
-            calibration=None,
-        )
-        for name in ("grid", "replay")
-    )
+    sessions = opened("grid", folder, TWIN), opened("replay", folder, TWIN)
     record = loop_record("grid", "ab", refused=(("a-r02", "was not pressed again"), ("x<u>", "is blank")))
-    return write_loop(record, (original, again), pairs, scores, folder / "loop").read_text(encoding="utf-8")
+    return write_loop(record, sessions, pairs, scores, folder / "loop").read_text(encoding="utf-8")
 
 
 def _written(folder: Path) -> str:
@@ -91,12 +80,7 @@ def _written(folder: Path) -> str:
     strokes = [np.array([[1.0, 2.0, 3.0, 4.0, 0.0], [5.0, 6.0, 7.0, 8.0, 9.0]])]
     figure = Figure(name="字", source="a font", commanded=as_points(strokes), wanted=cross, simulated=cross)
     character = Character(figure, {"zi-r01": ink, "zi-r02": ink})
-    session = SimpleNamespace(
-        header=Header(session_id="write-01", source=Source.LOOPBACK, software="test", brush=TWIN),
-        recording=SimpleNamespace(path=folder),
-        sha256="ab",
-        calibration=CALIBRATION,
-    )
+    session = opened("write-01", folder, TWIN, CALIBRATION)
     plan = Plan(model="CCD-BSM", planned_by=PlannedBy(), cell_mm=60.0, software="test", figures=(figure,))
     written = WritingComparison(session, plan, [character])
     return write_written(written, folder / "written", "brushloop write").read_text(encoding="utf-8")
@@ -141,14 +125,11 @@ def test_a_page_of_a_twin_says_whose_twin_on_every_figure(pages: dict[str, str])
     assert "x&lt;u&gt;: is blank" in pages["loop"]
 
 
-def test_the_remark_of_a_described_brush_is_part_of_the_label() -> None:
+def test_the_remark_of_a_described_brush_is_part_of_the_label_and_that_of_any_other_is_its_source() -> None:
     remark = "brush made to agree with the paper's Table 2: no evidence for the model"
     assert source_label(Source.LOOPBACK, [MADE, MADE]) == f"loopback rig, {remark}"
     assert source_label(Source.LOOPBACK, [f"{MADE}, R = 6 mm, L = 48 mm"]) == f"loopback rig, {remark}"
     assert source_note(Source.LOOPBACK, MADE).endswith(f"not a result on paper, {remark}")
-
-
-def test_the_label_of_any_other_brush_is_its_source() -> None:
     assert source_label(Source.LOOPBACK, ["simulated bristle bundle, seed 1"]) == "loopback rig"
     assert source_label(Source.REAL, ["Langhao brush (12 mm)"]) == "real capture"
     assert source_note(Source.REAL, "Langhao brush (12 mm)") == source_note(Source.REAL)

@@ -43,8 +43,7 @@ print([float(press.coverage.sum()) for press in read_presses(open_session(Path(s
 
 @pytest.fixture
 def session(tmp_path: Path) -> Path:
-    (tmp_path / "photos").mkdir()
-    return imported_presses(tmp_path / "photos", tmp_path / "presses", CONDITIONS, (300, 480), (380, 150))
+    return imported_presses(tmp_path, CONDITIONS)
 
 
 @pytest.fixture
@@ -162,8 +161,7 @@ def test_a_press_that_is_marked_bad_is_refused_and_comes_back_without_work(sessi
 
 
 def test_a_press_is_cut_out_of_its_page_before_the_page_is_resampled(session: Path, tmp_path: Path) -> None:
-    (tmp_path / "pages").mkdir()
-    page = imported_presses(tmp_path / "pages", tmp_path / "page", CONDITIONS[:1], (1500, 2000), (1380, 700))
+    page = imported_presses(tmp_path / "page", CONDITIONS[:1], (1500, 2000), (1380, 700))
     [whole], [near, *_] = read(page), read(session)
     assert whole.measured.area_mm2 == pytest.approx(near.measured.area_mm2, rel=0.01)
     assert np.abs(whole.coverage - near.coverage).mean() < 0.001

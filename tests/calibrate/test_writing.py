@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -61,8 +60,7 @@ from brushloop.model.characters.plan import (
 from brushloop.model.drag import NAMES, START, Drawings, Footprint, inked
 from brushloop.model.similarity import csim, ssim
 from brushloop.model.strokes import stroke_model
-from brushloop.sessions.records import Header, Source
-from tests.calibrate.given import CALIBRATION, written_record
+from tests.calibrate.given import CALIBRATION, opened, written_record
 from tests.command import brushloop, refused
 
 MODEL = stroke_model("ccd-bsm", Brush())
@@ -252,10 +250,7 @@ def session(plan: Plan, name: str = "bar", ink: np.ndarray | None = None) -> Wri
     seen = came_out(plan) if ink is None else ink
     figure = plan.figures[0].model_copy(update={"name": name})
     character = Character(figure, {f"{name}-r01": as_ink(seen)})
-    header = Header(session_id="s", source=Source.LOOPBACK, software="test")
-    recording = SimpleNamespace(path=Path("s.mcap"))
-    opened = SimpleNamespace(header=header, recording=recording, sha256="", calibration=CALIBRATION)
-    return WritingComparison(opened, plan, [character])
+    return WritingComparison(opened("s", Path("s.mcap"), calibration=CALIBRATION), plan, [character])
 
 
 @pytest.fixture(scope="module")

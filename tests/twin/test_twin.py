@@ -181,8 +181,7 @@ HELD_OUT = Stat(
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("sessions") / "presses"
-    return imported_presses(tmp_path_factory.mktemp("photos"), out, PRESSED, (200, 320), (250, 100))
+    return imported_presses(tmp_path_factory.mktemp("sessions"), PRESSED, (200, 320), (250, 100))
 
 
 @contextmanager

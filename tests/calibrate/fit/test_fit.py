@@ -181,8 +181,7 @@ def test_the_ends_of_a_brush_move_by_its_residual() -> None:
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("sessions") / "presses"
-    return imported_presses(tmp_path_factory.mktemp("photos"), out, CONDITIONS, (300, 480), (380, 150))
+    return imported_presses(tmp_path_factory.mktemp("sessions"), CONDITIONS)
 
 
 def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> None:
@@ -224,8 +223,6 @@ def test_one_command_leads_from_photographs_to_the_report(session: Path) -> None
 
 
 def test_a_single_condition_gives_neither_intervals_nor_held_out_scores(tmp_path: Path) -> None:
-    (tmp_path / "photos").mkdir()
-    pressed = imported_presses(tmp_path / "photos", tmp_path / "presses", CONDITIONS[:1], (300, 480), (380, 150))
-    fitted = fit_session(FitRequest(pressed))
+    fitted = fit_session(FitRequest(imported_presses(tmp_path, CONDITIONS[:1])))
     assert fitted.held_out == []
     assert fitted.sizes == {}
