@@ -82,13 +82,21 @@ async def test_escape_goes_back_and_q_leaves(keys: list[str], raised: type[Excep
         app.steps.join()
 
 
-@pytest.mark.parametrize(("key", "work"), [("s", "move"), ("ctrl+c", "move"), ("s", "run")])
-async def test_a_stop_key_stops_what_is_at_work_and_ends_the_screen(key: str, work: str) -> None:
+@pytest.mark.parametrize(
+    ("key", "work", "leaving"),
+    [("s", "move", False), ("ctrl+c", "move", False), ("s", "run", False), ("s", "move", True)],
+)
+async def test_a_stop_key_stops_what_is_at_work_and_ends_the_screen(key: str, work: str, leaving: bool) -> None:
+    """Also over the question that leaving asks meanwhile."""
     asking = Asking("choose", work)
     async with running(asking) as (app, pilot):
         await pilot.press("y")
         await seen(app, pilot, lambda: asking.at_work and app.first_day.prompt is None)
         assert re.search(r"s: software stop; red button: emergency stop   at work, \d+ s", shown(app))
+        if leaving:
+            await pilot.press("q")
+            await pilot.pause()
+            assert isinstance(app.screen, AskScreen)
         await pilot.press(key)
         await until(lambda: not app.is_running, "the end of the screen")
     assert asking.stopped_arm
@@ -112,15 +120,3 @@ def test_a_second_stop_key_works_at_once() -> None:
     steps.stop()
     with pytest.raises(CollectAborted):
         steps.join()
-
-
-async def test_leaving_while_something_is_at_work_asks_and_the_stop_key_works_over_it() -> None:
-    asking = Asking("choose", "move")
-    async with running(asking) as (app, pilot):
-        await pilot.press("y")
-        await seen(app, pilot, lambda: asking.at_work and app.first_day.prompt is None)
-        await pilot.press("q")
-        await pilot.pause()
-        assert isinstance(app.screen, AskScreen)
-        await pilot.press("s")
-        await seen(app, pilot, lambda: asking.stopped_arm)
