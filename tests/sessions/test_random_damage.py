@@ -50,10 +50,6 @@ class Whole:
     chunks: dict[str, list] = field(default_factory=dict)
     """File -> (first byte, byte behind the last, messages) of each chunk."""
 
-    @property
-    def lines(self):
-        return (self.folder / JOURNAL_NAME).read_bytes().splitlines(keepends=True)
-
 
 @dataclass
 class Damage:
@@ -218,14 +214,13 @@ def edited(line, chosen):
 
 
 def may_be_sound(whole, before):
-    """Where nothing is damaged: all as it was, or a journal that ends earlier, as after a kill, and files for it."""
-    if {name: data for name, data in before.items() if data is not None} == contents(whole.folder):
-        return True
+    """Where nothing is damaged: all as it was, but that the journal may end earlier, as after a kill."""
+    files = contents(whole.folder)
     if whole.lone:
-        return False
-    journal = b"".join(whole.lines)
-    others = {name for name, data in contents(whole.folder).items() if name != JOURNAL_NAME and before[name] != data}
-    return not others and journal.startswith(before[JOURNAL_NAME])
+        return before == files
+    journal = files.pop(JOURNAL_NAME)
+    steps = {name: data for name, data in before.items() if name != JOURNAL_NAME}
+    return steps == files and journal.startswith(before[JOURNAL_NAME])
 
 
 def read_of(path):
