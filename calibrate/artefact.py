@@ -9,7 +9,7 @@ import hashlib
 import re
 from importlib.metadata import version
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -48,6 +48,24 @@ class Artefact(Frozen):
     def _canonical(self) -> bytes:
         return self.model_dump_json(indent=2).encode() + b"\n"
 
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Read an artefact of this kind.
+
+        Raises `InputError` if there is none, and `CalibrationError` for any other file or version, or an edited one.
+        """
+        data = read_bounded(path)
+        if not NAME.fullmatch(path.name.encode()):
+            what = f"is not a result of brushloop, whose name is {HASH_CHARS} hexadecimal digits and .json"
+            raise CalibrationError(str(path), what)
+        try:
+            artefact = cls.model_validate_json(data)
+        except ValidationError as error:
+            raise invalid(str(path), error) from None
+        if hashlib.sha256(data).hexdigest()[:HASH_CHARS] != path.stem:
+            raise CalibrationError(str(path), "was edited: its name is not the hash of its contents")
+        return artefact
+
     def save(self, folder: Path) -> Path:
         """Write `<digest>.json` into `folder`; an existing one has the same contents and is kept. Raises OSError."""
         folder.mkdir(parents=True, exist_ok=True)
@@ -81,24 +99,6 @@ class FittedValue(Frozen):
         """The number and its interval, as tables show it."""
         interval = "not determined" if self.low is None else f"{self.low:.2f} to {self.high:.2f}"
         return f"{self.value:.2f} ({interval})"
-
-
-A = TypeVar("A", bound=Artefact)
-
-
-def load_artefact(path: Path, kind: type[A]) -> A:
-    """Read an artefact of this kind. Raises `CalibrationError` for any other file or version, or an edited one."""
-    data = read_bounded(path)
-    if not NAME.fullmatch(path.name.encode()):
-        what = f"is not a result of brushloop, whose name is {HASH_CHARS} hexadecimal digits and .json"
-        raise CalibrationError(str(path), what)
-    try:
-        artefact = kind.model_validate_json(data)
-    except ValidationError as error:
-        raise invalid(str(path), error) from None
-    if hashlib.sha256(data).hexdigest()[:HASH_CHARS] != path.stem:
-        raise CalibrationError(str(path), "was edited: its name is not the hash of its contents")
-    return artefact
 
 
 def put_to_use(artefact: Artefact, session: Path, folder: str = FOLDER) -> Path:

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from pydantic import AliasPath, BaseModel, Field, ValidationError
 
-from brushloop.calibrate.artefact import Artefact, current, load_artefact, made_by
+from brushloop.calibrate.artefact import Artefact, current, made_by
 from brushloop.calibrate.board.lens import Lens
 from brushloop.calibrate.board.pix2len import Plane
 from brushloop.calibrate.board.spec import BoardSpec
@@ -92,7 +92,7 @@ def open_session(place: Path | Recording, kind: Kind | None = None) -> OpenSessi
         used = current(folder)
         if used is None:
             raise CalibrationError(str(recording.path), f"is not calibrated: run `brushloop calibrate {folder}`")
-        calibration = load_artefact(used, Calibration)
+        calibration = Calibration.read(used)
         if calibration.recording_sha256 != sha256:
             problem = f"belongs to another recording ({calibration.session_id}): `brushloop calibrate` makes its own"
             raise CalibrationError(str(used), problem)

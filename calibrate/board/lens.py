@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.artefact import Artefact, Frozen, load_artefact, made_by
+from brushloop.calibrate.artefact import Artefact, Frozen, made_by
 from brushloop.calibrate.board.spec import BoardView
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 
@@ -182,7 +182,7 @@ class LensFile(Artefact):
 
 def read_lens(path: Path) -> Lens:
     """Read a lens file written by `camera intrinsics`. Raises `CalibrationError`."""
-    file = load_artefact(path, LensFile)
+    file = LensFile.read(path)
     return file.lens.model_copy(update={"source": f"lens file {file.digest}"})
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from brushloop.calibrate.artefact import load_artefact, made_by, put_to_use
+from brushloop.calibrate.artefact import made_by, put_to_use
 from brushloop.calibrate.commands import FitRequest
 from brushloop.calibrate.drags import Drags, read_drags
 from brushloop.calibrate.drags.fit import (
@@ -131,7 +131,7 @@ def validate_drags(session: Path, fit: Path | None, progress: Progress = unseen)
 
     Raises `CalibrationError`, also for a file that is no fit of drags.
     """
-    artefact = None if fit is None else load_artefact(fit, DragArtefact)
+    artefact = None if fit is None else DragArtefact.read(fit)
     drags = read_drags(session, progress)
     if artefact is None:
         return DragValidation(drags, None, [])
@@ -264,7 +264,7 @@ def fit_session(request: FitRequest, progress: Progress = unseen) -> Written:
     """Fit the drags of a session, or adapt a known brush to them, and put the fit to use. Raises `CalibrationError`."""
     if request.strokes is not None and request.prior is None:
         raise CalibrationError("--strokes", "needs --prior, the fit that is adapted to so many strokes")
-    before = None if request.prior is None else load_artefact(request.prior, DragArtefact)
+    before = None if request.prior is None else DragArtefact.read(request.prior)
     drags = read_drags(request.session, progress)
     if before is None:
         artefact = fit_drags(drags, progress)

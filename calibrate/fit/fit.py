@@ -17,7 +17,7 @@ from typing import Any, Self
 import numpy as np
 from pydantic import model_validator
 
-from brushloop.calibrate.artefact import FITS, FittedValue, SessionFit, load_artefact, made_by, put_to_use
+from brushloop.calibrate.artefact import FITS, FittedValue, SessionFit, made_by, put_to_use
 from brushloop.calibrate.commands import FitRequest
 from brushloop.calibrate.compare import MM_PER_PX, SHOWN_MM, SHOWN_ROWS, brush_of
 from brushloop.calibrate.errors import CalibrationError
@@ -84,7 +84,7 @@ class BrushFit(SessionFit):
         """
         if fit is None:
             return stroke_model("ccd-bsm", brush_of(header)), None
-        artefact = load_artefact(fit, cls)
+        artefact = cls.read(fit)
         return fitted_model(artefact.press(), f"CCD-BSM fitted on {artefact.session_id}"), artefact
 
     @model_validator(mode="after")

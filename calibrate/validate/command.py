@@ -19,7 +19,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 from rich.table import Table
 
-from brushloop.calibrate.artefact import FITS, current, load_artefact
+from brushloop.calibrate.artefact import FITS, current
 from brushloop.calibrate.commands import DiffRequest, ValidateRequest
 from brushloop.calibrate.drags.report import DragValidation, validate_drags, write_drags
 from brushloop.calibrate.drags.report import summary as drag_summary
@@ -148,7 +148,7 @@ def open_session(place: Path | Recording, fit: Path | None = None) -> FittedSess
         raise CalibrationError(str(path), "mixes presses and drags; validate them as two sessions")
     # A fit of drags is read with the strokes that it predicts.
     used = None if session.strokes[0].kind == "drag" else fit or current(path.parent, FITS)
-    brush = None if used is None else load_artefact(used, BrushFit)
+    brush = None if used is None else BrushFit.read(used)
     return FittedSession(session.recording, sha256, session.strokes, session.calibration, session.store, brush)
 
 

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import Field, PlainSerializer, PlainValidator, ValidationError, model_validator
 
-from brushloop.calibrate.artefact import Frozen, SessionFit, load_artefact, made_by
+from brushloop.calibrate.artefact import Frozen, SessionFit, made_by
 from brushloop.calibrate.commands import PlanRequest
 from brushloop.calibrate.compare import SIZE_PX, Image
 from brushloop.calibrate.errors import CalibrationError, invalid
@@ -240,7 +240,7 @@ def plan(request: PlanRequest, _progress: Progress = unseen) -> Written:
     Raises `CalibrationError` that names option, or file and field.
     """
     check_writable(request.out)
-    fitted = load_artefact(request.footprint, FootprintArtefact) if request.footprint is not None else None
+    fitted = FootprintArtefact.read(request.footprint) if request.footprint is not None else None
     limits = {name: getattr(request, name) for name in PlannedBy.model_fields if name != "footprint"}
     by = PlannedBy(**limits, footprint=None if fitted is None else fitted.footprint().values)
     low, high = by.tilt_range_deg

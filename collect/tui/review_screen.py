@@ -19,7 +19,7 @@ from textual.content import Content
 from textual.screen import Screen
 from textual.widgets import Footer, OptionList
 
-from brushloop.calibrate.artefact import FITS, current, load_artefact
+from brushloop.calibrate.artefact import FITS, current
 from brushloop.calibrate.board.pix2len import Plane, see_board
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.fit import BrushFit
@@ -151,7 +151,7 @@ class Review:
         try:
             if (path := current(self.folder, FITS)) is None:
                 return pictures, "no fit yet: run `brushloop fit`"
-            fit = load_artefact(path, BrushFit)
+            fit = BrushFit.read(path)
         except InputError as error:
             return pictures, str(error)
         pictures = replace(pictures, model=mark_of(fit.press(), capture.press.condition))

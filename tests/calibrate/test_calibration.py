@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from brushloop.calibrate.artefact import HASH_CHARS, current, load_artefact, put_to_use
+from brushloop.calibrate.artefact import HASH_CHARS, current, put_to_use
 from brushloop.calibrate.board.lens import FITTED, read_lens
 from brushloop.calibrate.board.pix2len import see_board
 from brushloop.calibrate.calibrated import calibrate_session
@@ -58,7 +58,7 @@ def test_half_a_board_is_flagged_and_a_mirrored_one_is_refused(tmp_path: Path, b
         assert ("warning: only" in made.lines()[0]) is warned
         assert any("partly hidden" in flag for flag in made.calibration.flags) is warned
         assert f"lens: {FITTED}" in made.lines()
-        assert load_artefact(made.path, Calibration) == made.calibration
+        assert Calibration.read(made.path) == made.calibration
     session = photographed(tmp_path / "mirrored", SPEC, [np.ascontiguousarray(board[:, ::-1])])
     with pytest.raises(CalibrationError, match="is mirrored"):
         calibrate_session(CalibrateRequest(session))
@@ -114,11 +114,11 @@ def artefact(rms_px: float) -> Calibration:
 
 def test_an_artefact_is_named_after_its_contents(tmp_path: Path) -> None:
     path = CALIBRATION.save(tmp_path)
-    assert load_artefact(path, Calibration) == CALIBRATION
+    assert Calibration.read(path) == CALIBRATION
     assert [p.name for p in tmp_path.iterdir()] == [f"{CALIBRATION.digest}.json"]
     path.write_text(path.read_text().replace("loopback rig", "real capture"))
     with pytest.raises(CalibrationError, match="was edited"):
-        load_artefact(path, Calibration)
+        Calibration.read(path)
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ def test_what_is_no_artefact_is_refused_in_one_line(tmp_path: Path, text: str, m
     path = tmp_path / f"{hashlib.sha256(text.encode()).hexdigest()[:HASH_CHARS]}.json"
     path.write_text(text)
     with pytest.raises(InputError, match=re.escape(message)) as refused:
-        load_artefact(path, Calibration)
+        Calibration.read(path)
     assert "\n" not in str(refused.value)
 
 
@@ -254,7 +254,7 @@ def test_a_bent_session_is_refused_without_a_lens_file_which_makes_scale_anchors
     assert f"lens: lens file {lens.stem}" in said("calibrate", session, "--lens", lens)
     path = current(session)
     assert path is not None
-    made = load_artefact(path, Calibration)
+    made = Calibration.read(path)
     holds(made, shot)
     assert made.lens.source == f"lens file {lens.stem}"
     assert made.lens.distortion[0] == pytest.approx(CAMERAS[BARREL].k1, abs=0.005)

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from brushloop.calibrate.artefact import current, load_artefact
+from brushloop.calibrate.artefact import current
 from brushloop.calibrate.drags import MM_PER_PX, Drag, Drags, along_axis, commanded_path, defects, read_drags
 from brushloop.calibrate.drags.fit import (
     FOLDER,
@@ -81,7 +81,7 @@ def test_dragged_strokes_are_fitted_and_written(session: Path, fitted: tuple[Pat
     path, output = fitted
     for words in ("bristle lag alone", "leash_mm", "not determined", "no depth at the ends"):
         assert words in output
-    fit = load_artefact(path, DragArtefact)
+    fit = DragArtefact.read(path)
     assert len(fit.fitted_strokes) == 6
     assert fit.held_out.keys() == {PREDICTED, LAG}
     assert all(csim > 80.0 for csim, _ in fit.held_out.values())
@@ -108,16 +108,16 @@ def test_another_session_is_predicted_stroke_by_stroke(session: Path, fitted: tu
 
 
 def test_a_known_brush_is_adapted_to_few_strokes(session: Path, fitted: tuple[Path, str]) -> None:
-    before = load_artefact(fitted[0], DragArtefact)
+    before = DragArtefact.read(fitted[0])
     options = ("--prior", str(fitted[0]), "--strokes")
-    adapted = load_artefact(fit_command(session, *options, "2")[0], DragArtefact)
+    adapted = DragArtefact.read(fit_command(session, *options, "2")[0])
     assert (adapted.prior, len(adapted.fitted_strokes)) == (before.digest, 2)
     assert adapted.parameters["settle_mm"] == before.parameters["settle_mm"]
     assert adapted.refitted[:2] == ("half_mm", "half_per_mm")
     assert adapted.kept is None  # what the lag missed belongs to the other session
     path, output = fit_command(session, *options, "1")
     assert "drift_x_mm" in output
-    one = load_artefact(path, DragArtefact)
+    one = DragArtefact.read(path)
     assert one.parameters["drift_x_mm"].low is None  # a single stroke has no interval, not one of width zero
     assert "allowed 1 to 6" in refused("fit", session, *options, "7")
 
@@ -125,13 +125,13 @@ def test_a_known_brush_is_adapted_to_few_strokes(session: Path, fitted: tuple[Pa
 def test_an_edited_file_hostile_ink_and_presses_are_refused_with_one_line(
     session: Path, fitted: tuple[Path, str], tmp_path: Path
 ) -> None:
-    fit = load_artefact(fitted[0], DragArtefact)
+    fit = DragArtefact.read(fitted[0])
     assert fit.kept is not None
     for old, new, words in (('"leash_mm"', '"leash_m"', "leash_mm"), (fit.kept.ink, "aGVsbG8=", "ink cannot be read")):
         edited = tmp_path / fitted[0].name
         edited.write_text(fitted[0].read_text().replace(old, new))
         with pytest.raises(CalibrationError, match=words):
-            load_artefact(edited, DragArtefact)
+            DragArtefact.read(edited)
     assert "holds drags" in refused("recover", session)
 
 

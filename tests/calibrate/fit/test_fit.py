@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from brushloop.__main__ import app
-from brushloop.calibrate.artefact import FITS, current, load_artefact
+from brushloop.calibrate.artefact import FITS, current
 from brushloop.calibrate.commands import FitRequest
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.descent import KnownBrush, draw, fit_presses, learned, of_brushes, regress, spreads
@@ -195,7 +195,7 @@ def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> Non
     assert not any(name in said for name in NAMES), "a parameter alone says nothing about another brush"
     path = current(session, FITS)
     assert path is not None
-    fit = load_artefact(path, BrushFit)
+    fit = BrushFit.read(path)
     assert fit.strokes == 5
     assert set(fit.cells) == set(CONDITIONS)
     assert fit.csim_percent["fitted"] > fit.csim_percent["uncalibrated"] + 3.0
