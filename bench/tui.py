@@ -22,7 +22,7 @@ import numpy as np
 from bench.harness import ROOT, BenchError, Result, at_most, machine, rounds_of, tell
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.live import Telemetry
-from brushloop.collect.engine.snapshot import CellCount, Picture, Snapshot
+from brushloop.collect.engine.snapshot import ConditionCount, Picture, Snapshot
 from brushloop.collect.tui.app import OperatorApp
 from brushloop.drivers.devices import ForceSample, Stamp
 from brushloop.sessions.records import Condition
@@ -92,7 +92,7 @@ class BusyEngine:
             strokes_done=13,
             strokes_planned=150,
             grid=tuple(
-                CellCount(Condition(float(h), float(a)), 3, 10) for h in (11, 13, 15, 17, 20) for a in (0, 5, 10)
+                ConditionCount(Condition(float(h), float(a)), 3, 10) for h in (11, 13, 15, 17, 20) for a in (0, 5, 10)
             ),
             voids=0,
             elapsed_s=now - self._began,

@@ -37,7 +37,7 @@ REFRESH_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class CellCount:
+class ConditionCount:
     """Strokes of one condition."""
 
     condition: Condition
@@ -125,7 +125,7 @@ class Snapshot:
     """What is being done, in words."""
     strokes_done: int = 0
     strokes_planned: int = 0
-    grid: tuple[CellCount, ...] = ()
+    grid: tuple[ConditionCount, ...] = ()
     voids: int = 0
     """Attempts that were cut short."""
     elapsed_s: float = 0.0
@@ -317,14 +317,14 @@ class Progress:
 
     def _grid(
         self, kept: Iterable[Press], bad: Iterable[Press], left_out: Iterable[Press], *, at_work: bool
-    ) -> tuple[CellCount, ...]:
+    ) -> tuple[ConditionCount, ...]:
         """The strokes of each condition. `at_work`: the first of those left is being made or photographed."""
         counts = [Counter(press.condition for press in presses) for presses in (kept, bad, left_out)]
         strokes = iter(self.left)
         current = next(strokes, None) if at_work else None
         following = next(strokes, None)
         return tuple(
-            CellCount(
+            ConditionCount(
                 asked,
                 counts[0][asked],
                 planned,

@@ -19,7 +19,7 @@ from textual.widgets import DataTable, Footer
 
 from brushloop.collect.engine.control import FINAL, State
 from brushloop.collect.engine.snapshot import (
-    CellCount,
+    ConditionCount,
     Mark,
     SheetMap,
     Snapshot,
@@ -361,29 +361,29 @@ def spark(values_n: Sequence[float]) -> str:
     return "".join(EIGHTHS[math.ceil(8 * max(value, 0.0) / full_n)] for value in values_n)
 
 
-def fill_grid(table: DataTable[Text], cells: tuple[CellCount, ...]) -> None:
+def fill_grid(table: DataTable[Text], grid: tuple[ConditionCount, ...]) -> None:
     """Done and planned strokes, a row for each tilt and a column for each depth, with a sign as well as a colour."""
-    counts = {cell.condition: cell for cell in cells}
-    depths_mm = sorted({cell.condition.depth_mm for cell in cells})
+    counts = {count.condition: count for count in grid}
+    depths_mm = sorted({condition.depth_mm for condition in counts})
     table.clear(columns=True)
     table.add_columns(Text("α \\ H"), *(Text(f"{depth_mm:g} mm") for depth_mm in depths_mm))
-    for tilt_deg in sorted({cell.condition.tilt_deg for cell in cells}):
-        row = (cell_text(counts.get(Condition(depth_mm, tilt_deg))) for depth_mm in depths_mm)
+    for tilt_deg in sorted({condition.tilt_deg for condition in counts}):
+        row = (count_text(counts.get(Condition(depth_mm, tilt_deg))) for depth_mm in depths_mm)
         table.add_row(Text(f"{tilt_deg:g}°", "bold"), *row)
 
 
-def cell_text(cell: CellCount | None) -> Text:
+def count_text(count: ConditionCount | None) -> Text:
     """`1/2 ▶`: strokes done and planned, and the sign of the most important state."""
-    if cell is None:
+    if count is None:
         return Text("-", "dim")
-    sign = "›" if cell.next else "!" if cell.bad else ""
-    if cell.done >= cell.planned:
-        sign = "!" if cell.bad else "✓"
-    if cell.left_out:
+    sign = "›" if count.next else "!" if count.bad else ""
+    if count.done >= count.planned:
+        sign = "!" if count.bad else "✓"
+    if count.left_out:
         sign = "×"
-    if cell.now:
+    if count.now:
         sign = "▶"
-    return Text(f"{cell.done}/{cell.planned} {sign}", "" if cell.done and not sign else GRID_STYLES[sign])
+    return Text(f"{count.done}/{count.planned} {sign}", "" if count.done and not sign else GRID_STYLES[sign])
 
 
 def sheet_content(sheet: SheetMap) -> Content:

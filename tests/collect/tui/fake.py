@@ -26,7 +26,7 @@ from brushloop.collect.commission.visit import Visit, choice_of
 from brushloop.collect.engine.capture import mark_of
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.engine import Engine
-from brushloop.collect.engine.snapshot import CellCount, LastCapture, Mark, Picture, SheetMap, Snapshot
+from brushloop.collect.engine.snapshot import ConditionCount, LastCapture, Mark, Picture, SheetMap, Snapshot
 from brushloop.collect.errors import CollectAborted, ConfigError
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
 from brushloop.collect.photograph.checks import Verdict
@@ -48,12 +48,12 @@ ERROR = (
 )
 
 
-def grid_of(done: int) -> list[CellCount]:
+def grid_of(done: int) -> list[ConditionCount]:
     conditions = [Condition(h, a) for h in HEIGHTS_MM for a in TILTS_DEG]
-    return [CellCount(asked, min(max(done - 2 * n, 0), 2), 2) for n, asked in enumerate(conditions)]
+    return [ConditionCount(asked, min(max(done - 2 * n, 0), 2), 2) for n, asked in enumerate(conditions)]
 
 
-def marked_grid() -> tuple[CellCount, ...]:
+def marked_grid() -> tuple[ConditionCount, ...]:
     """Every sign once: a bad take, one left out, one now, one next; the more important of two."""
     cells = grid_of(13)
     cells[1] = replace(cells[1], bad=2)
