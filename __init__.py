@@ -11,7 +11,7 @@ TYPE_CHECKING = False  # `typing` alone takes a third of the time that this impo
 if TYPE_CHECKING:
     from brushloop.calibrate.calibrated import Calibrated
     from brushloop.calibrate.errors import CalibrationError, CaptureRefused
-    from brushloop.calibrate.fit.fit import BrushFit
+    from brushloop.calibrate.fit.command import BrushFit
     from brushloop.calibrate.notebook import (
         RecordedPress,
         Session,
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 _NAMES = {
     "brushloop.calibrate.calibrated": ("Calibrated",),
     "brushloop.calibrate.errors": ("CalibrationError", "CaptureRefused"),
-    "brushloop.calibrate.fit.fit": ("BrushFit",),
+    "brushloop.calibrate.fit.command": ("BrushFit",),
     "brushloop.calibrate.notebook": (
         *("RecordedPress", "Session", "calibrate_session", "fit", "predict", "recover", "validate"),
     ),

@@ -110,7 +110,7 @@ COMMANDS: tuple[tuple[str, str, type[Any], str], ...] = (
     ("calibrate", RESEARCH, commands.CalibrateRequest, "calibrate.calibrated:calibrate_session"),
     ("camera board", "", commands.PrintRequest, "calibrate.board.spec:print_board"),
     ("camera intrinsics", "", commands.LensRequest, "calibrate.calibrated:calibrate_lens"),
-    ("fit", RESEARCH, commands.FitRequest, "calibrate.fit.fit:fit"),
+    ("fit", RESEARCH, commands.FitRequest, "calibrate.fit.command:fit"),
     ("recover", RESEARCH, commands.RecoverRequest, "calibrate.recover:recover"),
     ("repress compare", "", commands.CompareLoopRequest, "calibrate.loop:compare"),
     ("sessions export", "", commands.ExportRequest, "calibrate.export:export"),

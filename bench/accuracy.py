@@ -35,7 +35,7 @@ from bench.brushes import (
 from bench.harness import BenchError, Result, at_most, brushloop, machine, rounds_of
 from bench.prior import BRISTLE
 from brushloop.calibrate.compare import TABLE_2
-from brushloop.calibrate.fit.descent import Prior, fit_presses, learned
+from brushloop.calibrate.fit.fit import Prior, fit_presses, learned
 from brushloop.calibrate.fit.heldout import BEZIER, FITTED, Refit, held_out_scores, leave_condition_out, refit
 from brushloop.calibrate.loop import LoopRecord
 from brushloop.calibrate.presses import read_for_fit
@@ -83,7 +83,7 @@ def few(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     draws of these presses, over all other conditions."""
     draws, results = rounds_of(n, 3), list[Result]()
     for name, presses, prior in _pressed(None, seed):
-        cells = presses.cells
+        cells = presses.conditions
         for size, goal in FEW_POINTS.items():
             gaps: list[float] = []
             for draw in range(draws):
@@ -218,7 +218,7 @@ def twin(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     well it repeats itself, and for frozen brushes the share of the intervals that hold the constant."""
     results: list[Result] = []
     for name, every, _ in _pressed(n, seed):
-        presses = every.pick([k for numbers in every.cells.values() for k in numbers[:TWIN_REPEATS]])
+        presses = every.pick([k for numbers in every.conditions.values() for k in numbers[:TWIN_REPEATS]])
         with workers() as pool:
             fitted = fit_twin(presses, pool)
         csim = {row.model: row.csim.avg for row in fitted.held_out}
@@ -230,8 +230,8 @@ def twin(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
             results.append(at_most(label, off, POINTS, TWIN_REPEAT_POINTS, len(presses), seed, where))
         if name in NAMED:
             # A brush bows by bow_mm times a draw of its individual, which the twin does not have.
-            known = [one for one in fitted.estimates if one.determined and one.constant.name != "bow_mm"]
-            held = [one.low <= getattr(NAMED[name], one.constant.name) <= one.high for one in known]
+            known = [(of.name, value.low, value.high) for of, value in fitted.values.items() if of.name != "bow_mm"]
+            held = [low <= getattr(NAMED[name], of) <= high for of, low, high in known if None not in (low, high)]
             share = 100.0 * statistics.fmean(held)
             label = f"twin.intervals.{name}"
             results.append(Result(label, share, "%", "the nominal 95 %", share / 95.0, len(held), seed, where))

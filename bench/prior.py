@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.brushes import BRISTLE_SETS, CELLS, bristle_session
-from brushloop.calibrate.fit.descent import FILE, KnownBrush, Prior, fit_presses
+from brushloop.calibrate.fit.fit import FILE, KnownBrush, Prior, fit_presses
 from brushloop.calibrate.presses import read_for_fit
 from brushloop.model.fitted import NAMES, chance_within
 from brushloop.model.presses import Grid, Presses

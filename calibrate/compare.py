@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.stroke import Prepared
+from brushloop.calibrate.stroke.preprocess import Prepared
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.outline import Outline
 from brushloop.model.presses import Grid

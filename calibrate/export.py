@@ -20,7 +20,7 @@ from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.notebook import RecordedPress, Session
 from brushloop.calibrate.presses import Refused
 from brushloop.calibrate.stats import odd_waits
-from brushloop.calibrate.stroke import PX_PER_MM
+from brushloop.calibrate.stroke.preprocess import PX_PER_MM
 from brushloop.sessions.disk import check_room, csv_text, staged_folder
 from brushloop.sessions.errors import InputError, SessionDamaged, disk_error
 from brushloop.sessions.messages import PNG_START, encode_png

@@ -28,7 +28,7 @@ from brushloop.calibrate.compare import (
 )
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written
-from brushloop.calibrate.fit.fit import BrushFit
+from brushloop.calibrate.fit.command import BrushFit
 from brushloop.calibrate.presses import Press, Refused, read_presses, too_thin, uncommanded
 from brushloop.calibrate.report import (
     Point,

@@ -29,7 +29,7 @@ from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.files import Written
 from brushloop.calibrate.presses import Refused, read_presses, rectified
 from brushloop.calibrate.session import Calibration, OpenSession, open_session
-from brushloop.calibrate.stroke import Prepared
+from brushloop.calibrate.stroke.preprocess import Prepared
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.generator import SHIPPED_GENERATOR
 from brushloop.model.strokes import Prediction
@@ -42,7 +42,7 @@ from brushloop.sessions.terminal import Progress, unseen
 if TYPE_CHECKING:
     # What only some of the functions need is imported when they are called.
     from brushloop.calibrate.calibrated import Calibrated
-    from brushloop.calibrate.fit.fit import BrushFit, FitResult
+    from brushloop.calibrate.fit.command import BrushFit, FitResult
     from brushloop.calibrate.recover import Recovered
     from brushloop.calibrate.validate.command import ValidationOutput
 
@@ -237,9 +237,9 @@ def calibrate_session(session: Place, *, lens: Path | None = None) -> Calibrated
 
 def fit(session: Place, **options: Any) -> FitResult:
     """Fit the brush to the presses of a session, as `brushloop fit` does; `options` are fields of `FitRequest`."""
-    from brushloop.calibrate.fit.fit import fit_presses
+    from brushloop.calibrate.fit.command import fit_press_session
 
-    return fit_presses(FitRequest(_path(session), **options))
+    return fit_press_session(FitRequest(_path(session), **options))
 
 
 def recover(session: Place, out: Path | None = None, **options: Any) -> Recovered:
@@ -274,7 +274,7 @@ def analyse(request: AnalyseRequest, progress: Progress = unseen) -> Written:
     An import has its own scale and is not calibrated.
     """
     from brushloop.calibrate import calibrated
-    from brushloop.calibrate.fit.fit import fit as fit_strokes
+    from brushloop.calibrate.fit.command import fit as fit_strokes
     from brushloop.calibrate.validate.command import validate as compare_models
 
     session, recording, said = request.session, Recording(request.session), list[object]()

@@ -29,7 +29,7 @@ from brushloop.calibrate.compare import (
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.report import source_label
 from brushloop.calibrate.session import Calibration, OpenSession, open_session
-from brushloop.calibrate.stroke import (
+from brushloop.calibrate.stroke.preprocess import (
     BACKGROUND_MM,
     PX_PER_MM,
     Gray,

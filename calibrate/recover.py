@@ -21,7 +21,7 @@ from brushloop.calibrate.commands import RecoverRequest
 from brushloop.calibrate.compare import MM_PER_PX
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import check_target, write_whole
-from brushloop.calibrate.fit.fit import BrushFit
+from brushloop.calibrate.fit.command import BrushFit
 from brushloop.calibrate.presses import Press, Refused, cut, read_presses
 from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.calibrate.stats import student_95

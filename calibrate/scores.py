@@ -19,7 +19,8 @@ from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.compare import KEYS, Alignment, Key, Pixels, Tone, similarity
 from brushloop.calibrate.files import replacing
 from brushloop.calibrate.presses import Press
-from brushloop.calibrate.stats import CEILING, DepthTilt, Floats, Integers, Summary, summarise
+from brushloop.calibrate.stats import CEILING, Floats, Integers, Summary, summarise
+from brushloop.model.presses import DepthTilt
 from brushloop.sessions.disk import csv_text
 from brushloop.sessions.records import Condition
 

@@ -22,6 +22,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from brushloop.model.presses import DepthTilt
 from brushloop.sessions.events import CaptureResult
 from brushloop.sessions.journal import RunState
 
@@ -192,10 +193,6 @@ def holm(p_values: Sequence[float]) -> list[float]:
     order, left = np.argsort(p), len(p) - np.arange(len(p))
     p[order] = np.maximum.accumulate(np.minimum(1.0, left * p[order]))
     return p.tolist()
-
-
-DepthTilt = tuple[float, float]
-"""A condition of the grid: depth in mm and tilt in deg."""
 
 
 def farthest_first(places: Floats, first: int, count: int) -> list[int]:

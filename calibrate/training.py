@@ -30,7 +30,7 @@ from brushloop.calibrate.report import (
     write_page,
 )
 from brushloop.calibrate.session import OpenSession
-from brushloop.calibrate.stroke import PX_PER_MM, Prepared
+from brushloop.calibrate.stroke.preprocess import PX_PER_MM, Prepared
 from brushloop.calibrate.validate.command import one_source, open_session
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.generator.config import ANCHOR_SHARE, INPUTS, Placement, Target, TrainConfig, load_config, preset

@@ -215,10 +215,10 @@ def calibrated(session: Path) -> None:
 
 def fitted(session: Path) -> Path:
     """The brush fit in use of a session, made if there is none. Raises `CalibrationError`, `SessionError`."""
-    from brushloop.calibrate.fit.fit import fit_presses  # slow to import
+    from brushloop.calibrate.fit.command import fit_press_session  # slow to import
 
     fit = current(session, FITS)
     if fit is None:
         say(f"fit {session}")
-        fit = show_work(fit_presses, FitRequest(session)).path
+        fit = show_work(fit_press_session, FitRequest(session)).path
     return fit

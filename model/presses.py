@@ -17,8 +17,8 @@ from brushloop.model.strokes import fit_plane
 from brushloop.model.strokes.peers import bezier
 
 Floats = NDArray[np.float64]
-Cell = tuple[float, float]
-"""Depth H in mm and tilt alpha in deg."""
+DepthTilt = tuple[float, float]
+"""A condition: depth H in mm and tilt alpha in deg."""
 Draw = Callable[[float, float], Outline]
 """The mark of a press by depth and tilt, x from the point of touch."""
 MARGIN_MM = 2.0
@@ -60,15 +60,15 @@ class Presses:
         return replace(self, commands=self.commands[list(rows)], ink=self.ink[list(rows)])
 
     @property
-    def cells(self) -> dict[Cell, list[int]]:
-        """Numbers of the presses of each cell, which is one depth and tilt; sorted."""
-        cells: dict[Cell, list[int]] = {}
+    def conditions(self) -> dict[DepthTilt, list[int]]:
+        """Numbers of the presses of each condition, which is one depth and tilt; sorted."""
+        conditions: dict[DepthTilt, list[int]] = {}
         for number, (depth_mm, tilt_deg) in enumerate(self.commands.tolist()):
-            cells.setdefault((depth_mm, tilt_deg), []).append(number)
-        return dict(sorted(cells.items()))
+            conditions.setdefault((depth_mm, tilt_deg), []).append(number)
+        return dict(sorted(conditions.items()))
 
     @property
-    def middle(self) -> Cell:
+    def middle(self) -> DepthTilt:
         """The middle of the depths and of the tilts."""
         depth_mm, tilt_deg = (0.5 * (self.commands.min(axis=0) + self.commands.max(axis=0))).tolist()
         return depth_mm, tilt_deg
@@ -98,7 +98,7 @@ def _end(across: Floats, x_mm: Floats) -> float:
     return float(x_mm[k - 1] + share * (x_mm[k] - x_mm[k - 1]))
 
 
-def plane_at(commands: Floats, measured: Floats, at: Cell) -> Floats:
+def plane_at(commands: Floats, measured: Floats, at: DepthTilt) -> Floats:
     """(3, 3): each size (column) at a depth and tilt, its growth by mm of depth and by degree of tilt, from a plane.
 
     `measured` (n, 3) are the `SIZES` at the commands (n, 2). Raises ValueError if these do not span depth and tilt.
@@ -112,7 +112,7 @@ def plane_at(commands: Floats, measured: Floats, at: Cell) -> Floats:
 def refit_bezier(presses: Presses) -> Draw | None:
     """The paper's Bezier baseline: ends, belly and shoulder of the marks as planes in (H, H alpha).
 
-    None where a press holds no ink, or the cells are too few for a plane.
+    None where a press holds no ink, or the conditions are too few for a plane.
     """
     grid, rows = presses.grid, list[tuple[float, float, float, float]]()
     for ink in presses.ink:

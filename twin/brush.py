@@ -4,8 +4,8 @@ A constant is searched in units of its scale: 0 is the default of `BrushSpec`, 1
 is never negative and may change by a factor is searched by its logarithm.
 
 The descents of the last few brushes are remembered, because a search changes one constant at a time and half of them
-leave the mechanics alone. Every press of a cell has the same seed for every brush: differences between brushes are then
-not hidden by differences between presses (common random numbers).
+leave the mechanics alone. Every press of a condition has the same seed for every brush: differences between brushes are
+then not hidden by differences between presses (common random numbers).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from brushloop.drivers.sim.brush.brush import Brush, Descent
 from brushloop.drivers.sim.brush.paper import Footprint
 from brushloop.drivers.sim.brush.spec import ALLOWED, BrushSpec
-from brushloop.model.presses import Cell, Grid
+from brushloop.model.presses import DepthTilt, Grid
 
 Vector = NDArray[np.float64]
 Images = NDArray[np.float32]
@@ -42,7 +42,7 @@ FINE = 3
 LEAST_MM = 0.5
 REMEMBERED = 4
 STILL = {"spread_wander": 0.0, "reach_wander_mm": 0.0, "bow_wander_mm": 0.0, "place_wander_mm": 0.0}
-"""Values for a brush whose presses of a cell differ only by their paper."""
+"""Values for a brush whose presses of a condition differ only by their paper."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +105,7 @@ SPREAD = (
     Constant("place_wander_mm", "mm", 0.2),
     Constant("strand_mm", "mm", 0.7, factor=True),
 )
-"""Constants by which presses of one cell differ."""
+"""Constants by which presses of one condition differ."""
 
 
 def with_values(base: BrushSpec, constants: Sequence[Constant], point: Sequence[float] | Vector) -> BrushSpec:
@@ -128,15 +128,15 @@ def search_bounds() -> tuple[Vector, Vector]:
 
 
 def draw(
-    spec: BrushSpec, place: Place, cells: Sequence[Cell], grid: Grid, repeats: int = 1, first_seed: int = 0
+    spec: BrushSpec, place: Place, conditions: Sequence[DepthTilt], grid: Grid, repeats: int = 1, first_seed: int = 0
 ) -> Images:
-    """(cells, repeats, len(y_mm), len(x_mm)) ink from 0 to 1 of a freshly dipped brush.
+    """(conditions, repeats, len(y_mm), len(x_mm)) ink from 0 to 1 of a freshly dipped brush.
 
     Raises ValueError, naming value and range, for a press deeper than the brush allows.
     """
     brush = Brush(spec)
-    descents = _descents(mechanics(spec), place[0], tuple(cells))
-    ink = np.empty((len(cells), repeats, len(grid.y_mm), len(grid.x_mm)), np.float32)
+    descents = _descents(mechanics(spec), place[0], tuple(conditions))
+    ink = np.empty((len(conditions), repeats, len(grid.y_mm), len(grid.x_mm)), np.float32)
     for c, descent in enumerate(descents):
         for r in range(repeats):
             seed = first_seed + 1000 * c + r
@@ -152,13 +152,13 @@ def mechanics(spec: BrushSpec) -> BrushSpec:
 
 
 @lru_cache(maxsize=REMEMBERED)
-def _descents(spec: BrushSpec, deeper_mm: float, cells: tuple[Cell, ...]) -> tuple[Descent, ...]:
-    brush, descents = Brush(spec), dict[Cell, Descent]()
-    for tilt in {tilt for _, tilt in cells}:
-        reached = {depth: max(depth + deeper_mm, LEAST_MM) for depth, a in cells if a == tilt}
+def _descents(spec: BrushSpec, deeper_mm: float, conditions: tuple[DepthTilt, ...]) -> tuple[Descent, ...]:
+    brush, descents = Brush(spec), dict[DepthTilt, Descent]()
+    for tilt in {tilt for _, tilt in conditions}:
+        reached = {depth: max(depth + deeper_mm, LEAST_MM) for depth, a in conditions if a == tilt}
         each = brush.descents(list(reached.values()), tilt)
         descents |= {(depth, tilt): each[reached_mm] for depth, reached_mm in reached.items()}
-    return tuple(descents[cell] for cell in cells)
+    return tuple(descents[condition] for condition in conditions)
 
 
 def _on_grid(mark: Footprint, place: Place, grid: Grid) -> Images:

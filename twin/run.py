@@ -1,4 +1,4 @@
-"""Fit of a twin to the presses of a session: shape, intervals, spread, and scores on cells left out; and its file.
+"""Fit of a twin to the presses of a session: shape, intervals, spread, and scores on conditions left out; and its file.
 
 `brushloop sim --brush twin.toml` presses with the file, and the command prints it. The camera's noise comes from stills
 of one view: what differs between two of them where nothing was drawn.
@@ -31,7 +31,7 @@ from brushloop.calibrate.report import source_note
 from brushloop.calibrate.scores import Stat
 from brushloop.calibrate.work import Store, key_of
 from brushloop.drivers.sim.brush.spec import BrushSpec, SoundHead
-from brushloop.model.presses import Cell, Grid, Presses, image_of, refit_bezier
+from brushloop.model.presses import DepthTilt, Grid, Presses, image_of, refit_bezier
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.terminal import Progress, unseen
@@ -64,7 +64,7 @@ VOTES = 7
 """Presses of the twin that are averaged to one prediction."""
 FIRST_SEED = 900
 PRESSES = 3
-"""Presses of each cell."""
+"""Presses of each condition."""
 HEAD_SEED = 300
 MARGIN_MM = 0.8
 """How far the head of a sound mark may lie from where it lay in these presses: the touch point is off by up to 0.5 mm,
@@ -99,9 +99,9 @@ class Twin:
     spec: BrushSpec
     values: dict[Constant, FittedValue]
     spread: Spread | None
-    """None where no cell has enough captures; the spread is then the default brush's."""
+    """None where no condition has enough captures; the spread is then the default brush's."""
     held_out: tuple[Stat, ...]
-    """Empty where the cells cannot be divided."""
+    """Empty where the conditions cannot be divided."""
     head: SoundHead | None = None
     """Where its marks begin; None if it leaves no ink."""
 
@@ -167,14 +167,14 @@ def fit_twin(presses: Presses, pool: Executor, progress: Progress = unseen, stor
 
     Raises ValueError for a press that is deeper than a brush of this size allows.
     """
-    grid, groups = presses.grid, {cell: presses.ink[numbers] for cell, numbers in presses.cells.items()}
+    grid, groups = presses.grid, {condition: presses.ink[numbers] for condition, numbers in presses.conditions.items()}
     means = np.asarray([ink.mean(axis=0) for ink in groups.values()], np.float32)
     size = BrushSpec(radius_mm=presses.radius_mm, length_mm=presses.length_mm, seed=0)
     target = Target(size, tuple(groups), grid, means)
-    parts = parts_of(target.cells)
+    parts = parts_of(target.conditions)
     searches = _Searches(pool, store, progress, (1 + len(parts)) * (2 + len(COARSE_MM) + 1))
     solution = searches.coarse(target)
-    repeats = {cell: ink for cell, ink in groups.items() if len(ink) >= FEWEST_REPEATS}
+    repeats = {condition: ink for condition, ink in groups.items() if len(ink) >= FEWEST_REPEATS}
     spread: Spread | None = None
     if repeats:
         spread = fit_spread(target.brush(solution), place_at(solution.point), repeats, grid, pool)
@@ -190,7 +190,7 @@ def fit_twin(presses: Presses, pool: Executor, progress: Progress = unseen, stor
         others = target.only([k for k in range(len(groups)) if k not in part])
         without = searches.fine(others, searches.coarse(others))
         points.append(without.point)
-        predicted += _predicted(presses, [target.cells[k] for k in part], without, target)
+        predicted += _predicted(presses, [target.conditions[k] for k in part], without, target)
     errors = WIDER * np.sqrt(variance + of_parts(points))
     found = [*zip(SHAPE, solution.point, errors, strict=False)]
     if spread is not None:
@@ -198,7 +198,7 @@ def fit_twin(presses: Presses, pool: Executor, progress: Progress = unseen, stor
         found += [*zip(SPREAD, spread.point, spread.error, strict=True)]
     held_out = tuple(held_out_scores(predicted, (TWIN, BEZIER)))
     values = {constant: fitted_value(constant, scales, error) for constant, scales, error in found}
-    return Twin(spec, values, spread, held_out, sound_head(spec, target.cells, grid))
+    return Twin(spec, values, spread, held_out, sound_head(spec, target.conditions, grid))
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,7 +223,7 @@ class _Searches:
 
     def _pass(self, work: Callable[..., Solution], target: Target, solution: Solution, *blur_mm: float) -> Solution:
         place = target.grid.x_mm, target.grid.y_mm, target.mean
-        key = key_of("twin", made_by(), blur_mm, target.base, target.cells, *place, solution.seed, solution.point)
+        key = key_of("twin", made_by(), blur_mm, target.base, target.conditions, *place, solution.seed, solution.point)
         if self.store is not None and (kept := self.store.get(key)) is not None:
             result = Solution(kept["point"], int(kept["seed"]))
         else:
@@ -234,30 +234,31 @@ class _Searches:
         return result
 
 
-def _predicted(presses: Presses, held: list[Cell], there: Solution, target: Target) -> Iterator[Predicted]:
-    """Yield the cells `held` as predicted by the twin solution without them, and by a Bezier refitted to the others."""
+def _predicted(presses: Presses, held: list[DepthTilt], there: Solution, target: Target) -> Iterator[Predicted]:
+    """Yield the conditions `held` as predicted by the twin without them, and by a Bezier refitted to the others."""
     drawn = draw(target.brush(there), place_at(there.point), held, target.grid, VOTES, FIRST_SEED).mean(axis=1)
-    cells = presses.cells
-    bezier = refit_bezier(presses.pick([k for cell, numbers in cells.items() if cell not in held for k in numbers]))
-    for cell, image in zip(held, drawn, strict=True):
+    conditions = presses.conditions
+    others = [k for condition, numbers in conditions.items() if condition not in held for k in numbers]
+    bezier = refit_bezier(presses.pick(others))
+    for condition, image in zip(held, drawn, strict=True):
         images: dict[str, NDArray[np.floating]] = {TWIN: image}
         if bezier is not None:
-            images[BEZIER] = image_of(bezier(*cell), target.grid)
-        yield presses.ink[cells[cell]], images
+            images[BEZIER] = image_of(bezier(*condition), target.grid)
+        yield presses.ink[conditions[condition]], images
 
 
-def parts_of(cells: Sequence[Cell]) -> list[list[int]]:
-    """Numbers of the cells in each part, along the diagonals of the grid of depths and tilts."""
-    depths, tilts = sorted({depth for depth, _ in cells}), sorted({tilt for _, tilt in cells})
-    diagonal = [(depths.index(depth) + tilts.index(tilt)) % PARTS for depth, tilt in cells]
+def parts_of(conditions: Sequence[DepthTilt]) -> list[list[int]]:
+    """Numbers of the conditions in each part, along the diagonals of the grid of depths and tilts."""
+    depths, tilts = sorted({depth for depth, _ in conditions}), sorted({tilt for _, tilt in conditions})
+    diagonal = [(depths.index(depth) + tilts.index(tilt)) % PARTS for depth, tilt in conditions]
     parts = [[k for k, at in enumerate(diagonal) if at == part] for part in range(PARTS)]
-    return [part for part in parts if part and len(part) < len(cells)]
+    return [part for part in parts if part and len(part) < len(conditions)]
 
 
-def sound_head(spec: BrushSpec, cells: Sequence[Cell], grid: Grid) -> SoundHead | None:
-    """The settings of the quality checks with which presses of the twin in these cells pass; None without ink."""
-    drawn = draw(spec, HERE, cells, grid, PRESSES, HEAD_SEED)
-    heads_mm = [at for cell in drawn for image in cell if (at := _head_mm(image, grid)) is not None]
+def sound_head(spec: BrushSpec, conditions: Sequence[DepthTilt], grid: Grid) -> SoundHead | None:
+    """The settings of the quality checks with which presses of the twin in these conditions pass; None without ink."""
+    drawn = draw(spec, HERE, conditions, grid, PRESSES, HEAD_SEED)
+    heads_mm = [at for images in drawn for image in images if (at := _head_mm(image, grid)) is not None]
     if not heads_mm:
         return None
     middle_mm = 0.5 * (min(heads_mm) + max(heads_mm))

@@ -1,11 +1,11 @@
 """The searches of a twin, all by least squares with brushes that press with the same seeds.
 
-Mechanics, ink and place are fitted to the mean press of each cell, on blurred images: a wide blur gives the search a
-slope from far away, a narrow one the detail. The minimiser is SciPy's trust region with bounds; its derivatives are
+Mechanics, ink and place are fitted to the mean press of each condition, on blurred images: a wide blur gives the search
+a slope from far away, a narrow one the detail. The minimiser is SciPy's trust region with bounds; its derivatives are
 differences between brushes. A wide prior on each constant keeps what the presses do not determine near its default.
 
-How presses of one cell differ is fitted to five statistics of repeats: spread, reach and bow of the tip, place of the
-mark, and stray of the hairs.
+How presses of one condition differ is fitted to five statistics of repeats: spread, reach and bow of the tip, place of
+the mark, and stray of the hairs.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from brushloop.twin.brush import (
     SHAPE,
     SPREAD,
     STILL,
-    Cell,
+    DepthTilt,
     Images,
     Place,
     Vector,
@@ -60,9 +60,9 @@ MOST_TRIALS = 4
 FTOL = 3e-4
 """A step that brings the sum of squares down by less than this share is the last of its pass."""
 FEWEST_REPEATS = 3
-"""Captures of a cell from which their spread is told."""
+"""Captures of a condition from which their spread is told."""
 REPEATS = 6
-"""Simulated presses of a cell."""
+"""Simulated presses of a condition."""
 FIRST_SEED = 500
 END_SHARE = 1.0 / 3.0
 """Share of the mark whose middle measures the bow, from its tip, or the place, from its other end."""
@@ -89,18 +89,18 @@ class Target:
 
     base: BrushSpec
     """Radius and length of the brush; everything else at its default."""
-    cells: tuple[Cell, ...]
+    conditions: tuple[DepthTilt, ...]
     grid: Grid
     mean: Images
-    """(cells, len(y_mm), len(x_mm)) mean ink of each cell's captures."""
+    """(conditions, len(y_mm), len(x_mm)) mean ink of each condition's captures."""
 
     def brush(self, solution: Solution) -> BrushSpec:
         """The brush of a search."""
         return with_values(replace(self.base, seed=solution.seed), SHAPE, solution.point)
 
     def only(self, kept: Sequence[int]) -> Target:
-        """The same with some of the cells."""
-        return replace(self, cells=tuple(self.cells[k] for k in kept), mean=self.mean[list(kept)])
+        """The same with some of the conditions."""
+        return replace(self, conditions=tuple(self.conditions[k] for k in kept), mean=self.mean[list(kept)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +120,7 @@ def start() -> Solution:
 def off(target: Target, seed: int, blur_mm: float, point: Vector) -> Vector:
     """Residuals: differences of blurred pixels between brush and captures over `IMAGE_SD`, then those of the prior."""
     still = replace(target.brush(Solution(point, seed)), **STILL)
-    drawn = draw(still, place_at(point), target.cells, target.grid)[:, 0]
+    drawn = draw(still, place_at(point), target.conditions, target.grid)[:, 0]
     apart = blurred(drawn - target.mean, blur_mm, target.grid)
     return np.concatenate([apart.ravel() / IMAGE_SD, point / PRIOR_SD])
 
@@ -188,16 +188,16 @@ def choose_individual(target: Target, solution: Solution, workers: Executor) -> 
 
 
 def covariance(target: Target, solution: Solution, workers: Executor) -> NDArray[np.float64]:
-    """Covariance (constants, constants) of the point in scales, clustered by cell.
+    """Covariance (constants, constants) of the point in scales, clustered by condition.
 
-    The sandwich of a least-squares fit: what each cell asks to be changed, the model's own errors included, spreads
-    over the cells. The prior counts as one more observation of each constant.
+    The sandwich of a least-squares fit: what each condition asks to be changed, the model's own errors included,
+    spreads over the conditions. The prior counts as one more observation of each constant.
     """
     _, high = search_bounds()
     evaluate = partial(off, target, solution.seed, FINE_MM)
     jacobian = derivatives(evaluate, solution.point, high, workers)
     residual = evaluate(solution.point)
-    count, constants = len(target.cells), len(solution.point)
+    count, constants = len(target.conditions), len(solution.point)
     of_cells = jacobian[:-constants].reshape(count, -1, constants)
     pulls = np.einsum("cij,ci->cj", of_cells, residual[:-constants].reshape(count, -1))
     pulls -= pulls.mean(axis=0)
@@ -207,7 +207,7 @@ def covariance(target: Target, solution: Solution, workers: Executor) -> NDArray
 
 
 def of_parts(points: Sequence[Vector]) -> Vector | float:
-    """Variance (constants,) of the point, from the points (parts, constants) where one part of the cells is left out.
+    """Variance (constants,) of the point, from the points (parts, constants) without one part of the conditions each.
 
     The jackknife of groups. It includes what `covariance` cannot know: that another individual was chosen, or that the
     search ended elsewhere.
@@ -225,7 +225,7 @@ class Spread:
     point: tuple[float, ...]
     error: tuple[float, ...]
     captured_percent: float
-    """Mean CSIM of two captures of a cell."""
+    """Mean CSIM of two captures of a condition."""
     twin_percent: float
     """The same of the twin."""
 
@@ -233,12 +233,12 @@ class Spread:
 def fit_spread(
     spec: BrushSpec,
     place: Place,
-    repeats: Mapping[Cell, NDArray[np.floating]],
+    repeats: Mapping[DepthTilt, NDArray[np.floating]],
     grid: Grid,
     workers: Executor,
     start: Sequence[float] = SPREAD_START,
 ) -> Spread:
-    """Match the statistics of the captures, (n, len(y_mm), len(x_mm)) ink of each cell."""
+    """Match the statistics of the captures, (n, len(y_mm), len(x_mm)) ink of each condition."""
     from scipy.optimize import least_squares  # slow to import
 
     captured = list(repeats.values())
@@ -261,14 +261,14 @@ def fit_spread(
 
 
 def _off_statistics(
-    spec: BrushSpec, place: Place, cells: Sequence[Cell], grid: Grid, seen: Vector, sd: Vector, point: Vector
+    spec: BrushSpec, place: Place, conditions: Sequence[DepthTilt], grid: Grid, seen: Vector, sd: Vector, point: Vector
 ) -> Vector:
-    drawn = statistics(_drawn(spec, place, cells, grid, point), grid)
+    drawn = statistics(_drawn(spec, place, conditions, grid, point), grid)
     return np.concatenate([(drawn - seen) / sd, point / SPREAD_PRIOR_SD])
 
 
-def _drawn(spec: BrushSpec, place: Place, cells: Sequence[Cell], grid: Grid, point: Vector) -> list[Images]:
-    return list(draw(with_values(spec, SPREAD, point), place, cells, grid, REPEATS, FIRST_SEED))
+def _drawn(spec: BrushSpec, place: Place, conditions: Sequence[DepthTilt], grid: Grid, point: Vector) -> list[Images]:
+    return list(draw(with_values(spec, SPREAD, point), place, conditions, grid, REPEATS, FIRST_SEED))
 
 
 def statistics(ink: Sequence[NDArray[np.floating]], grid: Grid) -> Vector:
@@ -276,7 +276,7 @@ def statistics(ink: Sequence[NDArray[np.floating]], grid: Grid) -> Vector:
 
     The deviations are those of log area, and in mm of the tip's x and of the y of the tip and of the heel.
     """
-    measured = [np.array([_measure(image, grid) for image in cell]) for cell in ink]
+    measured = [np.array([_measure(image, grid) for image in images]) for images in ink]
     freedom = sum(len(one) - 1 for one in measured)
     squares = sum(((one - one.mean(axis=0)) ** 2).sum(axis=0) for one in measured)
     deviations = np.sqrt(np.asarray(squares) / max(freedom, 1))
@@ -284,9 +284,9 @@ def statistics(ink: Sequence[NDArray[np.floating]], grid: Grid) -> Vector:
 
 
 def agreement(ink: Sequence[NDArray[np.floating]]) -> float:
-    """Mean CSIM in percent of two repeats of a cell, as binary images."""
-    binary = [(cell > 0.5).astype(np.float32) for cell in ink]
-    pairs = [csim(a, b) for cell in binary for a, b in combinations(cell, 2)]
+    """Mean CSIM in percent of two repeats of a condition, as binary images."""
+    binary = [(images > 0.5).astype(np.float32) for images in ink]
+    pairs = [csim(a, b) for images in binary for a, b in combinations(images, 2)]
     return 100.0 * float(np.mean(pairs))
 
 

@@ -23,7 +23,16 @@ from numpy.typing import NDArray
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.presses import Refused, rectified
 from brushloop.calibrate.session import OpenSession, open_session
-from brushloop.calibrate.stroke import PX_PER_MM, Gray, Mask, Measured, components, measure, outline, touches_edge
+from brushloop.calibrate.stroke.preprocess import (
+    PX_PER_MM,
+    Gray,
+    Mask,
+    Measured,
+    components,
+    measure,
+    outline,
+    touches_edge,
+)
 from brushloop.model.drag import Drawings, Floats
 from brushloop.model.similarity import inked_window
 from brushloop.sessions.errors import SessionDamaged

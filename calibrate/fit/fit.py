@@ -1,317 +1,329 @@
-"""`brushloop fit SESSION` for presses: the fitted brush, its immutable file, its tables, and its page.
+"""Fit `model.fitted` to coverage images: its parameters by least squares with a prior, then what they cannot express.
 
-The page shows the fitted outline over the ink of each condition, the sizes of the marks, and the held-out scores. The
-intervals of the sizes are those of the jackknife: each condition is left out in turn, so they hold the differences
-between presses and how far the brush is from a plane.
+No press repeats exactly: width, place and lengths differ from press to press, each by one amount along the whole mark.
+The fit allows for these differences (`STRAYS`): each stroke may have its own, at the cost that their spread says.
+
+What the parameters cannot express are residuals of the edges and ends, by empirical Bayes. Each stroke is compared with
+the fitted parameters: how much further its tip and its heel reach, and by which sines each of its edges differs from
+the profile. Over the strokes, each of these numbers is a polynomial in depth and tilt plus the stroke's own deviation.
+The scales of the polynomial's constant, of its other terms and of the deviations are those with the greatest marginal
+likelihood on a grid (D. MacKay, "Bayesian interpolation", 1992), with a weak prior on each scale. So the fit smooths
+strokes that repeat badly and follows strokes that repeat well.
+
+The prior is the mean and covariance of the parameters over known brushes. `prior.json` holds those of brushes of
+several families of shape, each fitted to many strokes (`python -m bench.prior` makes it). Each family counts with the
+square root of its number of brushes, so that one large family does not make the others implausible. The covariance is
+shrunk toward its diagonal, because there are few brushes, and it has a floor, because the next brush may belong to none
+of the families.
 """
 
 from __future__ import annotations
 
-import contextlib
-import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import product
+from operator import itemgetter
 from pathlib import Path
-from typing import Any, Self
+from typing import NamedTuple
 
 import numpy as np
-from pydantic import model_validator
+from numpy.typing import NDArray
 
-from brushloop.calibrate.artefact import FITS, FittedValue, SessionFit, made_by, put_to_use
-from brushloop.calibrate.commands import FitRequest
-from brushloop.calibrate.compare import MM_PER_PX, SHOWN_MM, SHOWN_ROWS, brush_of
-from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.files import Written
-from brushloop.calibrate.fit.descent import SPREAD_MM, Floats
-from brushloop.calibrate.fit.descent import fit_presses as fit_parameters
-from brushloop.calibrate.fit.heldout import FITTED, leave_condition_out
-from brushloop.calibrate.presses import Refused, read_for_fit
-from brushloop.calibrate.report import (
-    COLOURS,
-    Point,
-    about,
-    chart_uri,
-    framed,
-    ink_uri,
-    picture_grid,
-    source_label,
-    source_note,
-    source_point,
-    write_page,
+from brushloop.model.damped import Damping, Equations, descend
+from brushloop.model.fitted import (
+    MODES,
+    NAMES,
+    PARAMETERS,
+    TERMS,
+    FittedPress,
+    Sizes,
+    chance_within,
+    command_terms,
+    modes,
+    published,
 )
-from brushloop.calibrate.scores import Stat
-from brushloop.calibrate.session import OpenSession
-from brushloop.calibrate.stats import NEAR_POINTS, is_near, student_95
-from brushloop.model.ccdbsm import DomainError
-from brushloop.model.fitted import MODES, NAMES, TERMS, FittedPress, fitted_model
-from brushloop.model.presses import SIZES, Cell, Presses, measure, plane_at
-from brushloop.model.similarity import csim
-from brushloop.model.strokes import StrokeModel, stroke_model
-from brushloop.sessions.recording import Recording
-from brushloop.sessions.records import Header
-from brushloop.sessions.terminal import Progress, unseen
+from brushloop.model.presses import DepthTilt, Grid, Presses
 
-FEWEST_CONDITIONS = 5
-SMOOTH_POINTS = 24
+Floats = NDArray[np.float64]
 
+SPREAD_MM = 0.15
+"""Variation of an edge from press to press (scale of a logistic)."""
+FILE = Path(__file__).with_name("prior.json")
+SHRINKAGE = 0.3
+FLOOR = 0.15
+"""Least standard deviation of a parameter, in units of its spread."""
 
-class BrushFit(SessionFit):
-    """A fitted brush, with its strokes and software. Equal inputs give an equal file."""
+ALL = tuple(range(len(NAMES)))
+SCALE = tuple(NAMES.index(name) for name in ("lam", "heel_gain", "tip_gain", "origin_mm"))
+"""Size and place of the marks."""
+ROUNDS = 40
+DAMPING = Damping(1e-2, 6.0, 8.0, 1e-7, 1e5, floor=0.0)
+STEP = 1e-4
+"""Step of a derivative, as a share of the parameter's spread."""
+STRAYS = {"lam": 0.09, "origin_mm": 0.3, "heel_gain": 0.3, "tip_gain": 0.04}
+"""Standard deviations by which single presses of a brush differ: about 5 % of width and lengths, 0.3 mm of place."""
 
-    radius_mm: float
-    length_mm: float
-    strokes: int
-    cells: tuple[tuple[float, float], ...]
-    """Depth in mm and tilt in deg of the strokes, each condition once."""
-    mm_per_px: float
-    parameters: dict[str, float]
-    """They describe a mark together; on its own none is comparable between brushes. See docs/brushfit.md."""
-    edges_mm: tuple[tuple[tuple[float, ...], ...], ...]
-    ends_mm: tuple[tuple[float, ...], ...]
-    csim_percent: dict[str, float]
-    """Leave-condition-out CSIM by model."""
-
-    def press(self) -> FittedPress:
-        """The fitted brush."""
-        values = np.array([self.parameters[name] for name in NAMES])
-        return FittedPress(self.radius_mm, self.length_mm, values, np.array(self.edges_mm), np.array(self.ends_mm))
-
-    @classmethod
-    def model_of(cls, fit: Path | None, header: Header) -> tuple[StrokeModel, BrushFit | None]:
-        """The model of a fit and the fit itself; without one, CCD-BSM as published for the brush of a recording.
-
-        Raises `CalibrationError`.
-        """
-        if fit is None:
-            return stroke_model("ccd-bsm", brush_of(header)), None
-        artefact = cls.read(fit)
-        return fitted_model(artefact.press(), f"CCD-BSM fitted on {artefact.session_id}"), artefact
-
-    @model_validator(mode="after")
-    def _whole(self) -> Self:
-        shapes = (2, MODES, TERMS), (2, TERMS)
-        own_shapes = np.array(self.edges_mm).shape, np.array(self.ends_mm).shape
-        if set(self.parameters) != set(NAMES) or own_shapes != shapes:
-            raise ValueError(f"parameters: expected {', '.join(NAMES)}, with edges and ends of shapes {shapes}")
-        return self
+TERM_SCALE = (1.0, 1.0, 0.8, 0.8, 0.8, 0.8)
+"""Expected sizes of the terms: the first in units of the constant's scale, the rest in units of the others' scale."""
+CONSTANT = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
+OTHERS = (0.03, 0.07, 0.15, 0.3, 0.6, 1.2)
+OWN = (0.03, 0.05, 0.07, 0.1, 0.14, 0.2, 0.28, 0.4, 0.56, 0.8)
+EXPECTED = (0.3, 0.3, 0.1)
+"""Scales of constant, other terms and a stroke's own deviation that are most plausible beforehand, mm for the first
+sine; each may well be e times larger or smaller."""
+END_MM = 1.5
+"""Plausible error of a length; the scales of the ends are in units of it."""
+END_NOISE = 4.0
+"""Variance of a pixel times the number of pixels whose errors are correlated, where an end is sought."""
+END_STEP_MM, END_ROUNDS = 0.05, 4
 
 
-Sizes = dict[str, tuple[FittedValue, ...]]
-"""Each size of the marks by its name: mm in the middle of the session's depths and tilts, mm per mm of depth, mm per
-degree of tilt."""
+class KnownBrush(NamedTuple):
+    """A brush of the prior: its parameters, in the order of `NAMES`."""
+
+    name: str
+    family: str
+    values: Sequence[float]
 
 
-def sizes_of(presses: Presses) -> Sizes:
-    """Every size; empty where the conditions are too few for an interval, or do not span depth and tilt without one."""
-    inked = presses.pick(np.flatnonzero((presses.ink > 0.5).any(axis=(1, 2))).tolist())
-    groups = list(inked.cells.values())
-    if len(groups) < FEWEST_CONDITIONS:
-        return {}
-    measured = np.array([measure(ink, inked.grid) for ink in inked.ink])
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior:
+    """A normal distribution of the parameters over their spreads: `mean` (17,) and `precision` (17, 17)."""
 
-    def plane(rows: Sequence[int]) -> Floats:
-        return plane_at(inked.commands[rows], measured[rows], inked.middle)
+    mean: Floats
+    precision: Floats
 
-    every = range(len(inked))
-    try:
-        whole, without = plane(every), np.array([plane([k for k in every if k not in group]) for group in groups])
-    except ValueError:
-        return {}
-    variance = (1.0 - 1.0 / len(groups)) * ((without - whole) ** 2).sum(axis=0)
-    reach = student_95(len(groups) - 1) * np.sqrt(variance)
-    ends = np.stack([whole, whole - reach, whole + reach], axis=-1).swapaxes(0, 1).tolist()
-    return {
-        name: tuple(FittedValue(value=value, low=low, high=high) for value, low, high in each)
-        for name, each in zip(SIZES, ends, strict=True)
-    }
+    @property
+    def values(self) -> Floats:
+        """The mean in the parameters' own units, within their bounds."""
+        low, high = (np.array([getattr(p, end) for p in PARAMETERS]) for end in ("low", "high"))
+        return np.clip(published() + spreads() * self.mean, low, high)
+
+    def off(self, values: Floats) -> Floats:
+        """Distance of parameters from the mean, over their spreads, (17,)."""
+        return (values - published()) / spreads() - self.mean
+
+
+def spreads() -> Floats:
+    """The plausible spread of each parameter, (17,)."""
+    return np.array([parameter.spread for parameter in PARAMETERS])
+
+
+@cache
+def learned(without_families: tuple[str, ...] = ()) -> Prior:
+    """The prior from `prior.json`; a bench leaves out the family that it scores."""
+    known = [KnownBrush(**brush) for brush in json.loads(FILE.read_text(encoding="utf-8"))["brushes"]]
+    return of_brushes([brush for brush in known if brush.family not in without_families])
+
+
+def of_brushes(known: Sequence[KnownBrush]) -> Prior:
+    """The prior from these brushes. Raises ValueError for fewer than two."""
+    if len(known) < 2:
+        raise ValueError("a prior needs at least two brushes")
+    families = [brush.family for brush in known]
+    weights = np.array([families.count(family) ** -0.5 for family in families])
+    weights /= weights.sum()
+    off = (np.array([brush.values for brush in known]) - published()) / spreads()
+    mean = weights @ off
+    covariance = (off - mean).T @ ((off - mean) * weights[:, None]) / (1.0 - np.sum(weights**2))
+    covariance += SHRINKAGE * (np.diag(np.diag(covariance)) - covariance)
+    widened = np.asarray(covariance + FLOOR**2 * np.eye(len(mean)), np.float64)
+    return Prior(mean, np.asarray(np.linalg.solve(widened, np.eye(len(mean))), np.float64))
+
+
+def fit_presses(
+    presses: Presses, *, residual: bool = True, prior: Prior | None = None, start: Floats | None = None
+) -> FittedPress:
+    """Fit the parameters, then the residual that they cannot express. By default the prior is `learned`.
+
+    The cost has several minima. Of two descents, one from the prior and one that fits size and place of the marks
+    first, the lower one counts; with `start` (17,), the parameters of a fit to nearly the same presses, one descent
+    from there. Parameters that the presses do not determine have the values that the prior expects. Raises ValueError
+    without a press.
+    """
+    if not len(presses):
+        raise ValueError("a fit needs at least one press")
+    presses = presses.near_ink()
+    prior = learned() if prior is None else prior
+    expected = FittedPress(presses.radius_mm, presses.length_mm, prior.values if start is None else start)
+    starts = [expected]
+    if start is None:
+        starts.append(_minimise(expected, SCALE, presses, prior)[0])
+    press, _ = min((_minimise(begin, ALL, presses, prior) for begin in starts), key=itemgetter(1))
+    return fit_residual(press, presses) if residual else press
 
 
 @dataclass(frozen=True, slots=True)
-class FitResult:
-    """The fitted brush that a session uses from now on, and what its presses say about it."""
+class Drawn:
+    """A mark as a brush without residuals predicts it, with its derivatives by P numbers.
 
-    session: OpenSession
-    presses: Presses
-    refused: list[Refused]
-    """Presses that cannot be used or are cut by the edge of their photograph."""
-    fit: BrushFit
-    """The contents of the file."""
-    sizes: Sizes
-    """Empty where the session has too few conditions for an interval."""
-    held_out: list[Stat]
-    """Empty with one condition only."""
-    path: Path
-
-    @property
-    def page(self) -> Path:
-        """The page beside the file."""
-        return self.path.with_suffix(".html")
-
-    def lines(self) -> Iterator[object]:
-        """What the command prints: lines and tables."""
-        from rich.table import Table
-
-        header = self.session.header
-        label = source_label(header.source, [header.brush])
-        yield f"{source_note(header.source, header.brush)}; {len(self.presses)} presses fitted"
-        for name, why in self.refused:
-            yield f"left out: {name}: {why}"
-        if self.sizes:
-            title = f"sizes of the marks with 95 % intervals ({label})"
-            at = "at {:g} mm, {:g}°".format(*self.presses.middle)
-            sizes = Table("size, mm", at, "per mm of depth", "per degree of tilt", title=title)
-            for name, values in self.sizes.items():
-                sizes.add_row(name, *map(str, values))
-            yield sizes
-        else:
-            yield f"Intervals of the sizes of the marks need {FEWEST_CONDITIONS} combinations of depth and tilt."
-        if self.held_out:
-            scores = Table(
-                "model", "n", "CSIM", "SSIM", title=f"on combinations left out of the fit in turn, percent ({label})"
-            )
-            for row in self.held_out:
-                scores.add_row(row.model, str(row.csim.n), f"{row.csim.avg:.2f}", f"{row.ssim.avg:.2f}")
-            yield scores
-        else:
-            yield "Only one condition: nothing can be held out."
-        yield f"Fit: {self.path}"
-        yield f"Page: {self.page}"
-
-    def _repr_html_(self) -> str:
-        return framed(self.page)
-
-
-def fit(request: FitRequest, progress: Progress = unseen, opened: Recording | None = None) -> FitResult | Written:
-    """Fit what the session holds, presses or drags; `opened` is its recording. Raises `CalibrationError`."""
-    from brushloop.calibrate.drags.report import fit_session
-
-    recording = opened or Recording(request.session)
-    first = next(recording.stroke_records(), None)
-    if first is not None and first.kind == "drag":
-        return fit_session(request, progress)
-    return fit_presses(request, progress, recording)
-
-
-def fit_presses(request: FitRequest, progress: Progress = unseen, opened: Recording | None = None) -> FitResult:
-    """Fit the brush to the presses of a session, leave each condition out in turn, and measure the marks.
-
-    The session uses the fit from now on, and its page is written. Raises `CalibrationError`.
+    Such a number moves both edges of the mark, and the ink of a pixel depends only on the edge on its side. So the
+    Jacobian J of the image is d ink / d half width, one image, times the derivatives of the half width, and J'J and J'r
+    are sums over columns. Matrices of that size are also too small for a matrix library to start threads for them.
     """
-    if request.prior is not None:
-        raise CalibrationError("--prior", "adapts a fit of drags, and this session holds presses")
-    session, presses, refused = read_for_fit(opened or request.session, progress)
-    press = fit_parameters(presses)
-    held_out = leave_condition_out(presses, press, progress=progress, store=session.store)
-    fit = BrushFit(
-        **session.provenance,
-        radius_mm=presses.radius_mm,
-        length_mm=presses.length_mm,
-        strokes=len(presses),
-        cells=tuple(presses.cells),
-        mm_per_px=MM_PER_PX,
-        parameters=dict(zip(NAMES, press.values.tolist(), strict=True)),
-        edges_mm=press.edges.tolist(),
-        ends_mm=press.ends.tolist(),
-        csim_percent={row.model: row.csim.avg for row in held_out},
+
+    ink: Floats
+    """Probability of ink (len(y_mm), len(x_mm))."""
+    by_width: Floats
+    """Its derivative by the half width, 1/mm."""
+    widths: Floats
+    """Derivatives of the half width (P, len(x_mm)), mm."""
+
+    @classmethod
+    def of(cls, width: Floats, widths: Floats, y_mm: Floats) -> Drawn:
+        """The mark of half width (N,) with these derivatives."""
+        ink = chance_within(width, y_mm, SPREAD_MM)
+        return cls(ink, ink * (1.0 - ink) / SPREAD_MM, widths)
+
+    def square(self) -> Floats:
+        """J'J, (P, P)."""
+        return (self.widths * np.einsum("yx,yx->x", self.by_width, self.by_width)) @ self.widths.T
+
+    def pull(self, residuals: Floats) -> Floats:
+        """J'r, (n, P), of n images of residuals."""
+        return np.einsum("yx,nyx->nx", self.by_width, residuals) @ self.widths.T
+
+
+def draw(press: FittedPress, conditions: Floats, grid: Grid, free: Sequence[int] = ALL) -> list[Drawn]:
+    """Draw presses at C depths and tilts (C, 2), with derivatives by the free parameters over their spreads."""
+    moved = press.values + np.concatenate([np.zeros((1, len(NAMES))), STEP * np.diag(spreads())[list(free)]])
+    batch = replace(press, values=moved[:, None])
+    width, *others = batch.half_width(batch.sizes(*conditions.T), grid.x_mm)
+    by_parameter = (np.stack(others, axis=1) - width[:, None]) / STEP
+    return [Drawn.of(*of_condition, grid.y_mm) for of_condition in zip(width, by_parameter, strict=True)]
+
+
+def _minimise(press: FittedPress, free: Sequence[int], presses: Presses, prior: Prior) -> tuple[FittedPress, float]:
+    """Levenberg-Marquardt from `press`, and the cost where it ends; a parameter one standard deviation off the prior
+    costs as much as a pixel of wrong ink."""
+    inks = {condition: presses.ink[numbers] for condition, numbers in presses.conditions.items()}
+    at = list(free)
+    low, high = (np.array([getattr(PARAMETERS[k], end) for k in at]) for end in ("low", "high"))
+
+    def at_values(vector: Floats) -> FittedPress:
+        values = press.values.copy()
+        values[at] = vector
+        return replace(press, values=values)
+
+    def equations(vector: Floats) -> Equations:
+        trial = at_values(vector)
+        square, gradient, cost = _normal(trial, at, inks, presses.grid)
+        pull = prior.precision @ prior.off(trial.values)
+        cost += 0.5 * float(prior.off(trial.values) @ pull)
+        square += prior.precision[np.ix_(at, at)]
+        gradient += pull[at]
+        # A parameter that is pulled beyond its bound stays there: the step of the others must not count on it.
+        held = ((vector <= low) & (gradient > 0.0)) | ((vector >= high) & (gradient < 0.0))
+        square[held], square[:, held], gradient[held] = 0.0, 0.0, 0.0
+        square[held, held] = 1.0
+        return Equations(cost, square, gradient)
+
+    def feasible(vector: Floats) -> Floats | None:
+        """Within the bounds; None if a press would not reach the paper."""
+        clipped = np.clip(vector, low, high)
+        h0_mm = at_values(clipped).values[NAMES.index("h0_mm")]
+        return None if presses.commands[:, 0].min() + h0_mm <= 0.1 else clipped
+
+    lowest = descend(
+        equations,
+        press.values[at],
+        rounds=ROUNDS,
+        most=1.0,
+        gain=1e-4,
+        scale=spreads()[at],
+        damping=DAMPING,
+        feasible=feasible,
     )
-    path = put_to_use(fit, session.recording.path.parent, FITS)
-    result = FitResult(session, presses, refused, fit, sizes_of(presses), held_out, path)
-    _write_page(result, press)
-    return result
+    return at_values(lowest.vector), lowest.at.cost
 
 
-def _write_page(result: FitResult, press: FittedPress) -> None:
-    """Write the page of the fit. Raises OSError."""
-    session, presses = result.session, result.presses
-    header, published = session.header, FittedPress(presses.radius_mm, presses.length_mm)
-    write_page(
-        result.page,
-        "fit.html.j2",
-        **about(header),
-        session=session,
-        window=SHOWN_MM,
-        conditions=[_picture(presses, at, numbers, press, published) for at, numbers in presses.cells.items()],
-        presses=len(presses),
-        trust=[source_point(header.source), *_trust(result)],
-        chart=_chart(presses, press, header),
-        measured=result.sizes,
-        middle="{:g} mm, {:g}°".format(*presses.middle),
-        held_out=result.held_out,
-        refused=result.refused,
-        px_mm=presses.grid.px_mm,
-        provenance=(("fitted with", made_by()), ("artefact", result.path.name)),
-    )
+def _normal(
+    press: FittedPress, at: Sequence[int], inks: Mapping[DepthTilt, Floats], grid: Grid
+) -> tuple[Floats, Floats, float]:
+    """J'J (P, P) and J'r (P,) by the P parameters `at`, and half the sum of squares, over all strokes.
+
+    `inks` (n, len(y_mm), len(x_mm)) are the strokes of each condition. Strays are integrated out.
+    """
+    strays = [NAMES.index(name) for name in STRAYS]
+    sizes = np.array(list(STRAYS.values())) / spreads()[strays]
+    free = sorted({*at, *strays})
+    stray, kept = ([free.index(k) for k in chosen] for chosen in (strays, at))
+    squares, gradient, cost = np.zeros((len(free), len(free))), np.zeros(len(free)), 0.0
+    for drawn, ink in zip(draw(press, np.array(list(inks)), grid, free), inks.values(), strict=True):
+        square, miss = drawn.square(), drawn.ink - ink
+        pull, by_stray = drawn.pull(miss), square[stray]
+        taken = np.linalg.solve(by_stray[:, stray] + np.diag(sizes**-2.0), np.column_stack([by_stray, pull.T[stray]]))
+        squares += len(ink) * (square - by_stray.T @ taken[:, : len(free)])
+        shift = taken[:, len(free) :]
+        gradient += (pull.T - by_stray.T @ shift).sum(axis=1)
+        # Not a dot product, which would start the matrix library's threads.
+        cost += 0.5 * float(np.einsum("nyx,nyx->", miss, miss) - np.sum(pull.T[stray] * shift))
+    return squares[np.ix_(kept, kept)], gradient[kept], cost
 
 
-def _picture(
-    presses: Presses, condition: Cell, numbers: list[int], press: FittedPress, published: FittedPress
-) -> dict[str, Any]:
-    """One picture: the mean ink of the condition's presses, and both outlines as SVG paths in mm."""
-    grid, ink = presses.grid, presses.ink[numbers]
-    alike: list[float] = []
-    with contextlib.suppress(DomainError):  # so light that the brush leaves no mark
-        drawn = np.asarray(press.chance(*condition, grid.x_mm, grid.y_mm, SPREAD_MM) > 0.5, np.float32)
-        if drawn.any():
-            alike = [csim(drawn, seen) for seen in np.asarray(ink > 0.5, np.float32) if seen.any()]
-    return {
-        "depth_mm": f"{condition[0]:g}",
-        "tilt_deg": f"{condition[1]:g}",
-        "presses": len(numbers),
-        "ink": ink_uri(ink.mean(axis=0).astype(np.float32)[SHOWN_ROWS]),
-        "fitted": _path(press, condition),
-        "published": _path(published, condition),
-        "csim": f"{100.0 * np.mean(alike):.1f}" if alike else "",
-    }
+def fit_residual(press: FittedPress, presses: Presses) -> FittedPress:
+    """The brush with the residuals of its ends and edges; `press` has none."""
+    (depths, tilts), inks, grid = presses.commands.T, presses.ink, presses.grid
+    terms = command_terms(depths, tilts)
+    ends = _ends(press, depths, tilts, inks, grid)
+    sides = _sines(press, press.sizes(depths, tilts, ends), inks, grid)
+    falling = 1.0 / np.arange(1, MODES + 1)
+    # Half the sum of the edges is a mark's width, half the difference a bow: each has scales of its own.
+    width, bow = (regress(0.5 * (sides[:, 0] + way * sides[:, 1]), terms, falling) for way in (1.0, -1.0))
+    lengths = [END_MM * regress(ends[:, [k]] / END_MM, terms, np.ones(1))[0] for k in range(2)]
+    return replace(press, edges=np.array([width + bow, width - bow]), ends=np.array(lengths))
 
 
-def _path(press: FittedPress, condition: Cell) -> str:
-    """The outline as an SVG path, x to the right and y downward in mm; empty where the brush leaves no mark."""
-    try:
-        loop = press.outline(*condition)
-    except DomainError:  # so light that the brush leaves no mark
-        return ""
-    points = np.round(np.asarray(loop.points[0], np.float64) * [1.0, -1.0], 2)
-    x, y = points[0, 0].tolist()
-    curves = "".join(f"Q{a:g} {b:g} {c:g} {d:g}" for (a, b), (c, d) in points[:, 1:].tolist())
-    return f"M{x:g} {y:g}{curves}Z"
+def regress(seen: Floats, terms: Floats, scale: Floats) -> Floats:
+    """Coefficients (K, TERMS) of the polynomials for K numbers `seen` (strokes, K), of expected sizes `scale` (K,)."""
+    count = len(seen)
+    square, right = terms.T @ terms, terms.T @ (seen / scale)
+    total = float(np.sum((seen / scale) ** 2))
+    choices = np.array(list(product(CONSTANT, OTHERS, OWN)))
+    size = np.concatenate([choices[:, :1], np.repeat(choices[:, 1:2], TERMS - 1, axis=1)], axis=1) * TERM_SCALE
+    noise = choices[:, 2] ** 2
+    # Scaled by the terms' sizes, the prior is the unit matrix times the noise.
+    scaled = square * size[:, :, None] * size[:, None, :] + noise[:, None, None] * np.eye(TERMS)
+    found = np.linalg.solve(scaled, size[:, :, None] * right)
+    explained = np.einsum("ctk,tk,ct->c", found, right, size)
+    determinant = np.linalg.slogdet(scaled)[1] + (count - TERMS) * np.log(noise)
+    likelihood = -0.5 * (seen.shape[1] * determinant + (total - explained) / noise)
+    likelihood -= 0.5 * np.sum(np.log(choices / EXPECTED) ** 2, axis=1)
+    best = int(np.argmax(likelihood))
+    return (size[best, :, None] * found[best]).T * scale[:, None]
 
 
-def _chart(presses: Presses, press: FittedPress, header: Header) -> str:
-    """Length and width against depth: the ink of each press as a point, the fit as a line for each tilt."""
-    depths, tilts = presses.commands[:, 0], presses.commands[:, 1]
-    every = np.unique(tilts).tolist()
-    shown = every if len(every) <= len(COLOURS) else [every[0], every[len(every) // 2], every[-1]]
-    smooth = np.linspace(float(depths.min()), float(depths.max()), SMOOTH_POINTS).tolist()
-    sizes = np.array([measure(ink, presses.grid) for ink in presses.ink])
-    drawn = {tilt: np.array([_fitted(press, depth, tilt, presses.grid.x_mm) for depth in smooth]) for tilt in shown}
-    figure, [axes] = picture_grid(1, 2, (9.6, 3.6), source_label(header.source, [header.brush]))
-    seen = {"length": sizes[:, 0] + sizes[:, 1], "width": sizes[:, 2]}
-    for column, (axis, (what, measured)) in enumerate(zip(axes, seen.items(), strict=True)):
-        for tilt, colour in zip(shown, COLOURS, strict=False):
-            at = tilts == tilt
-            axis.plot(depths[at], measured[at], "o", color=colour, alpha=0.6, markersize=4, label=f"α {tilt:g}°")
-            axis.plot(smooth, drawn[tilt][:, column], color=colour, linewidth=1.5)
-        axis.set(title=what, xlabel="commanded depth H, mm", ylabel=f"{what} of the mark, mm")
-        axis.legend()
-    return chart_uri(figure)
+def _ends(press: FittedPress, depths_mm: Floats, tilts_deg: Floats, inks: Floats, grid: Grid) -> Floats:
+    """By how much the tip and heel of strokes reach beyond the brush's lengths, (strokes, 2) mm, by Gauss-Newton."""
+
+    def width(further: Floats) -> Floats:
+        return press.half_width(press.sizes(depths_mm, tilts_deg, further), grid.x_mm)
+
+    sizes = press.sizes(depths_mm, tilts_deg)
+    reach = np.stack([sizes.tip, sizes.heel], axis=-1)
+    weight = END_NOISE / END_MM**2
+    ends = np.zeros_like(reach)
+    for _ in range(END_ROUNDS):
+        here = width(ends)
+        by_end = np.stack([(width(ends + END_STEP_MM * way) - here) / END_STEP_MM for way in np.eye(2)], axis=1)
+        for k, ink in enumerate(inks):
+            drawn = Drawn.of(here[k], by_end[k], grid.y_mm)
+            pull = drawn.pull((ink - drawn.ink)[None])[0] - weight * ends[k]
+            step = np.asarray(np.linalg.solve(drawn.square() + weight * np.eye(2), pull), np.float64)
+            ends[k] = np.clip(ends[k] + np.clip(step, -0.7, 0.7), -0.5 * reach[k], reach[k])
+    return ends
 
 
-def _fitted(press: FittedPress, depth_mm: float, tilt_deg: float, x_mm: Floats) -> tuple[float, float]:
-    """Length and width of the mark that is predicted, mm; NaN where there is none."""
-    try:
-        sizes = press.sizes(depth_mm, tilt_deg)
-        width = np.maximum(press.edges_at(depth_mm, tilt_deg, x_mm), 0.0).sum(axis=0).max()
-    except DomainError:
-        return math.nan, math.nan
-    return float(sizes.tip + sizes.heel), float(width)
-
-
-def _trust(result: FitResult) -> Iterator[Point]:
-    csim = next((row.csim for row in result.held_out if row.model == FITTED), None)
-    if csim is None or csim.below_ceiling is None:
-        yield Point(None, "No combination was pressed twice, so the repeatability of the brush is not known here.")
-    else:
-        span = "" if csim.below_interval is None else " (95 % {:.1f} to {:.1f})".format(*csim.below_interval)
-        words = f"Held out, the fit is {csim.below_ceiling:.1f} points of CSIM{span} below the ceiling"
-        yield Point(is_near(csim.below_ceiling, csim.below_interval), f"{words}; {NEAR_POINTS:g} or less is near.")
-    yield Point(None, "The pictures above show presses that were fitted; judge the fit by the held-out scores.")
+def _sines(press: FittedPress, sizes: Sizes, inks: Floats, grid: Grid) -> Floats:
+    """The sines (strokes, 2, MODES) by which strokes' upper and lower edges differ from the profile, mm."""
+    share = (grid.x_mm - (sizes.widest - sizes.tip)[:, None]) / (sizes.tip + sizes.heel)[:, None]
+    waves = modes(share)  # 0 beyond the ends
+    width = np.maximum(press.half_width(sizes, grid.x_mm), 0.0)
+    above = grid.y_mm > 0.0
+    edges = [inks[:, rows].sum(axis=1) * grid.px_mm - width for rows in (above, ~above)]
+    little = 0.005 * ((share > 0.0) & (share < 1.0)).sum(axis=1)[:, None, None] * np.eye(MODES)
+    across = waves.swapaxes(1, 2)
+    sines = np.asarray(np.linalg.solve(across @ waves + little, across @ np.stack(edges, axis=-1)), np.float64)
+    return sines.swapaxes(1, 2)

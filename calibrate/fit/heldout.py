@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.compare import KEYS, MM_BINARY, Alignment, similarity
-from brushloop.calibrate.fit.descent import Floats, Prior, fit_presses
+from brushloop.calibrate.fit.fit import Floats, Prior, fit_presses
 from brushloop.calibrate.scores import Stat, statistics
 from brushloop.calibrate.stats import CEILING, ceiling_values, pair_means
 from brushloop.calibrate.work import Arrays, Scheduler, Store, key_of, threads
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.fitted import FittedPress
-from brushloop.model.presses import Cell, Draw, Presses, image_of, refit_bezier
+from brushloop.model.presses import DepthTilt, Draw, Presses, image_of, refit_bezier
 from brushloop.sessions.terminal import Progress, counted, unseen
 
 FITTED, BEZIER, UNCALIBRATED = "fitted", "refitted Bezier", "uncalibrated"
@@ -32,14 +32,14 @@ Predicted = tuple[Floats, Mapping[str, Images]]
 """The ink of the presses of one condition, (n, rows, columns), and what each model predicts there without them."""
 
 
-def leave_out(presses: Presses, conditions: Mapping[Cell, Sequence[int]]) -> list[tuple[list[Cell], Presses]]:
+def leave_out(presses: Presses, conditions: Mapping[DepthTilt, Sequence[int]]) -> list[tuple[list[DepthTilt], Presses]]:
     """Conditions left out together, and the presses of all others that a fit uses; none if no press is left."""
     conditions = dict(sorted(conditions.items()))
     folds = [list(conditions)[k::MAX_FOLDS] for k in range(min(len(conditions), MAX_FOLDS))]
     return [(fold, presses.pick(others)) for fold in folds if (others := _without(conditions, fold))]
 
 
-def _without(conditions: Mapping[Cell, Sequence[int]], fold: Sequence[Cell]) -> list[int]:
+def _without(conditions: Mapping[DepthTilt, Sequence[int]], fold: Sequence[DepthTilt]) -> list[int]:
     others = [press for at, group in conditions.items() if at not in fold for press in group[:PER_CONDITION]]
     return others[:: max(1, -(-len(others) // MAX_STROKES))]
 
@@ -92,7 +92,7 @@ def leave_condition_out(
     keeps. Models without enough data are left out: the ceiling needs two strokes of a condition, a regressed Bezier two
     depths and two tilts among the others.
     """
-    conditions = presses.cells
+    conditions = presses.conditions
     published = FittedPress(presses.radius_mm, presses.length_mm)
     left_out = leave_out(presses, conditions)
     jobs = [Refit(others, prior, press.values) for _, others in left_out]

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from brushloop.calibrate.errors import CaptureRefused
-from brushloop.calibrate.stroke import Gray, Mask, Soft, light_surface, parts_near, touches_edge
+from brushloop.calibrate.stroke.preprocess import Gray, Mask, Soft, light_surface, parts_near, touches_edge
 
 DARK_SHARE = 0.6
 """A pixel darker than this share of the paper held ink before: new ink on top of it cannot be seen."""

@@ -24,7 +24,7 @@ from brushloop.calibrate.commands import DiffRequest, ValidateRequest
 from brushloop.calibrate.drags.report import DragValidation, validate_drags, write_drags
 from brushloop.calibrate.drags.report import summary as drag_summary
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.fit.fit import BrushFit
+from brushloop.calibrate.fit.command import BrushFit
 from brushloop.calibrate.loop import LoopRecord
 from brushloop.calibrate.report import data_uri, framed, write_files
 from brushloop.calibrate.scores import MEASURES, scores_csv, write_parquet

@@ -19,7 +19,7 @@ from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.commands import ValidateRequest
 from brushloop.calibrate.compare import MM_BINARY, Alignment, Pixels, brush_of, images_of, similarity
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.fit.fit import BrushFit
+from brushloop.calibrate.fit.command import BrushFit
 from brushloop.calibrate.fit.heldout import Refit, leave_out, refits
 from brushloop.calibrate.presses import Press, for_fit, read_presses, too_thin, uncommanded
 from brushloop.calibrate.scores import Scores, similarities
@@ -29,7 +29,7 @@ from brushloop.calibrate.work import Arrays, Scheduler, key_of
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.fitted import NAME as FITTED
 from brushloop.model.outline import Outline
-from brushloop.model.presses import Cell, Draw, refit_bezier
+from brushloop.model.presses import DepthTilt, Draw, refit_bezier
 from brushloop.sessions.disk import file_sha256
 from brushloop.sessions.records import Condition
 from brushloop.sessions.terminal import Progress, counted, unseen
@@ -251,8 +251,8 @@ def _held_out(
     if not request.held_out or not {FITTED_HELD_OUT, BEZIER_REFITTED} & {*wanted}:
         return
     whole = for_fit([press for press in presses if not press.cut], session.header)
-    conditions = {(press.condition.depth_mm, press.condition.tilt_deg): list[int]() for press in presses} | whole.cells
-    left_out = leave_out(whole, conditions)
+    asked = [(press.condition.depth_mm, press.condition.tilt_deg) for press in presses]
+    left_out = leave_out(whole, {condition: list[int]() for condition in asked} | whole.conditions)
     if not left_out:
         return
     if session.fit is not None:
@@ -266,7 +266,7 @@ def _held_out(
     yield _left_out(BEZIER_LEFT_OUT, {at: refit_bezier(others) for fold, others in left_out for at in fold})
 
 
-def _left_out(info: ModelInfo, outlines: Mapping[Cell, Draw | None]) -> Model:
+def _left_out(info: ModelInfo, outlines: Mapping[DepthTilt, Draw | None]) -> Model:
     """A model that was fitted without the condition that it predicts; None where the other conditions are too few."""
 
     def mark(at: Condition) -> Mark:

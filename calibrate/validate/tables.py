@@ -33,7 +33,7 @@ from brushloop.calibrate.loop import AGAIN, LoopRecord
 from brushloop.calibrate.report import Sealed, source_label
 from brushloop.calibrate.scores import MEASURES, Scores, Stat, find_stat, statistics
 from brushloop.calibrate.session import Calibration
-from brushloop.calibrate.stats import CEILING, DepthTilt, Floats, Summary, ceiling_values
+from brushloop.calibrate.stats import CEILING, Floats, Summary, ceiling_values
 from brushloop.calibrate.validate.run import (
     ANOTHER,
     FITTED,
@@ -48,6 +48,7 @@ from brushloop.calibrate.validate.run import (
 )
 from brushloop.calibrate.writing.compare import ANOTHER as ANOTHER_WRITING
 from brushloop.calibrate.writing.compare import PAPER_ROWS, PLANNED, REFERENCE, SIMULATED, Table3Row, WrittenRecord
+from brushloop.model.presses import DepthTilt
 from brushloop.model.similarity import SSIM_SETTINGS
 from brushloop.sessions.disk import csv_text
 from brushloop.sessions.events import CaptureResult, DipResult, ZeroTouchResult

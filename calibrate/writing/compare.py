@@ -47,7 +47,7 @@ from brushloop.calibrate.report import (
 )
 from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.calibrate.stats import Floats, Summary, pair_means, summarise
-from brushloop.calibrate.stroke import Prepared
+from brushloop.calibrate.stroke.preprocess import Prepared
 from brushloop.calibrate.writing import Figure, Plan, Round, check_drawn_from, code_points, load_plan
 from brushloop.model.characters.plan import Phase, phase_map
 from brushloop.model.similarity import SSIM_SETTINGS

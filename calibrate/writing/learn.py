@@ -26,7 +26,7 @@ from brushloop.calibrate.drags.fit import captured_distance
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written
 from brushloop.calibrate.session import open_session
-from brushloop.calibrate.stroke import PX_PER_MM
+from brushloop.calibrate.stroke.preprocess import PX_PER_MM
 from brushloop.calibrate.writing import (
     Figure,
     FootprintArtefact,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from brushloop.calibrate.board.pix2len import Plane, see_board
 from brushloop.calibrate.compare import ANCHOR_MM, MM_PER_PX, covered, field_around, field_grid
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
-from brushloop.calibrate.stroke import PX_PER_MM, Gray, on_window, prepare, rectify
+from brushloop.calibrate.stroke.preprocess import PX_PER_MM, Gray, on_window, prepare, rectify
 from brushloop.collect.engine.recorder import RunContext, StepContext, meanwhile, uninterrupted
 from brushloop.collect.engine.snapshot import LastCapture
 from brushloop.collect.errors import BadPicture, NeedsOperator, StepError

@@ -17,7 +17,7 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from brushloop.calibrate.board.pix2len import Plane, see_board
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.stroke import Gray
+from brushloop.calibrate.stroke.preprocess import Gray
 from brushloop.collect.engine.control import RunControl
 from brushloop.collect.engine.live import LiveView, Telemetry
 from brushloop.collect.engine.open_or_resume import Opening

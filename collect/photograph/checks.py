@@ -14,7 +14,7 @@ from enum import StrEnum
 import numpy as np
 
 from brushloop.calibrate.board.pix2len import Plane
-from brushloop.calibrate.stroke import PX_PER_MM, Gray, rectify
+from brushloop.calibrate.stroke.preprocess import PX_PER_MM, Gray, rectify
 from brushloop.collect.photograph import measure
 from brushloop.collect.photograph.measure import (
     Ink,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from brushloop.calibrate.board.lens import Floats, apply
 from brushloop.calibrate.board.pix2len import Plane
-from brushloop.calibrate.stroke import PX_PER_MM, Gray, Mask, Soft, flatten, rectify
+from brushloop.calibrate.stroke.preprocess import PX_PER_MM, Gray, Mask, Soft, flatten, rectify
 
 Rect = tuple[float, float, float, float]
 """x, y, width, height in the paper frame, mm."""

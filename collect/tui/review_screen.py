@@ -22,7 +22,7 @@ from textual.widgets import Footer, OptionList
 from brushloop.calibrate.artefact import FITS, current
 from brushloop.calibrate.board.pix2len import Plane, see_board
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.fit.fit import BrushFit
+from brushloop.calibrate.fit.command import BrushFit
 from brushloop.calibrate.session import RigView, rig_of
 from brushloop.calibrate.stats import odd_waits, waits_of
 from brushloop.collect.engine.capture import mark_of, pictures_of

@@ -21,7 +21,7 @@ from brushloop.calibrate.loop import AGAIN, ANOTHER, SIMULATED, LoopRecord, stat
 from brushloop.calibrate.presses import Press, prepare_job, press_of
 from brushloop.calibrate.scores import Scores
 from brushloop.calibrate.session import Calibration
-from brushloop.calibrate.stroke import Measured
+from brushloop.calibrate.stroke.preprocess import Measured
 from brushloop.calibrate.writing import Figure
 from brushloop.calibrate.writing.compare import KEYS as WRITTEN_KEYS
 from brushloop.calibrate.writing.compare import PAIRS, PLANNED, Character, Table3Row, WritingComparison, WrittenRecord

@@ -21,7 +21,7 @@ from brushloop.calibrate.compare import MM_PER_PX, field_around
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.presses import prepare_press
 from brushloop.calibrate.session import Calibration, open_session
-from brushloop.calibrate.stroke import PX_PER_MM
+from brushloop.calibrate.stroke.preprocess import PX_PER_MM
 from brushloop.collect.tui.review_screen import Review
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.config import SimConfig, Table, View

@@ -31,7 +31,7 @@ from brushloop.calibrate.drags.fit import (
 from brushloop.calibrate.drags.report import summary, validate_drags, width_sentence, write_drags
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.session import OpenSession
-from brushloop.calibrate.stroke import Measured, measure
+from brushloop.calibrate.stroke.preprocess import Measured, measure
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
 from brushloop.model.drag import DragModel, Drawings, ink, lagging
 from brushloop.sessions.records import Header, Source, Stroke

@@ -22,7 +22,7 @@ from brushloop.calibrate.commands import FitRequest, ValidateRequest
 from brushloop.calibrate.compare import ANCHOR_MM, FIELD_MM
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.fit import heldout
-from brushloop.calibrate.fit.fit import fit_presses
+from brushloop.calibrate.fit.command import fit_press_session
 from brushloop.calibrate.presses import Press, cut, too_thin, uncommanded
 from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.calibrate.validate import run as validation
@@ -78,10 +78,10 @@ def same(one: Press, other: Press) -> bool:
 
 def test_fit_and_validate_do_no_work_twice(session: Path, tmp_path: Path, calls: Counter[str]) -> None:
     request = ValidateRequest(places=(session,), out=tmp_path / "report")
-    fit_presses(FitRequest(session))
+    fit_press_session(FitRequest(session))
     validate(request)
     assert (calls["prepare_job"], calls["refit"], calls["score_job"]) == (3, 3, 3)
-    fit_presses(FitRequest(session))
+    fit_press_session(FitRequest(session))
     validate(request)
     assert calls.total() == 9
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from brushloop.calibrate.errors import CaptureRefused
-from brushloop.calibrate.stroke import PX_PER_MM, measure, prepare, rectify, rescale
 from brushloop.calibrate.stroke.difference import new_stroke
+from brushloop.calibrate.stroke.preprocess import PX_PER_MM, measure, prepare, rectify, rescale
 
 PAGE = (800, 800)
 

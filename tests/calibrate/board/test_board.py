@@ -30,8 +30,8 @@ from brushloop.calibrate.board.spec import (
 from brushloop.calibrate.commands import PrintRequest
 from brushloop.calibrate.compare import field_around
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.stroke import PX_PER_MM as RASTER_PX_PER_MM
-from brushloop.calibrate.stroke import prepare, rectify_by
+from brushloop.calibrate.stroke.preprocess import PX_PER_MM as RASTER_PX_PER_MM
+from brushloop.calibrate.stroke.preprocess import prepare, rectify_by
 from tests.calibrate.simulated_rigs import CAMERAS, Shot, boards, sheet, true_mask, true_scale
 from tests.command import refused
 

@@ -13,9 +13,8 @@ from brushloop.__main__ import app
 from brushloop.calibrate.artefact import FITS, current
 from brushloop.calibrate.commands import FitRequest
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.fit.descent import KnownBrush, draw, fit_presses, learned, of_brushes, regress, spreads
-from brushloop.calibrate.fit.fit import FEWEST_CONDITIONS, BrushFit, sizes_of
-from brushloop.calibrate.fit.fit import fit_presses as fit_session
+from brushloop.calibrate.fit.command import FEWEST_CONDITIONS, BrushFit, fit_press_session, sizes_of
+from brushloop.calibrate.fit.fit import KnownBrush, draw, fit_presses, learned, of_brushes, regress, spreads
 from brushloop.calibrate.fit.heldout import FITTED, leave_condition_out
 from brushloop.calibrate.session import open_session
 from brushloop.calibrate.stats import CEILING
@@ -223,6 +222,6 @@ def test_one_command_leads_from_photographs_to_the_report(session: Path) -> None
 
 
 def test_a_single_condition_gives_neither_intervals_nor_held_out_scores(tmp_path: Path) -> None:
-    fitted = fit_session(FitRequest(imported_presses(tmp_path, CONDITIONS[:1])))
+    fitted = fit_press_session(FitRequest(imported_presses(tmp_path, CONDITIONS[:1])))
     assert fitted.held_out == []
     assert fitted.sizes == {}

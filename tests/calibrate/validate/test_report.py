@@ -16,7 +16,7 @@ import brushloop
 from brushloop.calibrate.commands import DiffRequest, FitRequest, ValidateRequest
 from brushloop.calibrate.compare import KEYS
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.fit.fit import fit_presses
+from brushloop.calibrate.fit.command import fit_press_session
 from brushloop.calibrate.fit.heldout import BEZIER, FITTED
 from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.validate import run as validation
@@ -68,7 +68,7 @@ def test_every_model_is_scored_in_both_alignments_and_tones(report: Report) -> N
 
 def test_fit_and_validate_print_the_same_held_out_scores(session: Path, tmp_path: Path) -> None:
     copied = Path(shutil.copytree(session, tmp_path / session.name))
-    fitted = fit_presses(FitRequest(copied))
+    fitted = fit_press_session(FitRequest(copied))
     report = validate(ValidateRequest(places=(copied,), fit=fitted.path, out=tmp_path / "report")).report
     assert report is not None
     rows = {row.model: row for row in fitted.held_out}

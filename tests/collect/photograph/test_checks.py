@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from bench.brushes import DATA as SHARED
 from brushloop.calibrate.board.pix2len import Plane
-from brushloop.calibrate.stroke import PX_PER_MM
+from brushloop.calibrate.stroke.preprocess import PX_PER_MM
 from brushloop.collect.photograph.checks import Failure, Photograph, Verdict
 from brushloop.collect.photograph.measure import Ink, Window, blur_px, glare, measure_mark, paper_level
 from brushloop.collect.rig.config import QualityConfig
