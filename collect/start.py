@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 from brushloop.calibrate.artefact import FITS, current
 from brushloop.calibrate.commands import CalibrateRequest, FitRequest, show_work
 from brushloop.collect.engine import CollectRequest
+from brushloop.collect.engine.control import FINAL
 from brushloop.collect.engine.engine import Engine, engine_for
 from brushloop.collect.engine.live import LiveView
 from brushloop.collect.engine.open_or_resume import Opening
@@ -150,9 +151,10 @@ def show_progress(engine: Engine) -> None:
                 silent = now.no_pose_s is not None
                 line = f"warning: {no_pose_text(now)}" if silent else "the arm sends its pose again"
                 progress.console.print(line, highlight=False)
+            doing = str(now.state) if now.state in FINAL else f"{now.state}: {now.step}"
             progress.update(
                 task,
-                description=", ".join(part for part in (f"{now.state}: {now.step}", no_pose_text(now)) if part),
+                description=", ".join(filter(None, (doing, no_pose_text(now)))),
                 completed=now.strokes_done,
                 total=now.strokes_planned,
                 eta=eta_text(now),
