@@ -1,4 +1,4 @@
-"""The host computer: its clock, work that must end although its caller is cancelled, and one driver per device.
+"""The host computer: its clock, work that outlives its caller or ends with it, and one driver per device.
 
 On Linux a claim on a device is an abstract socket, a name kept by the kernel: it leaves no file behind, ends with its
 process in any case, and is visible to every user of the machine, but not in a container with a separate network. On
@@ -8,14 +8,14 @@ other systems it is a lock on a file that every user may open, in a folder share
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import os
 import socket
 import struct
 import sys
 import time
-from collections.abc import Coroutine
-from contextlib import AbstractContextManager
+from collections.abc import AsyncGenerator, Coroutine
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -64,6 +64,17 @@ async def finished(work: Coroutine[Any, Any, T]) -> T:
     return result
 
 
+@contextlib.asynccontextmanager
+async def alongside(work: Coroutine[Any, Any, None], name: str) -> AsyncGenerator[None]:
+    """Run `work` as a task of this name within the block; then cancel it and wait for its end. Its error is dropped."""
+    task = asyncio.create_task(work, name=name)
+    try:
+        yield
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
 WAITING = 64
 """Length of the backlog: refused processes connect to learn who holds the name, and are never served."""
 
@@ -75,7 +86,7 @@ class Claimed(Exception):
     """Another process holds the name; the message says which one, if that is known."""
 
 
-def claimed(name: str) -> AbstractContextManager[object]:
+def claimed(name: str) -> contextlib.AbstractContextManager[object]:
     """Claim `name` on this machine, and hold it until the block, or the process, ends. Raises `Claimed`."""
     return _named_socket(name) if sys.platform == "linux" else _file(name)
 
@@ -112,7 +123,7 @@ def _holder(address: str) -> str:
     return f"process {pid} of {user}" if pid else UNNAMED
 
 
-def _file(name: str) -> AbstractContextManager[object]:
+def _file(name: str) -> contextlib.AbstractContextManager[object]:
     folder = Path(os.environ.get("PROGRAMDATA", "C:/ProgramData")) if os.name == "nt" else Path("/tmp")
     try:
         return FileLock(folder / f"{name}.lock", timeout=0, mode=0o666).acquire()

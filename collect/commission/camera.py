@@ -25,7 +25,7 @@ from brushloop.collect.photograph.frames import gray
 from brushloop.drivers.camera import CameraTable, Locked, OpenCvCamera, found_settings
 from brushloop.drivers.devices import Stamp
 from brushloop.drivers.errors import DeviceError
-from brushloop.drivers.host import Clock
+from brushloop.drivers.host import Clock, alongside
 
 Gray = NDArray[np.uint8]
 LATE_MS = 2500.0
@@ -250,10 +250,8 @@ async def shown_live(visit: Visit, camera: OpenCvCamera) -> AsyncGenerator[None]
                 visit.live = gray(frame.image)
                 await asyncio.sleep(LIVE_S)
 
-    task = asyncio.create_task(look(), name="live picture")
     try:
-        yield
+        async with alongside(look(), "live picture"):
+            yield
     finally:
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
         visit.live = None

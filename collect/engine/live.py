@@ -7,7 +7,8 @@ import contextlib
 import math
 import threading
 from collections import deque
-from collections.abc import AsyncGenerator, Callable, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractAsyncContextManager
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -21,6 +22,7 @@ from brushloop.collect.photograph.frames import gray
 from brushloop.collect.photograph.measure import blur_px, busiest_tile
 from brushloop.drivers.devices import Camera, ForceSample, Frame, Stamp
 from brushloop.drivers.errors import DeviceError
+from brushloop.drivers.host import alongside
 from brushloop.sessions.mcap_writer import Outgoing, channel_of, encoded
 from brushloop.sessions.messages import image_message
 from brushloop.sessions.records import Event, Topic
@@ -37,8 +39,7 @@ FRAME_PERIOD_S = 0.2
 WIDTH_PX = 320
 
 
-@contextlib.asynccontextmanager
-async def each_frame(camera: Camera, shows: Sequence[Callable[[Frame], None]]) -> AsyncGenerator[None]:
+def each_frame(camera: Camera, shows: Sequence[Callable[[Frame], None]]) -> AbstractAsyncContextManager[None]:
     """Within the block pass the newest frame to each of `shows`, in a thread, every `FRAME_PERIOD_S`.
 
     Never slows the run. Without `shows`, the camera is not asked for frames.
@@ -52,12 +53,7 @@ async def each_frame(camera: Camera, shows: Sequence[Callable[[Frame], None]]) -
                     await asyncio.to_thread(show, frame)
             await asyncio.sleep(FRAME_PERIOD_S)
 
-    task = asyncio.create_task(watch(), name="camera picture")
-    try:
-        yield
-    finally:
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
+    return alongside(watch(), "camera picture")
 
 
 def _no_wider(image: NDArray[np.uint8], width_px: int) -> NDArray[np.uint8]:

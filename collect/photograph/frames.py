@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from brushloop.collect.errors import StepError
 from brushloop.collect.rig.config import CameraConfig
 from brushloop.drivers.devices import Camera, Frame, Stamp
+from brushloop.drivers.host import alongside
 
 Gray = NDArray[np.uint8]
 Thumbnail = NDArray[np.float32]
@@ -149,9 +150,5 @@ class Frames:
 async def watching(camera: Camera, reference: Thumbnail | None) -> AsyncGenerator[Frames]:
     """Within the block, follow the frames; `reference` is the view without the arm."""
     frames = Frames(reference)
-    task = asyncio.create_task(frames.follow(camera), name="camera frames")
-    try:
+    async with alongside(frames.follow(camera), "camera frames"):
         yield frames
-    finally:
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)

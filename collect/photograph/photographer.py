@@ -27,6 +27,7 @@ from brushloop.collect.rig.devices import Rig
 from brushloop.collect.rig.paper import to_paper
 from brushloop.drivers.devices import Frame, QueuedLine
 from brushloop.drivers.errors import DeviceError
+from brushloop.drivers.host import alongside
 
 Floats = NDArray[np.float64]
 GOOD_SHARE, GOOD_S = 0.1, 0.03
@@ -336,12 +337,8 @@ class Photographer:
                         placed.append((t_s, way))
                 await asyncio.sleep(POSE_PERIOD_S)
 
-        task = asyncio.create_task(note(), name="note the arm's path")
-        try:
+        async with alongside(note(), "note the arm's path"):
             yield placed
-        finally:
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
 
     def _too_late(self, what: str) -> CameraLate:
         return CameraLate(
