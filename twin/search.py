@@ -60,7 +60,7 @@ MOST_TRIALS = 4
 FTOL = 3e-4
 """A step that brings the sum of squares down by less than this share is the last of its pass."""
 FEWEST_REPEATS = 3
-"""Captures of a condition from which their spread is told."""
+"""Fewest captures of a condition from which their spread is estimated."""
 REPEATS = 6
 """Simulated presses of a condition."""
 FIRST_SEED = 500
