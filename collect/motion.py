@@ -205,14 +205,15 @@ def slowly(config: RigConfig, x_mm: float, y_mm: float, z_mm: float) -> Move:
     return Move(upright(config, x_mm, y_mm, z_mm), config.motion.press_speed_mm_s)
 
 
-def visit_moves(config: RigConfig, plane: PaperPlane, x_mm: float, y_mm: float) -> list[Move]:
-    """Over a point of the sheet, down to clearance, slowly to the expected surface, and up."""
+def visit_moves(config: RigConfig) -> list[Move]:
+    """Over the zero-touch point, down to clearance, slowly to the taught height, and up."""
     motion, paper = config.motion, config.paper
+    x_mm, y_mm = paper.touch_point_mm
     above = over(config, x_mm, y_mm)
     return [
         above,
-        Move(plane.pose(paper, x_mm, y_mm, CLEARANCE_MM), motion.travel_speed_mm_s),
-        Move(plane.pose(paper, x_mm, y_mm, 0.0), motion.press_speed_mm_s / 4),
+        Move(upright(config, x_mm, y_mm, paper.touch_z_mm + CLEARANCE_MM), motion.travel_speed_mm_s),
+        Move(upright(config, x_mm, y_mm, paper.touch_z_mm), motion.press_speed_mm_s / 4),
         above,
     ]
 
@@ -282,23 +283,17 @@ class Procedures:
         limits_of(self._config).check_start("robot", here)
         await self.go(*retreat_moves(self._config, here))
 
-    async def visit(self, plane: PaperPlane, x_mm: float, y_mm: float) -> float:
-        """Go slowly down to where `plane` has the surface; returns the height at which the arm rests, in mm."""
-        *down, up = visit_moves(self._config, plane, x_mm, y_mm)
-        await self.go(*down)
-        rests_mm = (await self.rig.robot.where()).z_mm
-        await self.go(up)
-        return rests_mm
-
     async def zero_touch(self) -> float:
         """Visit the taught touch height at the touch point; returns the height at which the arm rests, in mm.
 
         This confirms that the arm reaches the height that the operator taught. It does not measure the paper. Raises
         `StepVoid` if the arm rests elsewhere.
         """
-        paper = self._config.paper
-        rests_mm = await self.visit(PaperPlane(paper.touch_z_mm), *paper.touch_point_mm)
-        off_mm = rests_mm - paper.touch_z_mm
+        *down, up = visit_moves(self._config)
+        await self.go(*down)
+        rests_mm = (await self.rig.robot.where()).z_mm
+        await self.go(up)
+        off_mm = rests_mm - self._config.paper.touch_z_mm
         if abs(off_mm) > TOUCH_TOLERANCE_MM:
             raise StepVoid(f"zero touch rests {off_mm:+.3f} mm from the taught height; limit {TOUCH_TOLERANCE_MM} mm")
         return rests_mm

@@ -17,7 +17,7 @@ from brushloop.calibrate.report import printable
 from brushloop.collect.motion import Move, Region, park_moves
 from brushloop.collect.motion import Path as MotionPath
 from brushloop.collect.protocols.config import ProtocolConfig
-from brushloop.collect.protocols.steps import Drawn, DrawStep, PressStep, TouchStep
+from brushloop.collect.protocols.steps import Drawn, DrawStep, PressStep
 from brushloop.collect.rig.check import BLUE, GREY, ORANGE, Axes, finish, from_above
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import limits_of
@@ -86,7 +86,7 @@ class Plan:
     seconds: float
     seconds_by_kind: dict[str, float]
     touches_mm: tuple[tuple[float, float], ...]
-    """Touch points in the paper frame, those of zero touch first."""
+    """Points of zero touch, in the paper frame."""
 
     def as_json(self) -> dict[str, Any]:
         """Return every field, to be written as JSON."""
@@ -101,7 +101,6 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
     kinds: Counter[str] = Counter()
     seconds: dict[str, float] = {}
     measured = config.touch.method != "taught" and config.touch.points_mm
-    touches = list(measured or [config.paper.touch_point_mm])
     dips = 0
     sheets = 1
     plane, here = PaperPlane(config.paper.touch_z_mm), park_moves(config)[-1].target
@@ -112,8 +111,6 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
         took_s, here = step_s(config, here, moves)
         seconds[kind] = seconds.get(kind, 0.0) + took_s
         dips += moves.dips
-        if isinstance(step, TouchStep):
-            touches.append((step.x_mm, step.y_mm))
         if isinstance(step, PressStep | DrawStep):
             if placed and walked.sheet != sheets:
                 changes.append(step.press.stroke_id)
@@ -130,7 +127,7 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
         ink_ml=None if config.ink.device is None else config.ink.device.doses_ml(dips),
         seconds=sum(seconds.values()),
         seconds_by_kind=seconds,
-        touches_mm=tuple(dict.fromkeys(touches)),
+        touches_mm=tuple(measured or [config.paper.touch_point_mm]),
     )
 
 
@@ -143,9 +140,7 @@ def plan_table(plan: Plan) -> Group:
     totals = Table(title=f"plan of {plan.kind}", show_header=False)
     changes = f", a fresh one before {', '.join(plan.sheet_changes)}" if plan.sheet_changes else ""
     totals.add_row("strokes", str(len(plan.placed)))
-    totals.add_row(
-        "sheets", f"{plan.sheets} of {plan.patches_per_sheet} patches{changes}" if plan.placed else "no marks"
-    )
+    totals.add_row("sheets", f"{plan.sheets} of {plan.patches_per_sheet} patches{changes}")
     totals.add_row("dips", str(plan.dips))
     if plan.ink_ml is not None:
         totals.add_row("ink", f"{plan.ink_ml:.1f} ml, dosed by the ink device")
@@ -153,7 +148,7 @@ def plan_table(plan: Plan) -> Group:
     totals.add_row("time", f"{duration(plan.seconds)}, not counting {OMITTED}")
     for kind, seconds in plan.seconds_by_kind.items():
         totals.add_row(f"  {kind}", duration(seconds))
-    return Group(totals, _conditions(plan)) if plan.placed else Group(totals)
+    return Group(totals, _conditions(plan))
 
 
 def duration(seconds: float) -> str:
@@ -184,8 +179,8 @@ def draw_plan(config: RigConfig, protocol: ProtocolConfig, plan: Plan, path: Pat
     """Write the picture, in the format of the file's ending. Raises OSError if it cannot be written."""
     from matplotlib.figure import Figure as Picture
 
-    shown = min(plan.sheets, MOST_SHEETS) if plan.placed else 0
-    columns = 1 if shown == 0 else 2 if shown < 6 else 3
+    shown = min(plan.sheets, MOST_SHEETS)
+    columns = 2 if shown < 6 else 3
     rows = math.ceil((shown + 1) / columns)
     width, height = config.paper.size_mm
     panel_in = 7.2
@@ -203,7 +198,7 @@ def draw_plan(config: RigConfig, protocol: ProtocolConfig, plan: Plan, path: Pat
         _sheet(panel, config, sheet, number, plan, drawn)
     for panel in axes[shown + 1 :]:
         panel.set_axis_off()
-    if plan.sheets > shown > 0:
+    if plan.sheets > shown:
         picture.suptitle(f"the first {shown} of {plan.sheets} sheets")
     picture.savefig(path, dpi=110)
 

@@ -28,7 +28,7 @@ from brushloop.collect.motion import (
     visit_moves,
 )
 from brushloop.collect.protocols.config import ProtocolConfig
-from brushloop.collect.protocols.kinds import CalibrationConfig, WriteConfig
+from brushloop.collect.protocols.kinds import WriteConfig
 from brushloop.collect.protocols.steps import (
     MARKING,
     BoardStep,
@@ -42,7 +42,6 @@ from brushloop.collect.protocols.steps import (
     ReviewStep,
     SelfCheckStep,
     Step,
-    TouchStep,
     ZeroTouchStep,
     press_of,
 )
@@ -92,8 +91,8 @@ def moves_of(
     `dips` is the number of dips before the step, which decides when the brush is washed.
     """
     match step:
-        case ZeroTouchStep() | TouchStep():
-            return _touches(config, plane, step, dips)
+        case ZeroTouchStep():
+            return _touches(config, step, dips)
         case DipStep():
             return StepMoves(inking_moves(config, dips), dips=1)
         case ReviewStep():
@@ -118,24 +117,19 @@ def moves_of(
             return _figure(config, plane, drawn, patch, dips)
 
 
-def touch_of(config: RigConfig, step: ZeroTouchStep | TouchStep) -> TouchConfig:
-    """How and where a ZERO_TOUCH or TOUCH step touches. Raises ValueError for too few points for its method."""
-    asked: dict[str, object] = {}
-    if isinstance(step, TouchStep):
-        asked["points_mm"] = [(step.x_mm, step.y_mm)]
-    elif step.method is not None:
-        # The operator may measure even where the taught height is configured.
-        asked["method"] = step.method
-    return TouchConfig.model_validate(config.touch.model_dump() | asked) if asked else config.touch
+def touch_of(config: RigConfig, step: ZeroTouchStep) -> TouchConfig:
+    """How and where a ZERO_TOUCH step touches. Raises ValueError for too few points for its method."""
+    if step.method is None:
+        return config.touch
+    # The operator may measure even where the taught height is configured.
+    return TouchConfig.model_validate(config.touch.model_dump() | {"method": step.method})
 
 
-def _touches(config: RigConfig, plane: PaperPlane, step: ZeroTouchStep | TouchStep, dips: int) -> StepMoves:
+def _touches(config: RigConfig, step: ZeroTouchStep, dips: int) -> StepMoves:
     """A touch by force or jog decides how deep it goes; a touch by camera also chooses its next spot."""
     touch = touch_of(config, step)
     if touch.method == "taught":
-        if isinstance(step, TouchStep):
-            return StepMoves([*visit_moves(config, plane, step.x_mm, step.y_mm)])
-        return StepMoves([*visit_moves(config, PaperPlane(config.paper.touch_z_mm), *config.paper.touch_point_mm)])
+        return StepMoves(visit_moves(config))
     segments: list[Segment] = []
     for rect_mm, floor_mm in touched_regions(config.paper, touch):
         x_mm, y_mm, *_ = rect_mm
@@ -237,13 +231,10 @@ PlannedPose = tuple[Pose, float, str]
 def check_protocol(rig_path: Path, protocol_path: Path, rig: RigConfig, protocol: ProtocolConfig) -> None:
     """Raise `ConfigError` with file, field and range for the first problem."""
     first_round = [stroke for stroke in protocol.planned() if stroke.repeat == 1]  # the others repeat it
-    if first_round:
-        sheet = sheet_of(rig, protocol)
-        _check_sheet(rig_path, protocol_path, rig, protocol, sheet)
-        _check_brush(protocol_path, rig.brush, first_round, sheet.patch(0))
-        _check_touch_point(rig_path, rig.paper, first_round, sheet)
-    if isinstance(protocol, CalibrationConfig):
-        _check_touches(protocol_path, rig, protocol.touches_mm)
+    sheet = sheet_of(rig, protocol)
+    _check_sheet(rig_path, protocol_path, rig, protocol, sheet)
+    _check_brush(protocol_path, rig.brush, first_round, sheet.patch(0))
+    _check_touch_point(rig_path, rig.paper, first_round, sheet)
     check_poses(rig_path, rig, all_poses(rig, protocol, PaperPlane(rig.paper.touch_z_mm)))
 
 
@@ -281,17 +272,6 @@ def _check_touch_point(rig_path: Path, paper: PaperConfig, strokes: Iterable[Pla
                 where = [round(v, 1) for v in at_mm]
                 what = f"{[*paper.touch_point_mm]} lies within {TOUCH_CLEAR_MM:g} mm of ink at {where}"
                 raise ConfigError(rig_path, "paper.touch_point_mm", what)
-
-
-def _check_touches(path: Path, rig: RigConfig, points_mm: Sequence[tuple[float, float]]) -> None:
-    if points_mm and rig.touch.method == "camera":
-        what = "single touches cannot be found by camera: use force, jog or taught in [touch]"
-        raise ConfigError(path, "touches_mm", what)
-    width, height = rig.paper.size_mm
-    for x_mm, y_mm in points_mm:
-        if not (0.0 <= x_mm <= width and 0.0 <= y_mm <= height):
-            what = f"[{x_mm:g}, {y_mm:g}] lies off the sheet of {width:g} x {height:g} mm"
-            raise ConfigError(path, "touches_mm", what)
 
 
 def check_poses(rig_path: Path, rig: RigConfig, poses: Iterable[PlannedPose]) -> None:

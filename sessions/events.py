@@ -27,7 +27,6 @@ class StepKind(StrEnum):
     DIP = "dip"
     PRESS = "press"
     DRAW = "draw"  # a figure: all strokes of one character on one patch; if interrupted, all of it is done again
-    TOUCH = "touch"  # bring the tip down on a given point of the sheet and measure its height
     CAPTURE = "capture"
     REVIEW = "review"  # read which captures a person has marked bad; nothing moves
     SELF_CHECK = "self_check"  # press an uneven triangle of marks, which shows a mirrored, turned or stretched rig
@@ -106,13 +105,6 @@ class BoardResult(Value):
     checks: tuple[Check, ...] = ()
 
 
-class TouchResult(TouchedPoint):
-    """One point of the paper, in the base frame."""
-
-    kind: Literal[StepKind.TOUCH] = StepKind.TOUCH
-    method: str
-
-
 class SelfCheckResult(Value):
     """Three marks as commanded and as found; `residuals_mm` remain once offset and turn are taken out."""
 
@@ -176,9 +168,9 @@ class ReviewResult(Value):
     again: tuple[Again, ...] = ()
 
 
-SetUpResult = ZeroTouchResult | BoardResult | TouchResult | SelfCheckResult
 StepResult = Annotated[
-    SetUpResult | PressResult | DipResult | CaptureResult | ReviewResult, Field(discriminator="kind")
+    ZeroTouchResult | BoardResult | SelfCheckResult | PressResult | DipResult | CaptureResult | ReviewResult,
+    Field(discriminator="kind"),
 ]
 
 

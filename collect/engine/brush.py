@@ -1,4 +1,4 @@
-"""Steps in which the brush goes down, into ink or onto paper: dip, press, figure, zero touch, touch, self-check."""
+"""Steps in which the brush goes down, into ink or onto paper: dip, press, figure, zero touch, self-check."""
 
 from __future__ import annotations
 
@@ -9,15 +9,14 @@ from brushloop.collect.engine.recorder import StepContext, within_limits
 from brushloop.collect.errors import StepError
 from brushloop.collect.motion import TOUCH_TOLERANCE_MM
 from brushloop.collect.operator import Choice, Prompt
-from brushloop.collect.protocols.steps import DrawStep, PressStep, TouchStep, ZeroTouchStep
-from brushloop.collect.rig.config import TouchConfig
+from brushloop.collect.protocols.steps import DrawStep, PressStep, ZeroTouchStep
 from brushloop.collect.touch.force import ForceTap
 from brushloop.collect.touch.heights import plane_of
 from brushloop.collect.touch.measure import measure_plane
 from brushloop.collect.touch.selfcheck import self_check, triangle_on
 from brushloop.collect.walk import all_poses, step_poses, touch_of
 from brushloop.drivers.devices import PoseSample, Well
-from brushloop.sessions.events import DipResult, PressResult, SelfCheckResult, StepKind, TouchResult, ZeroTouchResult
+from brushloop.sessions.events import DipResult, PressResult, SelfCheckResult, StepKind, ZeroTouchResult
 from brushloop.sessions.records import InkState, Topic
 
 STALE_INK_S = 5.0
@@ -109,7 +108,15 @@ async def zero_touch(context: StepContext, step: ZeroTouchStep) -> ZeroTouchResu
         await rig.force.bias(rig.config.force.bias_s)
     if step.method is not None:
         await within_limits("", rig.config, step_poses(rig.config, run.procedures.plane, step))
-    measured = await _measured(context, touch_of(rig.config, step))
+    touch, tap = touch_of(rig.config, step), ForceTap()
+    context.guard.listeners.append(tap.take)
+
+    def tell(doing: str) -> None:
+        run.progress.doing(f"zero touch by {touch.method}: {doing}")
+
+    dip = partial(fill_brush, context)
+    measuring = measure_plane(run.procedures, touch, dip=dip, tap=tap, asker=run.asker, tell=tell)
+    measured = await context.guard.guarded(measuring)
     plane = plane_of(measured)
     poses = all_poses(rig.config, run.opening.protocol, plane)
     await within_limits("over the paper as it was touched, ", rig.config, poses)
@@ -137,19 +144,6 @@ async def _accepted(context: StepContext, moved_mm: float) -> None:
         raise StepError("the new height was not accepted.")
 
 
-async def touch(context: StepContext, step: TouchStep) -> TouchResult:
-    """The TOUCH step: measure the height of one point, by the method of the rig."""
-    run = context.run
-    config = touch_of(run.rig.config, step)
-    if config.method == "taught":
-        visited = run.procedures.visit(run.procedures.plane, step.x_mm, step.y_mm)
-        z_mm = await context.guard.guarded(visited)
-        return TouchResult(method="taught", x_mm=step.x_mm, y_mm=step.y_mm, z_mm=z_mm)
-    measured = await _measured(context, config)
-    [point] = measured.points
-    return TouchResult(method=measured.method, x_mm=point.x_mm, y_mm=point.y_mm, z_mm=point.z_mm, span_mm=point.span_mm)
-
-
 async def check_rig(context: StepContext) -> SelfCheckResult:
     """The SELF_CHECK step: a scalene triangle of marks shows whether the rig is mirrored, turned or stretched."""
     run, patches = context.run, context.patches
@@ -157,16 +151,3 @@ async def check_rig(context: StepContext) -> SelfCheckResult:
     checked = await context.guard.guarded(self_check(run.procedures, places_mm, partial(fill_brush, context)))
     place = {"sheet": run.store.state.sheet, "patches": tuple(patch.index for patch in patches)}
     return checked.model_copy(update=place)
-
-
-async def _measured(context: StepContext, config: TouchConfig) -> ZeroTouchResult:
-    run = context.run
-    tap = ForceTap()
-    context.guard.listeners.append(tap.take)
-
-    def tell(doing: str) -> None:
-        run.progress.doing(f"zero touch by {config.method}: {doing}")
-
-    dip = partial(fill_brush, context)
-    measured = measure_plane(run.procedures, config, dip=dip, tap=tap, asker=run.asker, tell=tell)
-    return await context.guard.guarded(measured)

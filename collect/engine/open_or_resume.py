@@ -79,7 +79,7 @@ def _lifted(rig: RigConfig, protocol: ProtocolConfig, by_mm: float) -> RigConfig
 
     Raises `ConfigError`, with the allowed range, if the brush would still meet the paper or travel too low.
     """
-    deepest_mm = max((stroke.condition.depth_mm for stroke in protocol.planned()), default=0.0)
+    deepest_mm = max(stroke.condition.depth_mm for stroke in protocol.planned())
     low_mm = deepest_mm + CLEAR_MM
     high_mm = rig.motion.safe_z_mm - rig.paper.touch_z_mm - TRAVEL_CLEARANCE_MM
     if not low_mm <= by_mm <= high_mm:

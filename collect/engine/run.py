@@ -42,7 +42,7 @@ from brushloop.sessions.events import DipResult, ReviewResult, StepKind, StepRes
 from brushloop.sessions.store import Attempt, step_message
 
 KEEP_SHEET = Choice("o", "keep the old sheet")
-HEIGHTS = MARKING | {StepKind.ZERO_TOUCH, StepKind.TOUCH}
+HEIGHTS = MARKING | {StepKind.ZERO_TOUCH}
 """Steps whose heights count only if the tool is still the one that was set, and the poses came in time."""
 
 
@@ -281,8 +281,6 @@ class Run(RunContext):
         match step:
             case steps.ZeroTouchStep():
                 return await brush.zero_touch(context, step)
-            case steps.TouchStep():
-                return await brush.touch(context, step)
             case steps.SelfCheckStep():
                 return await brush.check_rig(context)
             case steps.BoardStep():

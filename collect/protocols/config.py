@@ -18,7 +18,6 @@ from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.protocols.kinds import (
     MAX_STROKES,
-    CalibrationConfig,
     FewStrokesConfig,
     GridConfig,
     ListConfig,
@@ -31,7 +30,7 @@ from brushloop.sessions.disk import as_text, number
 MAX_PROTOCOL_BYTES = 4 * 1024 * 1024
 MAX_EFFECTIVE_BYTES = 64 * 1024 * 1024
 MAX_TABLE_BYTES = 4 * 1024 * 1024
-ProtocolConfig = GridConfig | FewStrokesConfig | ListConfig | ReplayConfig | WriteConfig | CalibrationConfig
+ProtocolConfig = GridConfig | FewStrokesConfig | ListConfig | ReplayConfig | WriteConfig
 TaggedProtocol = Annotated[ProtocolConfig, Field(discriminator="kind")]
 _PROTOCOL: TypeAdapter[ProtocolConfig] = TypeAdapter(TaggedProtocol)
 _R = TypeVar("_R", bound=BaseModel)

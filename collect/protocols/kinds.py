@@ -1,4 +1,4 @@
-"""The kinds of protocol: `grid`, `few-strokes`, `list`, `replay` press; `write` draws; `calibration` only touches.
+"""The kinds of protocol: `grid`, `few-strokes`, `list` and `replay` press; `write` draws.
 
 A kind with rounds says what one round presses or draws; `RoundsConfig` makes the order of all rounds.
 """
@@ -17,7 +17,6 @@ from pydantic import AfterValidator, AliasChoices, BaseModel, ConfigDict, Field,
 
 from brushloop.calibrate.stats import spread_out
 from brushloop.collect.protocols.steps import (
-    BoardStep,
     Drawn,
     HeadingDeg,
     InCellMm,
@@ -25,13 +24,11 @@ from brushloop.collect.protocols.steps import (
     Planned,
     Protocol,
     TiltDeg,
-    TouchStep,
     TrajectoryPoint,
-    ZeroTouchStep,
     balanced,
     stroke_steps,
 )
-from brushloop.collect.rig.config_file import Config, Finite
+from brushloop.collect.rig.config_file import Config
 from brushloop.collect.rig.paper import Layout
 from brushloop.sessions.records import Condition
 
@@ -78,7 +75,6 @@ Seed = Annotated[int, Field(ge=0)]
 FileName = Annotated[str, Field(min_length=1, max_length=200)]
 Depths = Annotated[list[DeepMm], Field(min_length=1, max_length=100), AfterValidator(distinct)]
 Tilts = Annotated[list[TiltDeg], Field(min_length=1, max_length=100), AfterValidator(distinct)]
-Place = tuple[Finite, Finite]
 
 
 class StrokesConfig(Config):
@@ -384,28 +380,3 @@ class WriteConfig(RoundsConfig):
             _, _, depth_mm, tilt_deg, _ = max(points, key=lambda point: point[2])
             strokes.append(Planned(f"{figure.name}-r{repeat:02d}", Condition(depth_mm, tilt_deg), repeat, drawn=drawn))
         return strokes
-
-
-class CalibrationConfig(Config):
-    """Touches and views of the board, nothing else: no ink, no mark."""
-
-    kind: Literal["calibration"]
-    touches_mm: Annotated[tuple[Place, ...], Field(max_length=200), AfterValidator(distinct)] = ()
-    """Points of the sheet to touch, x and y in the paper frame. Three that are not on a line give the sheet's slope."""
-    rounds: Annotated[int, Field(ge=1, le=100)] = 1
-    """How often all of them are touched: the spread of a point over the rounds shows how well a touch repeats."""
-    board_views: Annotated[int, Field(ge=1, le=100)] = 1
-    """How often the board is photographed in each round."""
-
-    def planned(self, layout: Layout | None = None) -> list[Planned]:
-        """No stroke."""
-        return []
-
-    def steps(self, layout: Layout | None = None, *, self_check: bool = False) -> Protocol:
-        """Zero touch, then in each round every touch and every view of the board; no self-check, which would mark."""
-        yield ZeroTouchStep(0)
-        for number in range(self.rounds):
-            for k, (x_mm, y_mm) in enumerate(self.touches_mm):
-                yield TouchStep(number * len(self.touches_mm) + k, x_mm, y_mm)
-            for k in range(self.board_views):
-                yield BoardStep(number * self.board_views + k)

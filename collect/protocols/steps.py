@@ -92,15 +92,6 @@ class BoardStep(StepBase):
 
 
 @dataclass(frozen=True, slots=True)
-class TouchStep(StepBase):
-    """Bring the tip down on a point of the sheet and measure its height."""
-
-    kind: ClassVar[StepKind] = StepKind.TOUCH
-    x_mm: float
-    y_mm: float
-
-
-@dataclass(frozen=True, slots=True)
 class SelfCheckStep(StepBase):
     """Press an uneven triangle of marks, and find them in a photograph."""
 
@@ -154,7 +145,7 @@ class ReviewStep(StepBase):
     kind: ClassVar[StepKind] = StepKind.REVIEW
 
 
-Step = ZeroTouchStep | BoardStep | TouchStep | SelfCheckStep | DipStep | PressStep | DrawStep | CaptureStep | ReviewStep
+Step = ZeroTouchStep | BoardStep | SelfCheckStep | DipStep | PressStep | DrawStep | CaptureStep | ReviewStep
 _ADAPTERS = {step.kind: TypeAdapter[Any](step) for step in get_args(Step)}
 MARKING = frozenset({StepKind.PRESS, StepKind.DRAW, StepKind.SELF_CHECK})
 """Steps that leave ink on a paper patch of their own."""

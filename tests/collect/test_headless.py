@@ -119,7 +119,7 @@ def test_the_recording_and_what_comes_next(tmp_path: Path) -> None:
     assert ending(folder, "grid") == [recorded, f"next:     brushloop calibrate {folder}"]
     (folder / "calibration").mkdir(parents=True)
     assert ending(folder, "list") == [recorded, f"next:     brushloop validate {folder}"]
-    assert ending(folder, "calibration") == [recorded]
+    assert ending(folder, "write") == [recorded]
 
 
 def test_the_ending_is_printed_after_the_screen_too(

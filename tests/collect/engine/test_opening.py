@@ -150,7 +150,7 @@ def test_the_start_screen_resumes_each_session_with_its_own_protocol(
 ) -> None:
     """Another protocol lies in the folder, and a newer session is open."""
     begin("grid-02")
-    Path("protocol.toml").write_text('kind = "calibration"\n')
+    edit("protocol.toml", "repeats = 2", "repeats = 3")
     openings: list[Opening] = []
 
     def engine_for(opening: Opening) -> FakeEngine:

@@ -58,19 +58,18 @@ def config(tmp_path: Path) -> RigConfig:
 
 
 @pytest.mark.parametrize(
-    ("name", "strokes", "patches", "sheets", "dips", "touches"),
+    ("name", "strokes", "patches", "sheets", "dips"),
     [
-        ("protocol.toml", 150, 42, 4, 150, 1),
-        ("protocol-write.toml", 2, 6, 1, 4, 1),  # figures have patches of their own size, and dip between strokes
-        ("protocol-calibration.toml", 0, 42, 1, 0, 6),
+        ("protocol.toml", 150, 42, 4, 150),
+        ("protocol-write.toml", 2, 6, 1, 4),  # figures have patches of their own size, and dip between strokes
     ],
 )
 def test_a_plan_says_what_a_protocol_takes(
-    config: RigConfig, name: str, strokes: int, patches: int, sheets: int, dips: int, touches: int
+    config: RigConfig, name: str, strokes: int, patches: int, sheets: int, dips: int
 ) -> None:
     plan = make_plan(config, example(name))
     assert (len(plan.placed), plan.patches_per_sheet, plan.sheets, plan.dips) == (strokes, patches, sheets, dips)
-    assert len(plan.touches_mm) == touches
+    assert plan.touches_mm == (config.paper.touch_point_mm,)
     assert len({(p.sheet, p.patch) for p in plan.placed}) == strokes
     assert list(plan.sheet_changes) == [plan.placed[i].stroke_id for i in range(patches, strokes, patches)]
     assert sum(plan.seconds_by_kind.values()) == pytest.approx(plan.seconds)
@@ -80,17 +79,12 @@ def figure(*points: list[float], patch: str = "[60.0, 60.0]") -> str:
     return f'kind = "write"\ncell_mm = {patch}\n[[figures]]\nname = "a"\n[[figures.strokes]]\npoints = {list(points)}\n'
 
 
-def touching(x_mm: float) -> str:
-    return f'kind = "calibration"\ntouches_mm = [[{x_mm}, 9.0]]\n'
-
-
 HERE, THERE = [9.0, 9.0, 9.0, 0.0, 0.0], [20.0, 9.0, 9.0, 0.0, 0.0]
 NEAR_TOUCH, TOO_DEEP, TOO_TILTED = [1.0, 0.0, 9.0, 0.0, 0.0], [20.0, 9.0, 23.0, 0.0, 0.0], [20.0, 9.0, 9.0, 20.0, 0.0]
 TOUCH = ("touch_point_mm = [2.0, 2.0]", "touch_point_mm = [4.0, 26.0]")
 NARROW = ("y_mm = [-260.0, 260.0]", "y_mm = [-260.0, 100.0]")
 MOTION = "\n[motion]"
 BY_JOG = MOTION, '\n[touch]\nmethod = "jog"\npoints_mm = [[2.0, 2.0], [240.0, 9.0]]\n' + MOTION
-BY_CAMERA = MOTION, BY_JOG[1].replace("jog", "camera").replace("240.0, 9.0", "240.0, 9.0], [9.0, 90.0")
 DEEP_TOUCH = MOTION, '\n[touch]\nmethod = "force"\ntravel_mm = 20.0\npoints_mm = [[200.0, 9.0]]\n' + MOTION
 DEEP_CHECK = MOTION, "\n[self_check]\nenabled = true\ndepth_mm = 10.0\n" + MOTION
 SOFT = "max_depth_mm = 22.0", "max_depth_mm = 9.5"
@@ -109,9 +103,6 @@ REPLAYED = 'kind = "replay"\nof = "s"\npresses = [{stroke_id = "b", depth_mm = 2
         (figure(HERE, THERE, patch="[300.0, 60.0]"), [], r"protocol.toml: cell_mm: .* does not fit"),
         (figure(HERE, TOO_TILTED), [], r"tilt = 20.000 deg is outside .*\(a-r01 on patch 0\)"),
         (figure(NEAR_TOUCH, THERE), [TOUCH], r"\[4.0, 26.0\] lies within 5 mm of ink at \[3.0, 26.0\]"),
-        (touching(250.0), [], r"touches_mm: \[250, 9\] lies off the sheet"),
-        (touching(240.0), [NARROW], r"y = 130.000 mm is outside .*\(touch\)"),
-        (touching(9.0), [BY_CAMERA], r"protocol.toml: touches_mm: single touches cannot be found by camera"),
         (LISTED, [BY_JOG, NARROW], r"y = 130.000 mm is outside .*\(zero_touch\)"),
         (LISTED, [DEEP_TOUCH], r"z = 96\.\d+ mm is outside .*\(zero_touch\)"),
         (LISTED, [DEEP_CHECK, SOFT], r"z = 110.030 mm is outside .*\(self_check on patch 0\)"),
@@ -188,7 +179,6 @@ def test_a_self_check_takes_a_patch_before_the_first_stroke(tmp_path: Path) -> N
     assert (len(plan.placed), plan.placed[0].patch, plan.placed[41].sheet, plan.dips) == (150, 1, 1, 153)
     used = {placed.patch for placed in plan.placed if placed.sheet == 0}
     assert used == set(range(42)) - {0, 5, 36}, "the self-check lies over three corners"
-    assert "self_check" not in make_plan(config, example("protocol-calibration.toml")).steps
     small = rig(tmp_path, "[motion]", "[self_check]\nenabled = true\nlegs_mm = [50.0, 15.0]\n\n[motion]")
     with pytest.raises(ConfigError, match=r"rig.toml: self_check.legs_mm: a triangle of 50 by 15 mm does not fit"):
         check_protocol(tmp_path / "rig.toml", EXAMPLES / "protocol.toml", small, example("protocol.toml"))
@@ -297,7 +287,6 @@ FIGURE = "[[figures]]\nname = 'a'\n" + "".join(
 KINDS = {
     "grid": 'kind = "grid"\ndepths_mm = [9.0]\ntilts_deg = [5.0]\nrepeats = 2\nboard_every = 1\n',
     "write": f'kind = "write"\ncell_mm = [60.0, 60.0]\n{FIGURE}',
-    "calibration": 'kind = "calibration"\ntouches_mm = [[20.0, 20.0], [200.0, 20.0]]\n',
 }
 """The other kinds press as a grid does."""
 

@@ -22,7 +22,6 @@ from brushloop.collect.errors import ConfigError
 from brushloop.collect.protocols import config as protocol_config
 from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
 from brushloop.collect.protocols.kinds import (
-    CalibrationConfig,
     DrawnStroke,
     FewStrokesConfig,
     Figure,
@@ -40,7 +39,6 @@ from brushloop.collect.protocols.steps import (
     PressStep,
     Step,
     StepKind,
-    TouchStep,
     press_of,
 )
 from brushloop.collect.rig.config import PaperConfig
@@ -146,8 +144,11 @@ def test_keys_and_order_are_the_same_in_another_process() -> None:
 
 def test_board_views_come_after_every_so_many_strokes_and_not_at_the_end() -> None:
     config = GridConfig(kind="grid", depths_mm=[11.0], tilts_deg=[0.0], repeats=6, board_every=2)
-    kinds = [step.kind for step in run(config) if step.kind in (StepKind.BOARD, StepKind.PRESS)]
+    walked = run(config)
+    kinds = [step.kind for step in walked if step.kind in (StepKind.BOARD, StepKind.PRESS)]
     assert "".join(kind[0] for kind in kinds) == "bppbppbpp"
+    again = [step.kind for step in walked if step.run_scoped]
+    assert again == [StepKind.ZERO_TOUCH, StepKind.BOARD], "each process touches the paper and looks at the board first"
 
 
 def test_a_list_keeps_its_order_and_names_and_shuffles_only_for_a_seed() -> None:
@@ -158,18 +159,6 @@ def test_a_list_keeps_its_order_and_names_and_shuffles_only_for_a_seed() -> None
     assert [s.stroke_id for s in as_written][5] == "light-r02"
     assert [s.dwell_s for s in as_written][:3] == [0.2, 0.2, 0.5]
     assert [s.stroke_id for s in listed.planned()] != [s.stroke_id for s in as_written]
-
-
-def test_a_calibration_touches_and_looks_and_leaves_no_mark() -> None:
-    config = load_protocol(EXAMPLES / "protocol-calibration.toml")
-    assert isinstance(config, CalibrationConfig)
-    walked = run(config)
-    assert config.planned() == []
-    assert Counter(step.kind for step in walked) == {StepKind.ZERO_TOUCH: 1, StepKind.TOUCH: 15, StepKind.BOARD: 6}
-    assert len({step.key for step in walked}) == len(walked)
-    assert walked[1] == TouchStep(walked[1].index, 20.0, 20.0)
-    again = [step.kind for step in walked if step.run_scoped]
-    assert again == [StepKind.ZERO_TOUCH, StepKind.BOARD], "each process touches the paper and looks at the board first"
 
 
 # Grids and their sheets
@@ -240,7 +229,6 @@ LIST = 'kind = "list"\nfile = "p.csv"\n'
 REPLAY = 'kind = "replay"\nof = "old"\nfile = "p.csv"\n'
 WRITE = 'kind = "write"\ncell_mm = [60.0, 60.0]\n[[figures]]\nname = "a"\n[[figures.strokes]]\n'
 POINTS = "points = [[10.0, 10.0, 5.0, 0.0, 0.0], [20.0, 10.0, 5.0, 0.0, 0.0]]\n"
-CALIBRATION = 'kind = "calibration"\n'
 
 
 def load(folder: Path, protocol: str, csv: str | bytes | None = None):
@@ -284,9 +272,8 @@ def load(folder: Path, protocol: str, csv: str | bytes | None = None):
         (WRITE + POINTS.replace("5.0,", "-1.0,"), None, r"nothing would be drawn"),
         (WRITE + POINTS.replace("20.0", "nan"), None, r"figures.0.strokes.0.points.1.0: "),
         ('kind = "write"\ncell_mm = [60.0, 60.0]\nfigures = 3\n', None, r"figures: "),
-        (CALIBRATION + "touches_mm = [[1.0, 1.0], [1.0, 1.0]]\n", None, r"touches_mm: \(1.0, 1.0\) occurs twice"),
-        (CALIBRATION + "board_every = 3\n", None, r"board_every: unknown field; did you mean board_views"),
-        ('kind = "teapot"\n', None, r"kind: 'teapot' is not one of 'grid', 'few-strokes', 'list', 'replay', 'write', "),
+        (GRID_FILE + "board_evry = 3\n", None, r"board_evry: unknown field; did you mean board_every"),
+        ('kind = "teapot"\n', None, r"kind: 'teapot' is not one of 'grid', 'few-strokes', 'list', 'replay', 'write'$"),
         (GRID_FILE + "hurry = 3\n", None, r"hurry: unknown field; known are board_every, .*, depths_mm, .*, kind$"),
         (GRID_FILE + "repeats = 0\n", None, r"repeats: .*1 \(given: 0\)$"),
         (GRID_FILE.replace("11.0", "11.0, 11.0"), None, r"depths_mm: 11.0 occurs twice"),
