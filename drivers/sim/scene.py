@@ -139,8 +139,7 @@ class Scene:
 
     def __init__(self, world: World) -> None:
         self._world = world
-        table, view = world.config.table, world.config.view
-        self._blank, self._noise = _draw(table, world.config.seed, view.noise, (view.height_px, view.width_px))
+        view = world.config.view
         self.optics = Optics(view, world.config.seed)
         self._shown: tuple[int, Pose | None] = (-1, None)
         self._lit: NDArray[np.float32] = np.zeros(0, np.float32)
@@ -151,6 +150,11 @@ class Scene:
         self._disc_radius_px = round(TOOL_CLEAR_MM * view.px_per_mm)
         self.held: Pose | None = None
         """The board before the camera, which hides the rest, in the frame of the camera: x right, y down, z ahead."""
+
+    @functools.cached_property
+    def _drawn(self) -> tuple[NDArray[np.uint8], list[NDArray[np.float32]]]:
+        config, view = self._world.config, self._world.config.view
+        return _draw(config.table, config.seed, view.noise, (view.height_px, view.width_px))
 
     def render(self, tool: Pose | None = None) -> NDArray[np.uint8]:
         """A (height, width) gray image of the world now.
@@ -165,7 +169,7 @@ class Scene:
             self._frames.clear()
         field = next(self._fields)
         if field not in self._frames:
-            self._frames[field] = self._exposed(self._lit + self._noise[field])
+            self._frames[field] = self._exposed(self._lit + self._drawn[1][field])
         frame = self._frames[field]
         disc_px = None if held else self._tool_disc(tool)
         if disc_px is not None:
@@ -183,7 +187,7 @@ class Scene:
 
     def _light_sheet(self) -> NDArray[np.float32]:
         table = self._world.config.table
-        raster = self._blank.copy()
+        raster = self._drawn[0].copy()
         sheet = _sheet_slices(table)
         kept = 1.0 - (1.0 - INK_REFLECTANCE) * self._world.paper.density
         raster[sheet] = (raster[sheet] * kept).astype(np.uint8)
