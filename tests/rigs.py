@@ -29,7 +29,7 @@ from brushloop.drivers.arcs.wire import RpcConnection
 from brushloop.drivers.camera.source import CameraTable
 from brushloop.drivers.devices import Frame, Identity, Stamp
 from brushloop.drivers.errors import DeviceTimeout
-from brushloop.drivers.force import sri_m8123 as force_driver
+from brushloop.drivers.force.sri_m8123 import SriM8123
 from brushloop.drivers.host import Clock
 from brushloop.drivers.sim.brush.footprint import Flaw
 from brushloop.drivers.sim.config import SimConfig, Table, View
@@ -258,7 +258,7 @@ class WirelessRig(LoopbackRig):
         async with contextlib.AsyncExitStack() as stack:
             patch = stack.enter_context(pytest.MonkeyPatch.context())
             patch.setattr(devices, "OpenCvCamera", lambda table, clock, _: SceneCamera(self, table, clock))
-            patch.setattr(force_driver, "RoundStream", lambda *arguments: LoopRounds(self, *arguments))
+            patch.setattr(devices, "SriM8123", lambda *arguments: LoopSensor(self, *arguments))
             patch.setattr("serial.Serial", lambda *_, **__: MemoryLine(self))
             for server, port in ((self.arcs, PORTS["arcs"]), (self.rtde, PORTS["rtde"])):
                 await server.start(self.address, port)
@@ -297,25 +297,28 @@ class SceneCamera:
         self._newest = None
 
 
-class LoopRounds(force_driver.RoundStream):
-    """The rounds of the force board, read by a task instead of a thread."""
+class LoopSensor(SriM8123):
+    """The force sensor, whose rounds are read by a task instead of a thread."""
 
     def __init__(self, rig: WirelessRig, *arguments: Any) -> None:
         super().__init__(*arguments)
         assert rig.force is not None
         self._rig, self._board = rig, rig.force.board
-        self._board.streaming = True
-        self._task = asyncio.get_running_loop().create_task(self._read(), name="force rounds")
 
-    def stop(self, timeout_s: float = 5.0) -> None:
-        super().stop(timeout_s)
+    async def connect(self) -> Identity:
+        self._board.streaming = True
+        self._task = asyncio.create_task(self._read(), name="force rounds")
+        return await super().connect()
+
+    async def close(self) -> None:
+        await super().close()
         self._task.cancel()
 
     def _run(self) -> None:
         """Leave the thread without work."""
 
     async def _read(self) -> None:
-        while self.loss is None:
+        while self._loss is None:
             for frame in self._board.round(self._rig.clock.now_s()):
                 at_s, is_error = self._rig.time.now_s, frame.error
                 self._take(can.Message(at_s, frame.can_id, False, False, is_error, data=frame.data))

@@ -133,13 +133,13 @@ async def _force(config: ForceTable, clock: Clock) -> Finding:
     async def look() -> None:
         first = sensor.latest().stamp
         await asyncio.sleep(0.5)  # a hundred rounds give the rate
-        newest, stream = sensor.latest(), sensor.stream
+        newest = sensor.latest()
         rate_hz = 1e9 * (newest.stamp.seq - first.seq) / max(newest.stamp.host_ns - first.host_ns, 1)
         finding.latency_ms = (clock.now_ns() - newest.stamp.host_ns) / 1e6
-        force_n, dropped = math.hypot(*newest.force_n), stream.assembler
+        force_n, dropped = math.hypot(*newest.force_n), sensor.assembler
         finding.notes = f"{rate_hz:.0f} rounds/s, {force_n:.3f} N before bias"
-        if dropped.torn or dropped.refused or stream.bus_errors:
-            finding.problem = f"{dropped.torn} torn, {dropped.refused} refused rounds, {stream.bus_errors} bus errors"
+        if dropped.torn or dropped.refused or sensor.bus_errors:
+            finding.problem = f"{dropped.torn} torn, {dropped.refused} refused rounds, {sensor.bus_errors} bus errors"
             finding.remedy = "Check wiring, shielding and termination."
         elif force_n > config.max_n:
             ceiling = f"above the ceiling force.max_n = {config.max_n:g} N"

@@ -111,6 +111,8 @@ AXES = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 CONNECT_S = 10.0
 """Time to open the bus, even through a gateway, and get a first round."""
 RECEIVE_S = 0.05
+JOIN_S = 5.0
+"""Longest wait for the reader to stop the board."""
 SILENT_S = 1.0
 """A board that streamed and then sends nothing for this long is lost: a gateway that goes away gives no notice."""
 STUCK_MS, STUCK_ROUNDS = 100.0, 10
@@ -158,31 +160,128 @@ class ForceTable(BaseModel, frozen=True, extra="forbid"):
         return self
 
 
-class RoundStream:
-    """Starts the sensor, reads it until `stop`, and stops it again. Use one for each connection."""
+class SriM8123:
+    """The force sensor. A thread reads its board; samples reach the listener in the event loop that made the driver."""
 
-    def __init__(self, table: ForceTable, clock: Clock, on_round: Callable[[RoundStream, Stamp, Wrench], None]) -> None:
-        """`on_round` gets each round, in the event loop that runs now."""
-        self._loop = asyncio.get_running_loop()
+    def __init__(self, table: ForceTable, clock: Clock) -> None:
         self._table = table
+        self._clock = clock
+        self._loop = asyncio.get_running_loop()
+        self._listener: Callable[[ForceSample], None] | None = None
+        self._averaged: list[Wrench] | None = None
+        """Collects every round while an average is taken."""
+        self.bias_wrench = NO_BIAS
+        """What is subtracted from every round; raw value = sample + bias."""
         self.assembler = RoundAssembler()
         """Counts the rounds that were dropped."""
-        self._clock = clock
-        self._on_round = on_round
-        self._closing = threading.Event()
         self.bus_errors = 0
-        self.newest: tuple[Stamp, Wrench] | None = None
-        self.alike_since = Stamp(0)
+        self._newest: tuple[Stamp, Wrench] | None = None
+        self._alike_since = Stamp(0)
         """Of the first round in a row that exactly equals the newest; a strain gauge is never that still."""
-        self.loss: tuple[str, str] | None = None
-        """Why the stream ended, and what to do about it."""
+        self._loss: tuple[str, str] | None = None
+        """Why the thread ended, and what to do about it."""
+        self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="force reader", daemon=True)
-        self._thread.start()
 
-    def stop(self, timeout_s: float = 5.0) -> None:
-        """Stop the sensor, shut the bus down, join the thread; blocks."""
+    async def connect(self) -> Identity:
+        """Open the bus, start the board, wait for its first complete round. Raises `ConnectionLost`, `DeviceTimeout`.
+
+        After a failure the board is stopped and nothing is left open.
+        """
+        self._thread.start()
+        try:
+            async with asyncio.timeout(CONNECT_S):
+                while self._newest is None:
+                    self._require("connect")
+                    await asyncio.sleep(RECEIVE_S)
+        except TimeoutError:
+            await self.close()
+            dropped = self.assembler
+            what = f"no whole round in {CONNECT_S:g} s ({dropped.torn} torn, {dropped.refused} refused)"
+            remedy = "Check power, wiring, termination and bit rate."
+            raise DeviceTimeout(DEVICE, "connect", what, remedy=remedy) from None
+        except BaseException:
+            await self.close()
+            raise
+        # The board has no identification. No real board can be on a virtual bus or on the loopback rig's bus.
+        interface, channel = self._table.interface, self._table.channel
+        simulated = interface == "virtual" or (interface, channel) == ("socketcand", LOOPBACK_CHANNEL)
+        return Identity(DEVICE, f"SRI M8123B2 on {interface} {channel}", "", simulated)
+
+    def latest(self) -> ForceSample:
+        """The newest sample; never blocks. Raises `Stale`, `Stuck`, `ConnectionLost`, `NotConnected`."""
+        self._require("latest")
+        newest, since = self._newest, self._alike_since
+        if newest is None:
+            raise NotConnected(DEVICE, "latest", "no sample yet")
+        stamp, wrench = newest
+        age_ms = (self._clock.now_ns() - stamp.host_ns) / 1e6
+        if age_ms > self._table.stale_ms:
+            raise Stale(DEVICE, age_ms, self._table.stale_ms)
+        alike, alike_ms = stamp.seq - since.seq, (stamp.host_ns - since.host_ns) / 1e6
+        if alike >= STUCK_ROUNDS and alike_ms > STUCK_MS:
+            raise Stuck(DEVICE, alike_ms, alike)
+        return self._sample(stamp, wrench)
+
+    def listen(self, on_sample: Callable[[ForceSample], None] | None) -> None:
+        """Hand every sample to `on_sample`, in the event loop; None ends it."""
+        self._listener = on_sample
+
+    async def bias(self, seconds: float) -> None:
+        """Average for `seconds` with nothing touching, and subtract that from now on.
+
+        Raises `DeviceError` if the sensor was not still, `Stale` or `DeviceTimeout` if it sent too little; the previous
+        bias then remains.
+        """
+        self._require("bias")
+        rounds = self._averaged = list[Wrench]()
+        try:
+            await asyncio.sleep(seconds)
+        finally:
+            self._averaged = None
+        self.latest()
+        if len(rounds) < MIN_BIAS_ROUNDS:
+            what = f"{len(rounds)} rounds in {seconds:g} s, {MIN_BIAS_ROUNDS} are needed"
+            raise DeviceTimeout(DEVICE, "bias", what, remedy="Average for longer.")
+        axes = list(zip(*rounds, strict=True))
+        for name, values in zip(AXES, axes, strict=True):
+            limit, unit = (STILL_N, "N") if name.startswith("F") else (STILL_NM, "Nm")
+            if (deviation := statistics.stdev(values)) > limit:
+                raise DeviceError(
+                    DEVICE,
+                    "bias",
+                    f"{name} varied by {deviation:.4f} {unit} (standard deviation), limit {limit:g} {unit}",
+                    condition="The previous bias remains.",
+                    remedy="Let nothing touch the brush, wait until the arm is still, and try again.",
+                )
+        self.bias_wrench = tuple(statistics.fmean(values) for values in axes)
+
+    async def close(self) -> None:
+        """Stop the board, shut the bus down, join the thread; may be repeated."""
         self._closing.set()
-        self._thread.join(timeout_s)
+        if self._thread.ident is not None:
+            await asyncio.shield(asyncio.to_thread(self._thread.join, JOIN_S))
+
+    def _require(self, op: str) -> None:
+        if self._closing.is_set():
+            raise NotConnected(DEVICE, op, "closed")
+        if self._loss is not None:
+            what, remedy = self._loss
+            raise ConnectionLost(DEVICE, op, what, remedy=f"{too_busy()} {remedy}".strip())
+
+    def _hear(self, stamp: Stamp, wrench: Wrench) -> None:
+        if self._closing.is_set():
+            return
+        if self._averaged is not None:
+            self._averaged.append(wrench)
+        if self._listener is not None:
+            self._listener(self._sample(stamp, wrench))
+
+    def _sample(self, stamp: Stamp, wrench: Wrench) -> ForceSample:
+        fx, fy, fz, mx, my, mz = (raw - bias for raw, bias in zip(wrench, self.bias_wrench, strict=True))
+        return ForceSample(stamp, (fx, fy, fz), (mx, my, mz))
+
+    # What follows runs in the thread.
 
     def _run(self) -> None:
         try:
@@ -192,12 +291,12 @@ class RoundStream:
         except Exception as error:
             # Back ends raise arbitrary exceptions if a library or a package is missing.
             name = f"{self._table.interface} {self._table.channel}"
-            self.loss = (f"cannot open {name}: {error}", "Check the adapter and that its interface is up.")
+            self._loss = (f"cannot open {name}: {error}", "Check the adapter and that its interface is up.")
             return
         try:
             self._command(bus, START)
             quiet_s = -math.inf  # until the board streams
-            while self.loss is None and not self._closing.is_set():
+            while self._loss is None and not self._closing.is_set():
                 if (message := bus.recv(RECEIVE_S)) is not None:
                     quiet_s = 0.0
                     self._take(message)
@@ -212,8 +311,8 @@ class RoundStream:
             with contextlib.suppress(can.CanError, OSError):
                 self._command(bus, STOP)
             bus.shutdown()
-            if not self._closing.is_set() and self.loss is None:
-                self.loss = ("the reader failed", "Connect again.")
+            if not self._closing.is_set() and self._loss is None:
+                self._loss = ("the reader failed", "Connect again.")
 
     def _open(self) -> can.BusABC:
         import can
@@ -242,139 +341,17 @@ class RoundStream:
         if wrench is None:
             return
         device_ns = round(message.timestamp * 1e9) or None  # 0: the adapter has no clock
-        seq = self.newest[0].seq + 1 if self.newest is not None else 0
+        seq = self._newest[0].seq + 1 if self._newest is not None else 0
         stamp = Stamp(self._clock.now_ns(), device_ns, seq)
-        if self.newest is None or wrench != self.newest[1]:
-            self.alike_since = stamp
-        self.newest = (stamp, wrench)
+        if self._newest is None or wrench != self._newest[1]:
+            self._alike_since = stamp
+        self._newest = (stamp, wrench)
         with contextlib.suppress(RuntimeError):  # the loop ended before the stream was closed
-            self._loop.call_soon_threadsafe(self._on_round, self, stamp, wrench)
+            self._loop.call_soon_threadsafe(self._hear, stamp, wrench)
 
     def _lose_bus(self, what: str) -> None:
-        self.loss = (
+        self._loss = (
             f"the bus {self._table.interface} {self._table.channel} {what}",
             f"Check wiring, termination and that both ends run at {self._table.bitrate} bit/s; "
             "then set the interface down and up, and connect again.",
         )
-
-
-class SriM8123:
-    """The force sensor behind a `RoundStream`; samples reach listeners in the event loop that connected."""
-
-    def __init__(self, table: ForceTable, clock: Clock) -> None:
-        self._table = table
-        self._clock = clock
-        self._stream: RoundStream | None = None
-        self._listener: Callable[[ForceSample], None] | None = None
-        self._averaged: list[Wrench] | None = None
-        """Collects every round while an average is taken."""
-        self.bias_wrench = NO_BIAS
-        """What is subtracted from every round; raw value = sample + bias."""
-
-    async def connect(self) -> Identity:
-        """Open the bus, start the board, wait for its first complete round. Raises `ConnectionLost`, `DeviceTimeout`.
-
-        After a failure the board is stopped and nothing is left open. A bias does not survive.
-        """
-        await self.close()
-        self.bias_wrench = NO_BIAS
-        stream = self._stream = RoundStream(self._table, self._clock, self._hear)
-        try:
-            async with asyncio.timeout(CONNECT_S):
-                while stream.newest is None:
-                    self._require("connect")
-                    await asyncio.sleep(RECEIVE_S)
-        except TimeoutError:
-            await self.close()
-            dropped = stream.assembler
-            what = f"no whole round in {CONNECT_S:g} s ({dropped.torn} torn, {dropped.refused} refused)"
-            remedy = "Check power, wiring, termination and bit rate."
-            raise DeviceTimeout(DEVICE, "connect", what, remedy=remedy) from None
-        except BaseException:
-            await self.close()
-            raise
-        # The board has no identification. No real board can be on a virtual bus or on the loopback rig's bus.
-        interface, channel = self._table.interface, self._table.channel
-        simulated = interface == "virtual" or (interface, channel) == ("socketcand", LOOPBACK_CHANNEL)
-        return Identity(DEVICE, f"SRI M8123B2 on {interface} {channel}", "", simulated)
-
-    def latest(self) -> ForceSample:
-        """The newest sample; never blocks. Raises `Stale`, `Stuck`, `ConnectionLost`, `NotConnected`."""
-        stream = self._require("latest")
-        newest, since = stream.newest, stream.alike_since
-        if newest is None:
-            raise NotConnected(DEVICE, "latest", "no sample yet")
-        stamp, wrench = newest
-        age_ms = (self._clock.now_ns() - stamp.host_ns) / 1e6
-        if age_ms > self._table.stale_ms:
-            raise Stale(DEVICE, age_ms, self._table.stale_ms)
-        alike, alike_ms = stamp.seq - since.seq, (stamp.host_ns - since.host_ns) / 1e6
-        if alike >= STUCK_ROUNDS and alike_ms > STUCK_MS:
-            raise Stuck(DEVICE, alike_ms, alike)
-        return self._sample(stamp, wrench)
-
-    def listen(self, on_sample: Callable[[ForceSample], None] | None) -> None:
-        """Hand every sample to `on_sample`, in the event loop; None ends it."""
-        self._listener = on_sample
-
-    async def bias(self, seconds: float) -> None:
-        """Average for `seconds` with nothing touching, and subtract that from now on.
-
-        Raises `DeviceError` if the sensor was not still, `Stale` or `DeviceTimeout` if it sent too little; the previous
-        bias then remains.
-        """
-        stream = self._require("bias")
-        rounds = self._averaged = list[Wrench]()
-        try:
-            await asyncio.sleep(seconds)
-        finally:
-            self._averaged = None
-        if self._stream is not stream:
-            raise NotConnected(DEVICE, "bias", "closed while averaging")
-        self.latest()
-        if len(rounds) < MIN_BIAS_ROUNDS:
-            what = f"{len(rounds)} rounds in {seconds:g} s, {MIN_BIAS_ROUNDS} are needed"
-            raise DeviceTimeout(DEVICE, "bias", what, remedy="Average for longer.")
-        axes = list(zip(*rounds, strict=True))
-        for name, values in zip(AXES, axes, strict=True):
-            limit, unit = (STILL_N, "N") if name.startswith("F") else (STILL_NM, "Nm")
-            if (deviation := statistics.stdev(values)) > limit:
-                raise DeviceError(
-                    DEVICE,
-                    "bias",
-                    f"{name} varied by {deviation:.4f} {unit} (standard deviation), limit {limit:g} {unit}",
-                    condition="The previous bias remains.",
-                    remedy="Let nothing touch the brush, wait until the arm is still, and try again.",
-                )
-        self.bias_wrench = tuple(statistics.fmean(values) for values in axes)
-
-    @property
-    def stream(self) -> RoundStream:
-        """Counters since `connect`. Raises `NotConnected`, `ConnectionLost`."""
-        return self._require("stream")
-
-    async def close(self) -> None:
-        """Stop the board, shut the bus down, join the reader; may be repeated."""
-        stream, self._stream = self._stream, None
-        if stream is not None:
-            await asyncio.shield(asyncio.to_thread(stream.stop))
-
-    def _hear(self, stream: RoundStream, stamp: Stamp, wrench: Wrench) -> None:
-        if stream is not self._stream:
-            return  # of an earlier connection
-        if self._averaged is not None:
-            self._averaged.append(wrench)
-        if self._listener is not None:
-            self._listener(self._sample(stamp, wrench))
-
-    def _require(self, op: str) -> RoundStream:
-        if self._stream is None:
-            raise NotConnected(DEVICE, op, "not connected")
-        if (loss := self._stream.loss) is not None:
-            what, remedy = loss
-            raise ConnectionLost(DEVICE, op, what, remedy=f"{too_busy()} {remedy}".strip())
-        return self._stream
-
-    def _sample(self, stamp: Stamp, wrench: Wrench) -> ForceSample:
-        fx, fy, fz, mx, my, mz = (raw - bias for raw, bias in zip(wrench, self.bias_wrench, strict=True))
-        return ForceSample(stamp, (fx, fy, fz), (mx, my, mz))
