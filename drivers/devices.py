@@ -103,7 +103,7 @@ class Device(Protocol):
     """What every device of a rig can do."""
 
     async def connect(self) -> Identity:
-        """Open the connections and learn who answers; moves and powers nothing. Raises `DeviceError`."""
+        """Open the connections, once, and learn who answers; moves and powers nothing. Raises `DeviceError`."""
         ...
 
     async def close(self) -> None:

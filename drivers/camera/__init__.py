@@ -35,7 +35,7 @@ from brushloop.drivers.camera.source import (
     open_source,
 )
 from brushloop.drivers.devices import Frame, Identity, Stamp
-from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected
+from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout
 from brushloop.drivers.host import Clock
 
 if TYPE_CHECKING:
@@ -143,69 +143,6 @@ REOPEN_AFTER_S = 0.5
 JOIN_S = 5.0
 
 
-class OpenCvCamera:
-    """The camera of one source. Each connection has its own grabber, so no frame outlives its connection."""
-
-    def __init__(self, table: CameraTable, clock: Clock, on_notice: Callable[[str], None] = lambda _text: None) -> None:
-        self._table = table
-        self._clock = clock
-        self._on_notice = on_notice
-        self._grabber: _Grabber | None = None
-
-    async def connect(self) -> Identity:
-        """Start the grabber and wait for its first valid frame. Raises `ConnectionLost`, `DeviceError`, ..."""
-        grabber = self._grabber = _Grabber(self._table, self._clock, self._on_notice)
-        grabber.thread.start()
-        try:
-            frame = await self.fresh(Stamp(0))
-        except BaseException:
-            await self.close()
-            raise
-        height, width = frame.image.shape
-        locked = "".join(f", {name} {value:g}" for name, value in grabber.settings.items())
-        return Identity(DEVICE, f"{self._table.source} {width}x{height}{locked}", "", grabber.simulated)
-
-    async def fresh(self, after: Stamp) -> Frame:
-        """The first valid frame exposed after `after.host_ns`, never an older buffered one.
-
-        Raises `DeviceTimeout`, `ConnectionLost`.
-        """
-        grabber = self._grabber
-        if grabber is None:
-            raise NotConnected(DEVICE, "fresh", "not connected")
-        after_ns, until_s = after.host_ns, time.monotonic() + self._table.timeout_s
-        skipped_before = grabber.skipped.copy()
-        while True:
-            newest = grabber.newest
-            if grabber.closing.is_set():
-                raise ConnectionLost(DEVICE, "fresh", "closed while waiting")
-            if newest is not None and newest.exposed_after_ns >= after_ns:
-                image = await asyncio.to_thread(looked_at, newest.picture)
-                if not isinstance(image, FrameFault):
-                    return Frame(newest.stamp, newest.exposed_after_ns, image)
-                grabber.skipped[image] += 1
-                after_ns = newest.exposed_after_ns + 1
-            elif grabber.ended is not None:
-                raise grabber.ended
-            if time.monotonic() >= until_s:
-                raise DeviceTimeout(
-                    DEVICE,
-                    "fresh",
-                    f"no valid new frame from {self._table.source} in {self._table.timeout_s:g} s"
-                    + grabber.why_none(grabber.skipped.copy() - skipped_before),
-                    remedy="Check cable, light and stream; the arm does not move meanwhile.",
-                )
-            await asyncio.sleep(POLL_S)
-
-    async def close(self) -> None:
-        """End the grabber and wait for it; a read that hangs is left to the daemon thread."""
-        grabber = self._grabber
-        if grabber is not None:
-            grabber.closing.set()
-            await asyncio.to_thread(grabber.thread.join, JOIN_S)
-            self._grabber = None
-
-
 @dataclass(frozen=True, slots=True)
 class _Arrival:
     """A frame that nobody has looked at yet."""
@@ -215,26 +152,73 @@ class _Arrival:
     picture: Picture
 
 
-class _Grabber:
-    """The frames of one connection; its thread owns the source from open to release."""
+class OpenCvCamera:
+    """The camera of one source; its thread owns the source from open to release."""
 
-    def __init__(self, table: CameraTable, clock: Clock, on_notice: Callable[[str], None]) -> None:
+    def __init__(self, table: CameraTable, clock: Clock, on_notice: Callable[[str], None] = lambda _text: None) -> None:
         self._table = table
         self._clock = clock
         self._on_notice = on_notice
-        self.newest: _Arrival | None = None
-        self.skipped: Counter[FrameFault] = Counter()
+        self._newest: _Arrival | None = None
+        self._skipped: Counter[FrameFault] = Counter()
         """Frames that were passed over, by the thread or when somebody looked at them."""
         self._lost_ns: int | None = None
         """Since when a live source has been gone."""
-        self.ended: DeviceError | None = None
-        self.closing = threading.Event()
+        self._ended: DeviceError | None = None
+        self._closing = threading.Event()
         """Ends the thread after its current read."""
-        self.thread = threading.Thread(target=self._grab, name="camera grabber", daemon=True)
-        self.settings: dict[str, float] = {}
-        self.simulated = False
+        self._thread = threading.Thread(target=self._grab, name="camera grabber", daemon=True)
+        self._settings: dict[str, float] = {}
+        self._simulated = False
 
-    def why_none(self, skipped: Counter[FrameFault]) -> str:
+    async def connect(self) -> Identity:
+        """Start to grab, and wait for the first valid frame. Raises `ConnectionLost`, `DeviceError`, ..."""
+        self._thread.start()
+        try:
+            frame = await self.fresh(Stamp(0))
+        except BaseException:
+            await self.close()
+            raise
+        height, width = frame.image.shape
+        locked = "".join(f", {name} {value:g}" for name, value in self._settings.items())
+        return Identity(DEVICE, f"{self._table.source} {width}x{height}{locked}", "", self._simulated)
+
+    async def fresh(self, after: Stamp) -> Frame:
+        """The first valid frame exposed after `after.host_ns`, never an older buffered one.
+
+        Raises `DeviceTimeout`, `ConnectionLost`.
+        """
+        after_ns, until_s = after.host_ns, time.monotonic() + self._table.timeout_s
+        skipped_before = self._skipped.copy()
+        while True:
+            newest = self._newest
+            if self._closing.is_set():
+                raise ConnectionLost(DEVICE, "fresh", "closed")
+            if newest is not None and newest.exposed_after_ns >= after_ns:
+                image = await asyncio.to_thread(looked_at, newest.picture)
+                if not isinstance(image, FrameFault):
+                    return Frame(newest.stamp, newest.exposed_after_ns, image)
+                self._skipped[image] += 1
+                after_ns = newest.exposed_after_ns + 1
+            elif self._ended is not None:
+                raise self._ended
+            if time.monotonic() >= until_s:
+                raise DeviceTimeout(
+                    DEVICE,
+                    "fresh",
+                    f"no valid new frame from {self._table.source} in {self._table.timeout_s:g} s"
+                    + self._why_none(self._skipped.copy() - skipped_before),
+                    remedy="Check cable, light and stream; the arm does not move meanwhile.",
+                )
+            await asyncio.sleep(POLL_S)
+
+    async def close(self) -> None:
+        """End the thread and wait for it; a read that hangs is left to it."""
+        self._closing.set()
+        if self._thread.ident is not None:
+            await asyncio.to_thread(self._thread.join, JOIN_S)
+
+    def _why_none(self, skipped: Counter[FrameFault]) -> str:
         """Why no valid frame came, in brackets; empty if that is not known."""
         if self._lost_ns is not None:
             return " (the stream ended and is opened again)"
@@ -244,41 +228,43 @@ class _Grabber:
         counts = ", ".join(f"{count} {fault}" for fault, count in sorted(skipped.items()))
         return f" ({causes}frames skipped: {counts})"
 
+    # What follows runs in the thread.
+
     def _grab(self) -> None:
         try:
-            while not self.closing.is_set():
+            while not self._closing.is_set():
                 opening_ns = self._clock.now_ns()
                 try:
                     source = open_source(self._table)
                 except ConnectionLost:
                     if self._lost_ns is None:
                         raise
-                    self.closing.wait(REOPEN_AFTER_S)
+                    self._closing.wait(REOPEN_AFTER_S)
                     continue
                 with contextlib.closing(source):
                     if self._lost_ns is not None:
                         self._on_notice(f"camera is back after {(self._clock.now_ns() - self._lost_ns) / 1e9:.1f} s")
                         self._lost_ns = None
                     self._read_all(source, opening_ns)
-                if self.closing.is_set():
+                if self._closing.is_set():
                     return
                 if not source.live:
                     raise ConnectionLost(DEVICE, "read", f"{self._table.source} ended")
                 self._lost_ns = self._clock.now_ns()
                 self._on_notice("camera: the stream ended and is opened again")
-                self.closing.wait(REOPEN_AFTER_S)
+                self._closing.wait(REOPEN_AFTER_S)
         except DeviceError as error:
-            self.ended = error
+            self._ended = error
         except BaseException as error:
-            self.ended = DeviceError(DEVICE, "read", f"the grabber failed: {error!r}")
+            self._ended = DeviceError(DEVICE, "read", f"the grabber failed: {error!r}")
             raise
 
     def _read_all(self, source: JpegStream | Capture, opening_ns: int) -> None:
         """Read until the source ends; late, repeated and patched frames are skipped."""
-        self.settings, self.simulated = source.settings, source.simulated
+        self._settings, self._simulated = source.settings, source.simulated
         latency_ns = round(self._table.latency_ms * 1e6)
         backlog, before = Backlog(latency_ns), None
-        while not self.closing.is_set():
+        while not self._closing.is_set():
             picture = source.read()
             arrival_ns = self._clock.now_ns()
             if picture is None:
@@ -289,9 +275,9 @@ class _Grabber:
             torn = source.patches and not repeated and is_patched(picture, before)
             before = picture
             if source.live and (late or repeated):
-                self.skipped[FrameFault.LATE if late else FrameFault.FROZEN] += 1
+                self._skipped[FrameFault.LATE if late else FrameFault.FROZEN] += 1
             elif torn:
-                self.skipped[FrameFault.TORN] += 1
+                self._skipped[FrameFault.TORN] += 1
             else:
-                seq = self.newest.stamp.seq + 1 if self.newest is not None else 0
-                self.newest = _Arrival(Stamp(arrival_ns, None, seq), exposed_ns, picture)
+                seq = self._newest.stamp.seq + 1 if self._newest is not None else 0
+                self._newest = _Arrival(Stamp(arrival_ns, None, seq), exposed_ns, picture)

@@ -141,8 +141,6 @@ class SerialPort:
         """Open the port for this process alone; an error within the block closes it. Raises `ConnectionLost`."""
         import serial
 
-        await self.close()
-        self._closing.clear()
         try:
             self._port = await asyncio.to_thread(
                 serial.Serial, self._path, self._baud, timeout=POLL_S, write_timeout=1.0, exclusive=True

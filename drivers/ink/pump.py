@@ -117,7 +117,6 @@ class ModbusPump(InkDevice):
 
     async def connect(self) -> Identity:
         """Open the port, check that the line does not echo, and stop the pump. `DeviceError` leaves the port closed."""
-        self._connected, self._dosed_ml, self._dips = False, 0.0, 0
         async with self._port.opening():
             await self._refuse_echo()
             await self._halt()

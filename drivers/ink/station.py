@@ -114,7 +114,6 @@ class InkStation(InkDevice):
 
     async def connect(self) -> Identity:
         """Open the port and learn who answers; moves nothing. Raises `DeviceError`; nothing is left open then."""
-        self._number, self._dosed_ml = 0, 0.0
         async with self._port.opening():
             answer = await self._ask("identify", attempts=CONNECT_ATTEMPTS)
             match answer.split(" "):

@@ -140,7 +140,7 @@ async def test_a_frame_is_decoded_only_when_somebody_looks(
     monkeypatch.setattr(camera_module, "looked_at", lambda picture: (looks.append(picture), looked_at(picture))[1])
     jpegs = [jpeg_of(page()) for _ in range(5)]
     feed.show(*jpegs)
-    await until(lambda: camera._grabber.newest.picture is jpegs[-1], "the pictures")  # type: ignore[union-attr]
+    await until(lambda: camera._newest.picture is jpegs[-1], "the pictures")  # type: ignore[union-attr]
     assert not looks
     await camera.fresh(Stamp(0))
     assert looks == jpegs[-1:]
@@ -157,7 +157,7 @@ async def test_a_stream_that_ends_is_opened_again_and_both_are_reported(
     sources.append(second)
     await until(lambda: len(feed.notices) == 2, "the stream to be opened")
     second.show(picture := page())
-    await until(lambda: camera._grabber.newest.picture is picture, "a picture")  # type: ignore[union-attr]
+    await until(lambda: camera._newest.picture is picture, "a picture")  # type: ignore[union-attr]
     assert np.array_equal((await camera.fresh(Stamp(0))).image, picture)
     assert feed.notices[0] == "camera: the stream ended and is opened again"
     assert feed.notices[1].startswith("camera is back after")
@@ -189,23 +189,8 @@ async def test_closing_never_hands_an_old_frame_to_whoever_still_waits(camera: O
     waiting = await asked(camera, feed)
     feed.show(None)
     await camera.close()
-    with pytest.raises(ConnectionLost, match="closed while waiting"):
+    with pytest.raises(ConnectionLost, match="closed"):
         await waiting
-
-
-async def test_a_read_that_hangs_beyond_the_end_of_its_connection_gives_the_next_one_no_frame(
-    camera: OpenCvCamera, feed: Feed, sources: list[Feed], monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(camera_module, "JOIN_S", 0.01)
-    await camera.close()
-    second = Feed()
-    second.show(picture := page())
-    sources.append(second)
-    await camera.connect()
-    feed.show(page(), None)
-    await asyncio.to_thread(feed.released.wait)
-    assert np.array_equal((await camera.fresh(Stamp(0))).image, picture)
-    second.show(None)
 
 
 async def test_a_server_that_says_nothing_is_given_up():

@@ -154,7 +154,7 @@ async def test_a_pulled_cable_is_a_lost_connection_at_once_and_leads_to_no_other
     assert lost.value.op == "dose"
     # the kernel gives the number of the closed terminal to the next one
     with PtyLine(StationFirmware()), pytest.raises(ConnectionLost, match="cannot open"):
-        await station.connect()
+        await station_at(station_line.path).connect()
 
 
 async def test_a_port_that_is_missing_or_held_by_somebody_else_is_not_opened(
@@ -181,6 +181,7 @@ async def test_closing_ends_an_exchange_that_waits_and_a_cancelled_one_does_not_
     await station.close()
     with pytest.raises(NotConnected):
         await asking
+    station = station_at(station_line.path)
     await station.connect()
     asking = asyncio.create_task(station.light())
     await asyncio.sleep(0)
@@ -188,6 +189,7 @@ async def test_closing_ends_an_exchange_that_waits_and_a_cancelled_one_does_not_
     with pytest.raises(asyncio.CancelledError):
         await asking
     assert await station.level() == 0.5
+    await station.close()
 
 
 async def test_the_limit_per_minute_slides_and_counts_what_was_not_confirmed(
