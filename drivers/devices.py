@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
     import numpy as np
@@ -191,27 +191,3 @@ class Well:
     """0 to 1; None where the device has no gauge."""
     dosed_ml: float = 0.0
     """What the device has given since it was connected, by a replenishing that failed half way too."""
-
-
-@runtime_checkable
-class Ink(Device, Protocol):
-    """A device that keeps the well filled as its table in `rig.toml` says. Connecting gives no ink."""
-
-    async def dose(self, volume_ml: float) -> None:
-        """Add ink to the well. Raises `LimitExceeded` before anything is sent."""
-        ...
-
-    async def replenish(self) -> Well:
-        """Before a dip: add ink if the table asks for it.
-
-        Raises `InkRefused` or `DoseLost` where only a person can help, else `DeviceError`.
-        """
-        ...
-
-    async def light(self) -> float | None:
-        """Set the light over the sheet as the table says and return it, 0 to 1; None if it says nothing."""
-        ...
-
-    async def level(self) -> float | None:
-        """Fill level of the well, 0 to 1; None where the device has no gauge."""
-        ...

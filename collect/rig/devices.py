@@ -12,9 +12,10 @@ from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.config import RigConfig
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.camera import OpenCvCamera
-from brushloop.drivers.devices import Camera, Device, ForceSensor, Identity, Ink, Robot
+from brushloop.drivers.devices import Camera, Device, ForceSensor, Identity, Robot
 from brushloop.drivers.force.sri_m8123 import SriM8123
 from brushloop.drivers.host import Claimed, Clock, claimed
+from brushloop.drivers.ink.port import InkDevice
 from brushloop.drivers.limits import Limits
 
 
@@ -29,7 +30,7 @@ class Rig:
     robot_identity: Identity
     camera_identity: Identity
     force: ForceSensor | None = None
-    ink: Ink | None = None
+    ink: InkDevice | None = None
     force_identity: Identity | None = None
     ink_identity: Identity | None = None
 

@@ -18,7 +18,7 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, Field
 
-from brushloop.drivers.devices import Ink
+from brushloop.drivers.devices import Identity, Well
 from brushloop.drivers.errors import (
     ConnectionLost,
     DeviceError,
@@ -52,7 +52,7 @@ class InkTable(BaseModel, ABC, frozen=True, extra="forbid"):
     max_per_minute_ml: Annotated[float, Field(gt=0.0, le=100.0)] = 5.0
 
     @abstractmethod
-    def device(self, clock: Clock) -> Ink:
+    def device(self, clock: Clock) -> InkDevice:
         """The driver, not yet connected."""
 
     def doses_ml(self, dips: int) -> float | None:
@@ -64,9 +64,10 @@ MINUTE_NS = 60 * 10**9
 
 
 class InkDevice(ABC):
-    """An `Ink` by its table: keeps to the limit of a dose and of a minute, and adds up what it has given.
+    """A `Device` that keeps the well filled as its table says. Connecting gives no ink.
 
-    A dose that failed counts against the limits: ink may have flowed before the reply was lost.
+    It keeps to the limit of a dose and of a minute, and adds up what it has given. A dose that failed counts against
+    the limits: ink may have flowed before the reply was lost.
     """
 
     def __init__(self, name: str, table: InkTable, clock: Clock, *, smallest_ml: float) -> None:
@@ -74,6 +75,21 @@ class InkDevice(ABC):
         self._smallest_ml = smallest_ml
         self._taken: deque[tuple[int, float]] = deque()
         self._dosed_ml = 0.0
+
+    @abstractmethod
+    async def connect(self) -> Identity:
+        """As for any `Device`."""
+
+    @abstractmethod
+    async def replenish(self) -> Well:
+        """Before a dip: add ink if the table asks for it.
+
+        Raises `InkRefused` or `DoseLost` where only a person can help, else `DeviceError`.
+        """
+
+    @abstractmethod
+    async def close(self) -> None:
+        """As for any `Device`."""
 
     @abstractmethod
     async def _give(self, volume_ml: float) -> None:
@@ -94,11 +110,11 @@ class InkDevice(ABC):
         self._dosed_ml += volume_ml
 
     async def light(self) -> float | None:
-        """None: most ink devices have no light."""
+        """Set the light over the sheet as the table says and return it, 0 to 1; None where there is none to set."""
         return None
 
     async def level(self) -> float | None:
-        """None: most ink devices have no gauge."""
+        """Fill level of the well, 0 to 1; None where the device has no gauge."""
         return None
 
 

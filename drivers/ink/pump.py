@@ -101,7 +101,7 @@ class ModbusPumpConfig(InkTable, frozen=True):
 
 
 class ModbusPump(InkDevice):
-    """`Ink` that doses by time at a fixed speed; a running pump is always stopped."""
+    """The pump, which doses by time at a fixed speed; a running pump is always stopped."""
 
     def __init__(self, table: ModbusPumpConfig, clock: Clock) -> None:
         self._ml_per_s = table.ml_per_revolution * table.rpm / 60.0

@@ -104,7 +104,7 @@ class InkStationConfig(InkTable, frozen=True):
 
 
 class InkStation(InkDevice):
-    """`Ink` over the station's line protocol."""
+    """The station, over its line protocol."""
 
     def __init__(self, table: InkStationConfig, clock: Clock) -> None:
         super().__init__(DEVICE, table, clock, smallest_ml=SMALLEST_ML)

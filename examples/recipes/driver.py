@@ -1,10 +1,9 @@
 """A driver: a syringe pump that takes `DOSE 0.500` as a line of text over TCP and answers `OK`.
 
-An ink device is a table of `rig.toml` and a class with the methods of `Ink` in `drivers/devices.py`; `InkDevice` has
-what all of them share. Both go into a file of `drivers/ink/`, the table also into `AnyInkTable` there. Write its
-simulator beside it, for real wire bytes.
+An ink device is a table of `rig.toml` and an `InkDevice`, which has what all of them share. Both go into a file of
+`drivers/ink/`, the table also into `AnyInkTable` there. Write its simulator beside it, for real wire bytes.
 """
-# ruff: noqa: D101, D102 - `Ink` says what each method does
+# ruff: noqa: D101, D102 - `InkDevice` says what each method does
 
 from __future__ import annotations
 

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from brushloop.drivers.devices import Ink
 from brushloop.drivers.errors import (
     ConnectionLost,
     DeviceError,
@@ -273,7 +272,6 @@ async def pump(pump_line: PatientLine, rotor: PumpFirmware) -> AsyncIterator[Mod
 async def test_a_dose_sets_the_speed_starts_and_stops():
     with scripted(*CONNECTED, (SPEED, SPEED), (START, START), (STOP, STOP), *BYE) as path:
         pump = pump_at(path)
-        assert isinstance(pump, Ink)
         identity = await pump.connect()
         assert (identity.model, identity.simulated) == ("Modbus RTU pump, unit 1", False)
         began = time.monotonic()
