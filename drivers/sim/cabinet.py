@@ -16,7 +16,7 @@ from brushloop.drivers.arcs.controller import LOOPBACK_CONTROL_BOX, MOVING_ALLOW
 from brushloop.drivers.arcs.wire import numbers
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import from_wire, to_wire
-from brushloop.drivers.sim.kinematics import LIMITS_DEG, Joints, Matrix, forward, inverse, inverted, matrix_of, pose_of
+from brushloop.drivers.sim.kinematics import LIMITS_DEG, Joints, Matrix, forward, inverse, matrix_of, pose_of
 from brushloop.drivers.sim.world import World
 
 BOOT_S = 0.7
@@ -140,13 +140,13 @@ class Cabinet:
     @property
     def _fix(self) -> Matrix | None:
         """From the configured tool centre point to the true tip; None if they are the same."""
-        fix = inverted(self._tool) @ self.motion.tool
+        fix = np.linalg.inv(self._tool) @ self.motion.tool
         return None if np.allclose(fix, np.eye(4), rtol=0.0, atol=1e-9) else fix
 
     def configured(self, tip: Pose) -> Pose:
         """Where the controller takes the tip to be, at the configured tool centre point, when the true one is there."""
         fix = self._fix
-        return tip if fix is None else pose_of(matrix_of(tip) @ inverted(fix))
+        return tip if fix is None else pose_of(matrix_of(tip) @ np.linalg.inv(fix))
 
     def fk(self, p: Params) -> list[Any]:
         """[pose of the configured tool centre point, return code]."""
@@ -160,7 +160,7 @@ class Cabinet:
 
     def _solved(self, target: Pose, near: Sequence[float]) -> Joints | None:
         """Joints for a pose of the configured tool centre point, searched from `near`."""
-        return inverse(matrix_of(target) @ inverted(self._tool), near)
+        return inverse(matrix_of(target) @ np.linalg.inv(self._tool), near)
 
     def stop(self, acc_m_s2: float, acc_rad_s2: float) -> int:
         """Decelerate and forget the path."""
@@ -206,12 +206,12 @@ class Cabinet:
 
     def move_joint(self, p: Params) -> int:
         """Queue a move that is straight in joints."""
-        q1, q2, q3, q4, q5, q6 = q = numbers("moveJoint", p["q"])
+        q = numbers("moveJoint", p["q"])
         if (code := self._admit(p)) != ReturnCode.OK:
             return code
         if any(abs(v) > math.radians(limit) for v, limit in zip(q, LIMITS_DEG, strict=True)):
             return self._out_of_reach()
-        added = self.motion.add_joints((q1, q2, q3, q4, q5, q6), p["v"], p["a"], self.now_s())
+        added = self.motion.add_joints(tuple(q), p["v"], p["a"], self.now_s())
         return ReturnCode.OK if added else ReturnCode.REQUEST_IGNORED
 
     def _admit(self, p: Params) -> int:

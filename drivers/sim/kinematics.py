@@ -18,13 +18,14 @@ from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import columns, interpolate, of_matrix, unit, vector
 
 Matrix = NDArray[np.float64]
-Joints = tuple[float, float, float, float, float, float]
+Joints = tuple[float, ...]
+"""Of the six joints, in rad."""
 
 A_M = (0.0, 0.0, 0.408, 0.376, 0.0, 0.0)
 ALPHA_DEG = (0.0, -90.0, 180.0, 180.0, -90.0, 90.0)
 D_M = (0.122, 0.1215, 0.0, 0.0, 0.1025, 0.094)
 THETA_DEG = (180.0, -90.0, 0.0, -90.0, 0.0, 0.0)
-LIMITS_DEG: Joints = (175.0, 175.0, 175.0, 175.0, 175.0, 360.0)
+LIMITS_DEG = (175.0, 175.0, 175.0, 175.0, 175.0, 360.0)
 """Limits of the joints in both directions from zero."""
 HOME: Joints = (0.0, math.radians(-15.0), math.radians(100.0), math.radians(25.0), math.radians(90.0), 0.0)
 
@@ -97,8 +98,7 @@ def _within(q: Matrix, near: Sequence[float]) -> Joints | None:
         if not allowed:
             return None
         joints.append(min(allowed, key=lambda v: abs(v - close)))
-    q1, q2, q3, q4, q5, q6 = joints
-    return q1, q2, q3, q4, q5, q6
+    return tuple(joints)
 
 
 def matrix_of(pose: Pose) -> Matrix:
@@ -115,17 +115,13 @@ def pose_of(matrix: Matrix) -> Pose:
     return Pose(x, y, z, *of_matrix(matrix[:3, :3].tolist()))
 
 
-def inverted(matrix: Matrix) -> Matrix:
-    """The inverse transformation."""
-    inverse_of: Matrix = np.linalg.inv(matrix).astype(np.float64)
-    return inverse_of
-
-
 ROTATION_AS_LINEAR_MM = 1.0
 """Below this travel, ARCS reads speed and acceleration as rad/s and rad/s2."""
 TURN_RAD = 1e-4
 STRETCHES = 16
 """Number of straight pieces in which a curved path is reported to the world."""
+ROUNDING = 1e-9
+"""A path ends exactly at its end, although sums of lengths are rounded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +143,7 @@ def line(start: Pose, end: Pose, travel_mm: float, turn_rad: float) -> Path:
     length = turn_rad if angular else travel_mm
 
     def pose(done: float) -> Pose:
-        if done >= length:
+        if done >= length - ROUNDING:
             return end
         return start if done <= 0.0 else interpolate(start, end, done / length)
 
@@ -173,10 +169,9 @@ def joint_line(start: Joints, end: Joints, tool: Matrix) -> Path:
     length = max(abs(a - b) for a, b in zip(start, end, strict=True))
 
     def joints(done: float) -> Joints:
-        if done >= length:
+        if done >= length - ROUNDING:
             return end
         share = max(done, 0.0) / length
-        q1, q2, q3, q4, q5, q6 = (a + share * (b - a) for a, b in zip(start, end, strict=True))
-        return q1, q2, q3, q4, q5, q6
+        return tuple(a + share * (b - a) for a, b in zip(start, end, strict=True))
 
     return Path(length, lambda done: pose_of(forward(joints(done)) @ tool), angular=True, joints=joints)

@@ -26,7 +26,7 @@ from brushloop.drivers.geometry import of_vector, product, turned, unit
 from brushloop.drivers.loopback import LoopbackServer
 from brushloop.drivers.sim.config import View
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
-from brushloop.drivers.sim.kinematics import Joints, inverse, inverted, matrix_of
+from brushloop.drivers.sim.kinematics import Joints, inverse, matrix_of
 from brushloop.drivers.sim.lab_facts import CAMERA_PORTS, LIFT_MM, PICTURE_PX, PIN_TILT_DEG, Trap, draw, held, trapped
 from brushloop.drivers.sim.rig import PORTS, LoopbackRig
 from brushloop.drivers.sim.scene import MjpegServer
@@ -263,7 +263,7 @@ class UnknownLab(LoopbackRig):
         above = _withdrawn(aim) if along_brush else replace(aim, z_mm=aim.z_mm + LIFT_MM)
         way: list[Joints] = []
         for pose in (_withdrawn(reached), above, aim):
-            joints = inverse(matrix_of(pose) @ inverted(self.world.motion.tool), near)
+            joints = inverse(matrix_of(pose) @ np.linalg.inv(self.world.motion.tool), near)
             if joints is not None:
                 way.append(joints)
                 near, reached = joints, pose

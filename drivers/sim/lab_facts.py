@@ -15,7 +15,7 @@ from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import DOWN, brush_pose, of_vector, product
 from brushloop.drivers.sim.brush.brush import BrushSpec
 from brushloop.drivers.sim.config import CORNERS, Place, SimConfig, Table, View
-from brushloop.drivers.sim.kinematics import HOME, inverse, inverted, matrix_of
+from brushloop.drivers.sim.kinematics import HOME, inverse, matrix_of
 from brushloop.drivers.sim.scene import homography, mapped
 from brushloop.drivers.sim.world import tool_of
 
@@ -307,7 +307,7 @@ def poses(facts: Facts) -> Iterator[Pose]:
 
 def reaches(config: SimConfig, wanted: Iterable[Pose]) -> bool:
     """Whether the arm reaches every pose of the tip with this tool."""
-    tool, near = inverted(tool_of(config)), HOME
+    tool, near = np.linalg.inv(tool_of(config)), HOME
     for pose in wanted:
         joints = inverse(matrix_of(pose) @ tool, near)
         if joints is None:

@@ -24,7 +24,6 @@ from brushloop.drivers.sim.kinematics import (
     Path,
     corner,
     inverse,
-    inverted,
     joint_line,
     line,
     matrix_of,
@@ -51,12 +50,12 @@ class Piece:
     ident: int
     """Of its move."""
     path: Path
+    origin: float
+    """Where its own path begins, along the whole path; a corner may have cut that beginning off."""
     start: float
     """Where it begins, along the whole path."""
-    begin: float
-    """Where it begins, along its own path."""
-    end: float
-    """Where it ends, along its own path."""
+    stop: float
+    """Where it ends, along the whole path."""
     cap: float
     """Highest speed."""
     acc: float
@@ -65,22 +64,13 @@ class Piece:
     through: bool = False
     """Whether the arm does not rest at its end, which leads into a corner or out of one."""
 
-    @property
-    def stop(self) -> float:
-        """Where it ends, along the whole path."""
-        return self.start + self.end - self.begin
-
-    def place(self, along: float) -> float:
-        """The distance along its own path."""
-        return self.end if along >= self.stop else self.begin + along - self.start
-
     def pose(self, along: float) -> Pose:
         """Where the tip is."""
-        return self.path.pose(self.place(along))
+        return self.path.pose(min(along, self.stop) - self.origin)
 
     def joints(self, along: float) -> Joints | None:
         """The joints; None where the path is not given in joints."""
-        return None if self.path.joints is None else self.path.joints(self.place(along))
+        return None if self.path.joints is None else self.path.joints(min(along, self.stop) - self.origin)
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +169,7 @@ class MotionQueue:
         """
         self.advance(now_s)
         start = self._last()
-        configured = start if fix is None else pose_of(matrix_of(start) @ inverted(fix))
+        configured = start if fix is None else pose_of(matrix_of(start) @ np.linalg.inv(fix))
         travel_mm, turn_deg = distance(configured, target)
         if travel_mm <= SAME_POSE_MM and turn_deg <= SAME_POSE_DEG:
             return False
@@ -216,7 +206,7 @@ class MotionQueue:
         self._brake(acc_mm_s2, acc_rad_s2, now_s)
         self.held, rest = False, self._knots[-1].along
         self._pieces = [
-            replace(piece, end=piece.place(rest), blend_mm=0.0, through=piece.through and piece.stop < rest)
+            replace(piece, stop=min(piece.stop, rest), blend_mm=0.0, through=piece.through and piece.stop < rest)
             for piece in self._pieces
             if piece.start < rest
         ]
@@ -260,7 +250,7 @@ class MotionQueue:
 
     def near_joints(self, tip: Pose) -> Joints:
         """The joints for a tip pose, near the last known ones; the last known ones if no solution is found."""
-        self.near = inverse(matrix_of(tip) @ inverted(self.tool), self.near) or self.near
+        self.near = inverse(matrix_of(tip) @ np.linalg.inv(self.tool), self.near) or self.near
         return self.near
 
     def steady(self, now_s: float) -> bool:
@@ -289,19 +279,18 @@ class MotionQueue:
         """Report the pieces that end no farther than `along`."""
         while self._pieces and self._pieces[0].stop <= along:
             piece = self._pieces.pop(0)
-            length, count = piece.end - piece.begin, piece.path.stretches
-            places = [piece.path.pose(piece.begin + length * k / count) for k in range(count)]
-            places.append(piece.path.pose(piece.end))
+            lengths: list[float] = np.linspace(piece.start, piece.stop, piece.path.stretches + 1).tolist()
+            places = [piece.pose(along) for along in lengths]
             self._rest = places[-1]
             self.near = piece.joints(piece.stop) or self.near
-            for start, end in itertools.pairwise(places if length > 0.0 else ()):
+            for start, end in itertools.pairwise(places if piece.stop > piece.start else ()):
                 self._on_path(start, end)
 
     def _append(self, path: Path, cap: float, acc: float, now_s: float, blend_mm: float = 0.0) -> None:
         """Append a move at no more than this speed."""
         here = self._knots[-1] if self.held else self._at(now_s)
         start = self._pieces[-1].stop if self._pieces else here.along
-        piece = Piece(self._next_id, path, start, 0.0, path.length, cap, acc, blend_mm)
+        piece = Piece(self._next_id, path, start, start, start + path.length, cap, acc, blend_mm)
         self._next_id += 1
         rounded = self._rounded(piece, here.along)
         if rounded is not None:
@@ -337,10 +326,11 @@ class MotionQueue:
         # the speed bends by `bend` v within 2 cut / v: an acceleration of v^2 bend / (2 cut)
         acc = min(last.acc, piece.acc)
         cap = min(math.sqrt(2.0 * cut * CORNER_SHARE * acc / max(bend, 1e-12)), last.cap, piece.cap)
-        before = replace(last, end=a.length - cut, through=True)
-        path = corner(a, b, cut)
-        bent = Piece(piece.ident, path, before.stop, 0.0, path.length, cap, (1.0 - CORNER_SHARE) * acc, through=True)
-        return [*self._pieces[:-1], before, bent, replace(piece, start=bent.stop, begin=cut)]
+        enter, bend_path = last.stop - cut, corner(a, b, cut)
+        leave = enter + bend_path.length
+        bent = Piece(piece.ident, bend_path, enter, enter, leave, cap, (1.0 - CORNER_SHARE) * acc, through=True)
+        after = replace(piece, origin=leave - cut, start=leave, stop=leave - cut + b.length)
+        return [*self._pieces[:-1], replace(last, stop=enter, through=True), bent, after]
 
     def _brake(self, acc_mm_s2: float, acc_rad_s2: float, now_s: float) -> None:
         """Come to rest on the path, never farther than the arm would have gone."""
