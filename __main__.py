@@ -174,18 +174,19 @@ def sim(
     """
     import asyncio
 
+    from brushloop.drivers.loopback import RigRefused
     from brushloop.drivers.sim.brush.spec import load_brush
     from brushloop.drivers.sim.config import SimConfig, View
-    from brushloop.drivers.sim.lab import LabRefused, UnknownLab
+    from brushloop.drivers.sim.lab import UnknownLab
     from brushloop.drivers.sim.rig import LoopbackRig, serve
 
     if unknown is not None:
         if write_rig is not None or brush != Path("loopback"):
-            raise LabRefused("--unknown: can only be combined with --trap, --control, --rate and --idle-exit")
+            raise RigRefused("--unknown: can only be combined with --trap, --control, --rate and --idle-exit")
         asyncio.run(serve(UnknownLab(unknown, trap, rate=rate), say, idle_exit_s=idle_exit, control=control))
         return
     if trap is not None:
-        raise LabRefused("--trap: needs --unknown SEED")
+        raise RigRefused("--trap: needs --unknown SEED")
     pressed = load_brush(brush, seed)
     config = SimConfig(
         seed=seed,

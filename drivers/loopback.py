@@ -95,38 +95,39 @@ def simulate(
             rig.end()
 
 
-TIMEOUT_S = 5.0
-GUIDING_S = 120.0
-"""Longest wait for an act of the person in the lab."""
+ANSWER_S = 120.0
+"""Longest wait for an answer: a person in the lab may have to act first."""
 
 
-class FaultRefused(Exception):
-    """No rig listens, or the rig refused the request."""
+class RigRefused(Exception):
+    """What was asked of the loopback rig cannot be done: one line that names the file, field, socket or request."""
 
     exit_code: ClassVar[int] = 2
 
 
 def ask(path: Path, request: Mapping[str, object]) -> dict[str, Any]:
-    """Send a request; return the rig's answer. Raises `FaultRefused`, with one line, if it is missing or a refusal."""
+    """Send a request; return the rig's answer. Raises `RigRefused` if it is missing or a refusal."""
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
-            client.settimeout(GUIDING_S if request["do"] == "hand" else TIMEOUT_S)
+            client.settimeout(ANSWER_S)
             client.connect(str(path))
             client.sendall(json.dumps(request).encode() + b"\n")
             answer: Any = json.loads(client.makefile("rb").readline())
     except OSError as error:
-        raise FaultRefused(f"{path}: no rig answers here: {error.strerror or error}") from None
+        raise RigRefused(f"{path}: no rig answers here: {error.strerror or error}") from None
     except (ValueError, RecursionError):
         answer = None
     match answer:
         case {"ok": True, **rest}:
             return rest  # pyright: ignore[reportUnknownVariableType]
         case {"ok": False, "error": str(error)}:
-            raise FaultRefused(error)
+            raise RigRefused(error)
         case _:
-            raise FaultRefused(f"{path}: not the control socket of a rig")
+            raise RigRefused(f"{path}: not the control socket of a rig")
 
 
+BACKLOG_BYTES = 32 * 1024
+"""A client that does not read is sent no more samples until it has caught up."""
 ENDS_OF_A_CLIENT = (
     *(ConnectionError, TimeoutError, asyncio.IncompleteReadError),  # it disconnected
     *(ProtocolViolation, asyncio.LimitOverrunError),  # it does not speak the protocol
@@ -175,6 +176,12 @@ class LoopbackServer:
         """Close every connection from the server's side."""
         for task in list(self._clients):
             task.cancel()
+
+    @staticmethod
+    def write(writer: asyncio.StreamWriter, data: bytes) -> None:
+        """Send to a client, unless it has gone."""
+        if not writer.is_closing():
+            writer.write(data)
 
     @property
     def clients(self) -> int:

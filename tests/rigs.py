@@ -319,7 +319,7 @@ class LoopSensor(SriM8123):
 
     async def _read(self) -> None:
         while self._loss is None:
-            for frame in self._board.round(self._rig.clock.now_s()):
+            for frame in self._board.round():
                 at_s, is_error = self._rig.time.now_s, frame.error
                 self._take(can.Message(at_s, frame.can_id, False, False, is_error, data=frame.data))
             await asyncio.sleep(1.0 / self._rig.config.force_hz)

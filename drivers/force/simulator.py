@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.force.sri_m8123 import BUS_OFF, COMMAND_ID, LOOPBACK_CHANNEL, START, STOP, Wrench, encode_round
-from brushloop.drivers.loopback import LoopbackServer
+from brushloop.drivers.loopback import BACKLOG_BYTES, LoopbackServer
 
 BUS_ERROR = 0x04
 """Class of an error frame: the controller has a problem but is on the bus."""
@@ -36,10 +36,10 @@ class CanFrame:
 
 
 class ForceBoard:
-    """Measures `force(t_s)` with seeded noise, from the start command to the stop command."""
+    """Measures `force()` with seeded noise, from the start command to the stop command."""
 
     def __init__(
-        self, force: Callable[[float], Wrench], *, noise_n: float = 0.0, noise_nm: float = 0.0, seed: int = 1
+        self, force: Callable[[], Wrench], *, noise_n: float = 0.0, noise_nm: float = 0.0, seed: int = 1
     ) -> None:
         self.streaming = False
         self._force = force
@@ -54,8 +54,8 @@ class ForceBoard:
         if frame.can_id == COMMAND_ID and not frame.error and frame.data in (START, STOP):
             self.streaming = frame.data == START
 
-    def round(self, t_s: float) -> Iterator[CanFrame]:
-        """The frames of the round that is due at `t_s`; none while the board is stopped."""
+    def round(self) -> Iterator[CanFrame]:
+        """The frames of the round that is due now; none while the board is stopped."""
         if not self.streaming:
             return
         fault = self.next_fault()
@@ -66,7 +66,7 @@ class ForceBoard:
             yield CanFrame(BUS_OFF if fault == "bus-off" else BUS_ERROR, bytes(8), error=True)
             return
         if fault != "stuck":
-            pairs = zip(self._force(t_s), self._noise, strict=True)
+            pairs = zip(self._force(), self._noise, strict=True)
             self._last = tuple(value + self._random.gauss(0.0, sigma) for value, sigma in pairs)
         wrench = tuple(math.nan if fault == "nan" and axis == 2 else value for axis, value in enumerate(self._last))
         for place, (can_id, data) in enumerate(encode_round(wrench)):
@@ -76,17 +76,14 @@ class ForceBoard:
 
 FRAME_S = 0.0002
 """From one frame of a round to the next on the bus."""
-BACKLOG_BYTES = 32 * 1024
-"""A client that does not read is sent nothing more until it has caught up."""
 
 
 class SocketcandServer(LoopbackServer):
     """One board on one bus, for any number of clients."""
 
-    def __init__(self, board: ForceBoard, now_s: Callable[[], float], *, rate_hz: float) -> None:
+    def __init__(self, board: ForceBoard, *, rate_hz: float) -> None:
         super().__init__()
         self.board = board
-        self._now_s = now_s
         self._period_s = 1.0 / rate_hz
         self._listeners: set[asyncio.StreamWriter] = set()
         self._streaming: asyncio.Task[None] | None = None
@@ -130,7 +127,7 @@ class SocketcandServer(LoopbackServer):
             # Real time, like that of an adapter's clock, whatever the rate of simulated time. It is read once: a board
             # sends its frames in one burst, however busy the computer is.
             at_s = time.time()
-            frames = self.board.round(self._now_s())
+            frames = self.board.round()
             text = "".join(_ascii(frame, at_s + place * FRAME_S) for place, frame in enumerate(frames)).encode()
             for writer in self._listeners:
                 if not writer.is_closing() and writer.transport.get_write_buffer_size() < BACKLOG_BYTES:

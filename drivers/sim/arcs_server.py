@@ -16,7 +16,7 @@ from brushloop.drivers.arcs.wire import PING, BareDecoder, FrameDecoder, encode,
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.geometry import to_wire
-from brushloop.drivers.loopback import LoopbackServer
+from brushloop.drivers.loopback import BACKLOG_BYTES, LoopbackServer
 from brushloop.drivers.sim.cabinet import Cabinet, methods
 from brushloop.drivers.sim.faults import KINDS, LOST, STOPS, Device, Fault, FaultBoard
 from brushloop.drivers.sim.world import World
@@ -39,7 +39,7 @@ async def send(
             raise ConnectionResetError("the connection is to be closed without an answer")
         case "late":
             assert fault is not None
-            asyncio.get_running_loop().call_later(fault.late_s, _write, writer, whole)
+            asyncio.get_running_loop().call_later(fault.late_s, LoopbackServer.write, writer, whole)
             return
         case "split":
             for cut in (*CUTS, len(whole) // 2):
@@ -61,11 +61,6 @@ async def send(
     # In one piece: the vendor's client never recovers from a header that arrives in two.
     writer.write(whole)
     await writer.drain()
-
-
-def _write(writer: asyncio.StreamWriter, data: bytes) -> None:
-    if not writer.is_closing():
-        writer.write(data)
 
 
 def _with_another_id(answer: bytes) -> bytes:
@@ -153,8 +148,6 @@ OUTPUTS = {
 }
 """Identifier of each output that a client may subscribe to."""
 MAX_HZ = 500.0
-BACKLOG_BYTES = 32 * 1024
-"""A client that does not read is sent nothing more until it has caught up."""
 
 
 class RtdeServer(LoopbackServer):
@@ -199,7 +192,11 @@ class RtdeServer(LoopbackServer):
                     rest for rest in world.motion.rests if before_s < rest.at_s <= now_s and world.clock.rate > 1.0
                 ]
                 for at_s, pose in (*((rest.at_s, rest.pose) for rest in rests), (now_s, tip)):
-                    self._push_once(chanel, [self._value(name, at_s, pose) for name in names], writer)
+                    fault = self.faults.meet(Device.TELEMETRY)
+                    late_s = 0.0 if fault is None else fault.late_s
+                    if fault is None or fault.kind != "mute":
+                        sample = encode_sample(chanel, [self._value(name, at_s, pose) for name in names])
+                        loop.call_later(late_s, self.write, writer, sample)
             before_s = now_s
             due = max(due + period_s, loop.time())
             await asyncio.sleep(due - loop.time())
@@ -218,14 +215,6 @@ class RtdeServer(LoopbackServer):
                 return cabinet.power.safety.value
             case _:
                 return to_wire(cabinet.configured(tip))
-
-    def _push_once(self, chanel: int, values: list[Any], writer: asyncio.StreamWriter) -> None:
-        fault = self.faults.meet(Device.TELEMETRY)
-        if fault is not None and fault.kind == "mute":
-            return
-        sample = encode_sample(chanel, values)
-        late_s = 0.0 if fault is None else fault.late_s
-        asyncio.get_running_loop().call_later(late_s, _write, writer, sample)
 
 
 def topic_of(payload: bytes) -> tuple[int, float, list[str]]:

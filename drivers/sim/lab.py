@@ -13,7 +13,7 @@ import zlib
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,13 +23,12 @@ from brushloop.drivers.arcs.wire import AUBOPE_PORT
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL
 from brushloop.drivers.geometry import of_vector, product, turned, unit
-from brushloop.drivers.loopback import LoopbackServer
-from brushloop.drivers.sim.config import View
+from brushloop.drivers.loopback import LoopbackServer, RigRefused
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 from brushloop.drivers.sim.kinematics import Joints, inverse, matrix_of
 from brushloop.drivers.sim.lab_facts import CAMERA_PORTS, LIFT_MM, PICTURE_PX, PIN_TILT_DEG, Trap, draw, held, trapped
 from brushloop.drivers.sim.rig import PORTS, LoopbackRig
-from brushloop.drivers.sim.scene import MjpegServer
+from brushloop.drivers.sim.scene import MjpegServer, Scene
 
 HAND_MM, BY_EYE_MM = 0.3, 1.0
 """Standard deviation of a tip that touches a thing, and of one that is brought near it by eye, along each axis."""
@@ -58,12 +57,6 @@ THINGS = (*TOUCHED, "upright", "well", "wash-pot", "park", "clear-view", "hold-b
 """Those that the tip touches, and those to which it is brought by eye."""
 
 
-class LabRefused(Exception):
-    """No such lab can be served."""
-
-    exit_code: ClassVar[int] = 2
-
-
 class UnknownLab(LoopbackRig):
     """`async with UnknownLab(seed) as lab:` serves until the block ends; `hand` asks the person for something.
 
@@ -73,9 +66,9 @@ class UnknownLab(LoopbackRig):
     def __init__(
         self, seed: int, trap: str | None = None, *, rate: float = 1.0, picture_px: tuple[int, int] = PICTURE_PX
     ) -> None:
-        """Raises `LabRefused` for an unknown trap."""
+        """Raises `RigRefused` for an unknown trap."""
         if trap is not None and trap not in [*Trap]:
-            raise LabRefused(f"--trap is {trap!r}, allowed: {', '.join(Trap)}")
+            raise RigRefused(f"--trap is {trap!r}, allowed: {', '.join(Trap)}")
         clean = draw(seed, rate, picture_px)
         self.facts, self._mended = (clean, clean) if trap is None else trapped(clean, Trap(trap))
         """The lab as it is now, and once the mistake is corrected."""
@@ -93,7 +86,7 @@ class UnknownLab(LoopbackRig):
         self.arcs.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
         self.arcs.cabinet.payload = [self.facts.payload_kg, [0.0] * 3, [0.0] * 3, [0.0] * 6]
         self._noise = np.random.default_rng([seed, 17])
-        self.servers["room"] = MjpegServer(self.world, self._wall, View(fps=5.0))
+        self.servers["room"] = MjpegServer(self.world, self._wall)
         if not self.facts.speaks_arcs:
             del self.servers["arcs"], self.servers["rtde"]
             # the software before ARCS takes connections, and answers nothing that ARCS would
@@ -130,8 +123,6 @@ class UnknownLab(LoopbackRig):
 
     async def hand(self, act: str = "", to: str = "", index: int = 0, corner: str = "") -> dict[str, Any]:
         """What the person did: `says`, and for `bring` whether it was `reached`. Raises ValueError, with one line."""
-        if type(index) is not int or not 0 <= index < 1000:
-            raise ValueError(f"index = {index!r}: must be a whole number from 0 to 999")
         async with self._busy:
             match act:
                 case "bring":
@@ -180,8 +171,9 @@ class UnknownLab(LoopbackRig):
             await self.start("rtde")
         if self.facts.cabinet_tcp != was.cabinet_tcp:
             self.arcs.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
-        if self.facts.config != was.config:
-            self.reconfigure(self.facts.config)
+        if self.facts.config != was.config:  # table, view or sensor; tool and brush stay
+            self.config = self.world.config = self.facts.config
+            self.scene = Scene(self.world)
         done, self._trap = f"I have seen to it: {self._trap}.", None
         return done
 

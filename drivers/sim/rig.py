@@ -15,13 +15,12 @@ from typing import Any, Self
 from brushloop.drivers.force.simulator import ForceBoard, SocketcandServer
 from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL
 from brushloop.drivers.ink.simulator import PtyLine, PumpFirmware, StationFirmware
-from brushloop.drivers.loopback import LoopbackServer
+from brushloop.drivers.loopback import LoopbackServer, RigRefused
 from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
-from brushloop.drivers.sim.brush.spec import SimFileError
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.faults import Device, fault_of
 from brushloop.drivers.sim.scene import MjpegServer, Scene
-from brushloop.drivers.sim.world import World
+from brushloop.drivers.sim.world import World, push_on
 
 TEMPLATE = Path(__file__).with_name("rig.toml.j2")
 """Of the `rig.toml`, as an operator would have taught it."""
@@ -69,8 +68,8 @@ class LoopbackRig:
         self.force = None
         if config.force_sensor:
             noise_n, noise_nm = config.force_noise_n, config.force_noise_nm
-            board = ForceBoard(lambda _: self.world.wrench(), noise_n=noise_n, noise_nm=noise_nm, seed=config.seed)
-            self.force = SocketcandServer(board, self.world.clock.now_s, rate_hz=config.force_hz)
+            board = ForceBoard(self.world.wrench, noise_n=noise_n, noise_nm=noise_nm, seed=config.seed)
+            self.force = SocketcandServer(board, rate_hz=config.force_hz)
         self.ink: PtyLine | None = None
         if config.ink_device == "station":
             self.ink = PtyLine(StationFirmware(self.world.well))
@@ -82,7 +81,7 @@ class LoopbackRig:
         """One board for all servers."""
         self.scene = Scene(self.world)
         """What the camera looks at."""
-        self.camera = MjpegServer(self.world, lambda tool: self.scene.render(tool), config.view, self.faults)
+        self.camera = MjpegServer(self.world, lambda tool: self.scene.render(tool), self.faults)
         self.servers: dict[str, LoopbackServer] = {"arcs": self.arcs, "rtde": self.rtde, "camera": self.camera}
         self._ports = ports or {}
         if self.ink is not None:
@@ -98,7 +97,7 @@ class LoopbackRig:
             for name in self.servers:
                 await self.start(name)
             if self.force is not None:
-                await asyncio.to_thread(lambda: self.world.reaction)  # it is slow to find
+                await asyncio.to_thread(push_on, self.config.brush)  # it is slow to find
             if self.ink is not None:
                 opening.enter_context(self.ink)
             watching = asyncio.create_task(self.faults.watch(self.arcs.cabinet.safety_stop), name="faults")
@@ -141,12 +140,6 @@ class LoopbackRig:
             "faults": len(self.faults.hanging),
         }
 
-    def reconfigure(self, config: SimConfig) -> None:
-        """Change table, view or sensor while serving, as a person in the lab would; tool and brush stay."""
-        self.config = self.world.config = config
-        self.scene = Scene(self.world)
-        self.camera.view = config.view
-
     async def hand(self, act: str = "", to: str = "", index: int = 0, corner: str = "") -> dict[str, Any]:
         """Ask the person in the lab for something. Raises ValueError, with one line, for what nobody can do."""
         raise ValueError("there is no person here: only the lab of `brushloop sim --unknown` has one")
@@ -170,7 +163,7 @@ USAGE = (
 class ControlServer(LoopbackServer):
     """Live control of one rig, by requests that are in docs/faults.md: `async with ControlServer(rig, path):`.
 
-    The socket at `path` is its owner's alone; one of a rig that has ended is replaced. Raises `SimFileError`.
+    The socket at `path` is its owner's alone; one of a rig that has ended is replaced. Raises `RigRefused`.
     """
 
     def __init__(self, rig: LoopbackRig, path: Path) -> None:
@@ -180,18 +173,16 @@ class ControlServer(LoopbackServer):
 
     async def __aenter__(self) -> Self:
         path = self._path
-        if path.exists() and not path.is_socket():
-            raise SimFileError(path, "", "exists and is not a socket; it is not overwritten")
         with contextlib.suppress(OSError):  # nobody listens
             _, writer = await asyncio.open_unix_connection(path)
             writer.close()
-            raise SimFileError(path, "", "another rig listens here")
+            raise RigRefused(f"{path}: another rig listens here")
         # Set before the path exists: another user could connect before a later `chmod`.
         mask = os.umask(0o177)
         try:
             self._server = await asyncio.start_unix_server(self._serve, path)
         except OSError as error:
-            raise SimFileError(path, "", f"cannot listen here: {error.strerror or error}") from None
+            raise RigRefused(f"{path}: cannot listen here: {error.strerror or error}") from None
         finally:
             os.umask(mask)
         return self
@@ -246,13 +237,13 @@ async def serve(
 ) -> None:
     """Serve until Ctrl-C, SIGTERM, or no client for `idle_exit_s`, where 0 means never; SIGUSR1 changes the sheet.
 
-    Print what a person reads at the rig, or write its `rig.toml`. Raises `SimFileError` for a control socket or a
+    Print what a person reads at the rig, or write its `rig.toml`. Raises `RigRefused` for a control socket or a
     `rig.toml` that cannot be written, and rather than overwrite a file that no loopback rig wrote.
     """
     if write_rig and not write_rig.parent.is_dir():
-        raise SimFileError(write_rig, "", f"there is no folder {write_rig.parent}")
+        raise RigRefused(f"{write_rig}: there is no folder {write_rig.parent}")
     if write_rig and write_rig.exists() and not write_rig.read_bytes().startswith(LOOPBACK_HEAD.encode()):
-        raise SimFileError(write_rig, "", "exists and was not written by a loopback rig; it is not overwritten")
+        raise RigRefused(f"{write_rig}: exists and was not written by a loopback rig; it is not overwritten")
     over, loop = asyncio.Event(), asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, over.set)
@@ -270,10 +261,10 @@ async def serve(
 
 
 def _write_whole(path: Path, text: str) -> None:
-    """Write a file of which a reader sees all or nothing. Raises `SimFileError`."""
+    """Write a file of which a reader sees all or nothing. Raises `RigRefused`."""
     part = path.with_name(path.name + ".part")
     try:
         part.write_text(text, encoding="utf-8")
         part.replace(path)
     except OSError as error:
-        raise SimFileError(path, "", f"cannot be written: {error.strerror}") from None
+        raise RigRefused(f"{path}: cannot be written: {error.strerror}") from None

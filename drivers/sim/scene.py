@@ -290,9 +290,6 @@ SPOILED: dict[str, Callable[[bytes], bytes]] = {"black": black, "torn": torn}
 """Faults of a single picture: JPEG in, JPEG out."""
 BOUNDARY = "brushloop"
 JPEG_QUALITY = 95
-BACKLOG = 64
-"""Images that a stalled stream keeps, as the buffers of a real one do."""
-
 
 Render = Callable[[Pose], NDArray[np.uint8]]
 """The gray image of a camera, with the tool at this pose; called in another thread than the world's."""
@@ -301,12 +298,10 @@ Render = Callable[[Pose], NDArray[np.uint8]]
 class MjpegServer(LoopbackServer):
     """Serves `/stream.mjpg`. A client that reads too slowly is sent the newest image next, never a backlog."""
 
-    def __init__(self, world: World, render: Render, view: View, faults: FaultBoard | None = None) -> None:
-        """`view` gives the rate and the delay of the pictures."""
+    def __init__(self, world: World, render: Render, faults: FaultBoard | None = None) -> None:
         super().__init__()
         self._world = world
         self._render = render
-        self.view = view
         self._rendering = asyncio.Lock()
         self._coded: deque[tuple[NDArray[np.uint8], bytes]] = deque(maxlen=NOISE_FIELDS)
         """The newest images and their JPEGs, reused while nothing changes."""
@@ -326,7 +321,6 @@ class MjpegServer(LoopbackServer):
     async def _stream(self, writer: asyncio.StreamWriter) -> None:
         loop = asyncio.get_running_loop()
         due_s = sent_s = loop.time()
-        held: deque[bytes] = deque(maxlen=BACKLOG)
         shown = b""
         while not writer.is_closing():  # a late picture is not drained, which would notice
             kind = None if self._faults is None else self._faults.kind_met(Device.CAMERA)
@@ -337,16 +331,14 @@ class MjpegServer(LoopbackServer):
                 image = SPOILED[kind](image)
             else:
                 shown = image
-            held.append(image)
             # The delay includes the time to draw, and no picture overtakes another.
-            delay_s = self.view.delay_s + random.uniform(0.0, self.view.delay_jitter_s)
-            while held and kind != "stale":
-                jpeg = held.popleft()
-                head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
-                sent_s = max(sent_s + 1e-6, exposed_s + delay_s)  # timers with the same time run in any order
-                loop.call_at(sent_s, _write, writer, head.encode() + jpeg + b"\r\n")
+            view = self._world.config.view
+            delay_s = view.delay_s + random.uniform(0.0, view.delay_jitter_s)
+            sent_s = max(sent_s + 1e-6, exposed_s + delay_s)  # timers with the same time run in any order
+            head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(image)}\r\n\r\n"
+            loop.call_at(sent_s, self.write, writer, head.encode() + image + b"\r\n")
             await writer.drain()  # of earlier pictures: else a slow client would fall farther and farther behind
-            due_s = max(due_s + 1.0 / self.view.fps, loop.time())
+            due_s = max(due_s + 1.0 / view.fps, loop.time())
             await asyncio.sleep(due_s - loop.time())
 
     async def _exposed(self) -> tuple[float, bytes]:
@@ -363,8 +355,3 @@ class MjpegServer(LoopbackServer):
         _, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         self._coded.append((image, data := encoded.tobytes()))
         return data
-
-
-def _write(writer: asyncio.StreamWriter, data: bytes) -> None:
-    if not writer.is_closing():
-        writer.write(data)

@@ -43,13 +43,13 @@ def served(channel: str, board: ForceBoard) -> Iterator[None]:
     bus, over = can.Bus(channel, "virtual", ignore_config=True), threading.Event()
 
     def stream() -> None:
-        began_s = due_s = time.monotonic()
+        due_s = time.monotonic()
         while not over.is_set():
             if (message := bus.recv(max(0.0, due_s - time.monotonic()))) is not None:
                 board.obey(CanFrame(message.arbitration_id, bytes(message.data), message.is_error_frame))
             elif time.monotonic() >= due_s:
                 due_s = max(due_s + 1.0 / RATE_HZ, time.monotonic())
-                for frame in board.round(due_s - began_s):
+                for frame in board.round():
                     bus.send(can.Message(0.0, frame.can_id, frame.error, False, frame.error, data=frame.data))
 
     thread = threading.Thread(target=stream, daemon=True)
@@ -77,7 +77,7 @@ async def sensing(board: ForceBoard, stale_ms: float = 1e6) -> AsyncIterator[Sri
 
 @pytest.fixture
 def board() -> ForceBoard:
-    return ForceBoard(lambda _: WRENCH)
+    return ForceBoard(lambda: WRENCH)
 
 
 @pytest.fixture
@@ -154,7 +154,7 @@ async def test_silence_and_what_is_no_number_make_the_sample_stale_until_it_meas
 
 async def test_a_sensor_that_says_the_same_again_and_again_is_named_as_stuck(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sri_m8123, "STUCK_MS", 100.0)
-    board = ForceBoard(lambda _: WRENCH, noise_n=0.002, noise_nm=2e-4)
+    board = ForceBoard(lambda: WRENCH, noise_n=0.002, noise_nm=2e-4)
     async with sensing(board) as sensor:
         await until(lambda: sensor.latest().stamp.seq > 10, "rounds")
         assert sensor.latest().force_n == pytest.approx(WRENCH[:3], abs=0.02)
@@ -217,7 +217,7 @@ async def test_an_adapter_that_is_not_there_is_a_lost_connection(interface: str)
 
 async def test_a_bias_is_subtracted_from_now_on():
     load: list[Wrench] = [WRENCH]
-    async with sensing(ForceBoard(lambda _: load[0], noise_n=0.02, noise_nm=0.002)) as sensor:
+    async with sensing(ForceBoard(lambda: load[0], noise_n=0.02, noise_nm=0.002)) as sensor:
         await sensor.bias(0.4)
         assert sensor.bias_wrench == pytest.approx(WRENCH, abs=0.02)
         seen: list[ForceSample] = []
@@ -229,8 +229,11 @@ async def test_a_bias_is_subtracted_from_now_on():
 
 @pytest.mark.parametrize(("axis", "size", "says"), [(2, 1.0, "Fz varied"), (3, 0.1, "Mx varied")])
 async def test_a_bias_while_something_moves_is_refused(axis: int, size: float, says: str):
-    def shake(t_s: float) -> Wrench:
-        return tuple(v + size * math.sin(50.0 * t_s) * (k == axis) for k, v in enumerate(WRENCH))
+    turns = count()
+
+    def shake() -> Wrench:
+        swing = size * math.sin(0.5 * next(turns))
+        return tuple(v + swing * (k == axis) for k, v in enumerate(WRENCH))
 
     async with sensing(ForceBoard(shake)) as sensor:
         with pytest.raises(DeviceError, match=rf"{says}.*The previous bias remains.*try again"):

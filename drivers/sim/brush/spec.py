@@ -8,9 +8,11 @@ from __future__ import annotations
 import tomllib
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 from pydantic import BaseModel, Field, ValidationError
+
+from brushloop.drivers.loopback import RigRefused
 
 
 def _ranged(default: float, low: float, high: float) -> Any:
@@ -89,27 +91,14 @@ def within(name: str, value: float, low: float, high: float) -> None:
         raise ValueError(f"{name} = {value:g} is outside {low:g} .. {high:g}")
 
 
-class SimFileError(Exception):
-    """A file or socket cannot be used, read or written: path, field, what is allowed."""
-
-    exit_code: ClassVar[int] = 2
-
-    def __init__(self, path: Path, field: str, what: str) -> None:
-        super().__init__(f"{path}: {field}: {what}" if field else f"{path}: {what}")
-
-
-def complaint(error: ValidationError) -> tuple[str, str]:
-    """(field, what is wrong with it), one line; an unknown key first, as it is often a misspelt one."""
+def complaint(error: ValidationError) -> str:
+    """A field and what is wrong with it, in one printable line; an unknown key first, as it is often a misspelt one."""
     first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
     field = ".".join(str(part) for part in first["loc"])
     value = "" if first["type"] in ("missing", "value_error") else f" (given: {str(first['input'])[:60]!r})"
     more = f"; and {error.error_count() - 1} more" if error.error_count() > 1 else ""
-    return _plain(field), _plain(f"{first['msg'].removeprefix('Value error, ')}{value}{more}")
-
-
-def _plain(text: str) -> str:
-    """One printable line, whatever the file holds."""
-    return "".join(char if char.isprintable() else "?" for char in text)[:300]
+    line = ": ".join(filter(None, (field, f"{first['msg'].removeprefix('Value error, ')}{value}{more}")))
+    return "".join(char if char.isprintable() else "?" for char in line)[:300]
 
 
 MAX_BYTES = 256 * 1024
@@ -151,7 +140,7 @@ class BrushFile(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
 def load_brush(path: Path, seed: int = BrushSpec().seed) -> BrushFile:
     """Read the file, or take one of the shipped brushes if `path` is just `paper` or `loopback`.
 
-    `seed` is that of the individual for `loopback`; any other brush has its own. Raises `SimFileError`.
+    `seed` is that of the individual for `loopback`; any other brush has its own. Raises `RigRefused`, or OSError.
     """
     if str(path) == LOOPBACK:
         return BrushFile(name=f"simulated bristle bundle, seed {seed}", brush=BrushSpec(seed=seed))
@@ -160,14 +149,12 @@ def load_brush(path: Path, seed: int = BrushSpec().seed) -> BrushFile:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
         if len(data) > MAX_BYTES:
-            raise SimFileError(path, "", f"is larger than {MAX_BYTES} bytes")
+            raise RigRefused(f"{path}: is larger than {MAX_BYTES} bytes")
         return BrushFile.model_validate(tomllib.loads(data.decode("utf-8")))
     except FileNotFoundError:
         shipped = f"{LOOPBACK} and {PAPER} are shipped, any other is a brush.toml"
-        raise SimFileError(path, "", f"no such file: {shipped}") from None
-    except OSError as error:
-        raise SimFileError(path, "", error.strerror or str(error)) from None
+        raise RigRefused(f"{path}: no such file: {shipped}") from None
     except ValidationError as error:
-        raise SimFileError(path, *complaint(error)) from None
+        raise RigRefused(f"{path}: {complaint(error)}") from None
     except (ValueError, RecursionError) as error:  # a ValueError also for a number of thousands of digits
-        raise SimFileError(path, "", f"is not TOML: {error}") from None
+        raise RigRefused(f"{path}: is not TOML: {error}") from None

@@ -20,7 +20,9 @@ from brushloop.drivers.devices import ForceSample, Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceError, MotionFailed, Stuck
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.ink.port import DoseLost, InkRefused
+from brushloop.drivers.sim import world
 from brushloop.drivers.sim.faults import Device, Fault
+from brushloop.drivers.sim.world import push_on
 from brushloop.sessions.events import DipResult, PressResult
 from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.records import Topic
@@ -37,7 +39,7 @@ def slowly(lab: Lab) -> None:
 
 def in_mid_press(lab: Lab, monkeypatch: pytest.MonkeyPatch, fault: Fault) -> None:
     """The sensor has this fault as soon as the brush is 4 mm deep, once."""
-    push_n = lab.rig.world.reaction
+    push_n = push_on(lab.rig.config.brush)
     hung: list[int] = []
 
     def pushed_n(depth_mm: float, tilt_deg: float) -> float:
@@ -45,7 +47,7 @@ def in_mid_press(lab: Lab, monkeypatch: pytest.MonkeyPatch, fault: Fault) -> Non
             hung.append(lab.rig.faults.hang(fault))
         return push_n(depth_mm, tilt_deg)
 
-    monkeypatch.setattr(lab.rig.world, "reaction", pushed_n)
+    monkeypatch.setattr(world, "push_on", lambda _brush: pushed_n)
 
 
 @pytest.mark.xdist_group("collected")
@@ -63,7 +65,7 @@ def test_force_and_ink_are_recorded_beside_the_poses(collected: Collected) -> No
 def test_something_hard_under_the_brush_stops_the_arm_at_once_and_burns_the_patch(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lab.rig.world, "reaction", lambda depth_mm, _tilt_deg: 9.0 if depth_mm > 4.0 else 0.0)
+    monkeypatch.setattr(world, "push_on", lambda _brush: lambda depth_mm, _tilt_deg: 9.0 if depth_mm > 4.0 else 0.0)
     slowly(lab)
     with pytest.raises(ForceTooHigh, match="ceiling is 5 N"):
         lab.run()

@@ -17,14 +17,13 @@ from tests.simulated_time import SimulatedTime
 
 
 class Scripted(FaultBoard):
-    """A board over a world whose state is set by the test, and a clock. The rig has no force sensor."""
+    """A board over a world whose state is set by the test, and a clock."""
 
     def __init__(self) -> None:
         self.at_s = 0.0
         self.doing = Phase.PARKED
         self.presses: list[None] = []
         self.clock = self
-        self.config = SimConfig(force_sensor=False)
         super().__init__(self)  # type: ignore[arg-type]
 
     def real_s(self) -> float:
@@ -87,7 +86,6 @@ def test_a_fault_strikes_the_requests_that_its_conditions_name(
     [
         ({"kind": "loud"}, "kind = 'loud' is not one of robot's: deaf, drop,"),
         ({"device": "coffee"}, "device: Input should be 'robot', 'telemetry'"),
-        ({"device": "force", "kind": "nan"}, "device = 'force': this rig has none"),
         ({"nth": 0}, "nth: Input should be greater than or equal to 1"),
         ({"device": "telemetry", "on": "moveLine"}, "only the robot has methods"),
         ({"kind": "emergency-stop", "nth": 2}, "counts nothing here"),

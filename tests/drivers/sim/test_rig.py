@@ -24,10 +24,9 @@ from brushloop.drivers.devices import Stamp
 from brushloop.drivers.force.simulator import FRAME_S, ForceBoard, SocketcandServer
 from brushloop.drivers.force.sri_m8123 import COMMAND_ID, LOOPBACK_CHANNEL, START
 from brushloop.drivers.host import HostClock
-from brushloop.drivers.loopback import FaultRefused, LoopbackServer
+from brushloop.drivers.loopback import LoopbackServer, RigRefused
 from brushloop.drivers.loopback import ask as ask_rig
 from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
-from brushloop.drivers.sim.brush.spec import SimFileError
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 from brushloop.drivers.sim.rig import HOST, ControlServer, LoopbackRig, serve
@@ -63,10 +62,10 @@ async def test_serving_ends_by_itself_and_leaves_a_rig_toml_unless_another_file_
     assert [p.name for p in tmp_path.iterdir()] == ["rig.toml"]
     assert str(target) in lines[0]
     target.write_text("name = 'our rig'")
-    with pytest.raises(SimFileError, match="was not written by a loopback rig"):
+    with pytest.raises(RigRefused, match="was not written by a loopback rig"):
         await serve(LoopbackRig(SMALL), lines.append, write_rig=target)
     (tmp_path / "other.toml.part").mkdir()
-    with pytest.raises(SimFileError, match=r"other\.toml: cannot be written: Is a directory"):
+    with pytest.raises(RigRefused, match=r"other\.toml: cannot be written: Is a directory"):
         await serve(LoopbackRig(SMALL), lines.append, write_rig=tmp_path / "other.toml")
 
 
@@ -121,7 +120,7 @@ async def test_a_server_refuses_any_address_that_is_not_loopback(host: str):
 async def test_the_frames_of_a_round_are_one_burst_on_a_busy_computer(monkeypatch: pytest.MonkeyPatch) -> None:
     late_s = itertools.count(1000.0, 0.05)
     monkeypatch.setattr(time, "time", lambda: next(late_s))
-    server = SocketcandServer(ForceBoard(lambda _: (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)), lambda: 0.0, rate_hz=100.0)
+    server = SocketcandServer(ForceBoard(lambda: (0.0,) * 6), rate_hz=100.0)
     await server.start("127.0.0.1", 0)
     reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
     command = f"< send {COMMAND_ID:03X} {len(START):x} {' '.join(f'{byte:02X}' for byte in START)} >"
@@ -187,7 +186,7 @@ async def test_what_is_no_request_gets_one_line_and_the_next_is_answered(ask: As
 
 async def test_only_its_owner_can_open_it_and_no_other_file_or_rig_is_pushed_aside(rig: LoopbackRig, path: Path):
     async def refused(at: Path, words: str) -> None:
-        with pytest.raises(SimFileError, match=words):
+        with pytest.raises(RigRefused, match=words):
             async with ControlServer(rig, at):
                 pass
 
@@ -201,7 +200,7 @@ async def test_only_its_owner_can_open_it_and_no_other_file_or_rig_is_pushed_asi
     async with ControlServer(rig, dead):  # replaced
         pass
     path.write_text("mine")
-    await refused(path, "exists and is not a socket")
+    await refused(path, "already in use")
     assert path.read_text() == "mine"
     await refused(path.with_name("x" * 120), "too long")  # the system would cut it
     await refused(path / "no", "cannot listen here")
@@ -221,7 +220,7 @@ async def test_a_person_breaks_the_rig_and_mends_it(ask: Ask, path: Path):
 
 
 def test_where_no_rig_answers_it_is_said_in_one_line(tmp_path: Path):
-    with pytest.raises(FaultRefused, match="no rig answers here") as caught:
+    with pytest.raises(RigRefused, match="no rig answers here") as caught:
         ask_rig(tmp_path / "nobody", {"do": "state"})
     assert caught.value.exit_code == 2
 

@@ -71,8 +71,6 @@ def test_the_labels_tell_where_to_connect_and_nothing_that_has_to_be_measured():
     [
         ({"act": "dance"}, "act = 'dance' is not one of bring"),
         ({"act": "bring", "to": "moon"}, "to = 'moon' is not one of pin"),
-        ({"act": "bring", "to": "pin", "index": -1}, "index = -1"),
-        ({"act": "bring", "to": "pin", "index": True}, "index = True"),
         ({"act": "bring", "to": "board-corner", "corner": "middle"}, "corner = 'middle' is not one of lower left"),
         ({"act": "measure", "to": "weight"}, "to = 'weight' is not one of square"),
     ],

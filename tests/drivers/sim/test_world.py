@@ -16,9 +16,10 @@ from bench.brushes import FROZEN
 from brushloop.collect.rig.config import QualityConfig
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.loopback import RigRefused
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Flaw, Waypoint
 from brushloop.drivers.sim.brush.paper import PX_PER_MM, Footprint, Paper
-from brushloop.drivers.sim.brush.spec import PAPER, SimFileError, load_brush
+from brushloop.drivers.sim.brush.spec import PAPER, load_brush
 from brushloop.drivers.sim.config import SimConfig, Table
 from brushloop.drivers.sim.rig import rig_toml
 from brushloop.drivers.sim.world import INK_PER_PRESS, Press, World, bent_toward
@@ -116,7 +117,7 @@ def written(folder: Path, text: str) -> Path:
 )
 def test_a_brush_out_of_range_is_refused_with_file_field_and_range(tmp_path: Path, text: str, message: str) -> None:
     path = written(tmp_path, f'name = "any"\n[brush]\n{text}\n')
-    with pytest.raises(SimFileError, match=message) as refused:
+    with pytest.raises(RigRefused, match=message) as refused:
         load_brush(path)
     assert str(refused.value).startswith(f"{path}: ")
     assert "\n" not in str(refused.value)
