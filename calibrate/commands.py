@@ -196,10 +196,8 @@ class RecoverRequest:
     tilt_range_deg: tuple[float, float] = (0.0, 30.0)
     presses: int | None = None
     """Only this many, spread evenly over the session."""
-    repeats: int = 1
-    """How often the protocol presses each stroke."""
     seed: int = 1
-    """Seed of the order in which it does."""
+    """Seed of the order in which the protocol presses them."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -158,7 +158,7 @@ def recover(request: RecoverRequest, progress: Progress = unseen) -> Recovered:
 
 
 def _protocol(recovered: Recovered, request: RecoverRequest) -> str:
-    """The protocol that presses each recovered stroke `repeats` times, in an order drawn with `seed`."""
+    """The protocol that presses each recovered stroke, in an order drawn with `seed`."""
     header = recovered.session.header
     return (
         f"# Recovered by {recovered.model} from {header.session_id} ({header.source}), "
@@ -166,7 +166,7 @@ def _protocol(recovered: Recovered, request: RecoverRequest) -> str:
         'kind = "replay"\n'
         f"of = {json.dumps(header.session_id, ensure_ascii=False)}\n"
         f"file = {json.dumps(recovered.out.name, ensure_ascii=False)}\n"
-        f"repeats = {request.repeats}\n"
+        "repeats = 1\n"
         f"seed = {request.seed}\n"
     )
 

@@ -6,13 +6,12 @@ Commands that collect among other things look here for the finished session of a
 from __future__ import annotations
 
 import contextlib
-import json
 import sys
 import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from brushloop.calibrate.artefact import FITS, current
 from brushloop.calibrate.commands import CalibrateRequest, FitRequest, show_work
@@ -174,20 +173,15 @@ def finished_session(root: Path, config: Path, protocol: Path) -> Path | None:
     """
     if not root.is_dir():
         return None
-    rig, wanted = load_rig(config), _settings(load_protocol(protocol).model_dump_json())
+    rig, wanted = load_rig(config), load_protocol(protocol).model_dump_json()
     material = (rig.brush.name, rig.ink.name, rig.paper.name)
     sessions: list[Path] = []
     for folder in root.iterdir():
-        with contextlib.suppress(SessionError, ValueError):  # open, damaged, imported, or no session
+        with contextlib.suppress(SessionError):  # open, damaged, or no session
             header = Recording(folder).header
-            if _settings(header.protocol) == wanted and (header.brush, header.ink, header.paper) == material:
+            if (header.protocol, header.brush, header.ink, header.paper) == (wanted, *material):
                 sessions.append(folder)
     return max(sessions, key=lambda path: (path / f"{path.name}.mcap").stat().st_mtime_ns, default=None)
-
-
-def _settings(protocol: str) -> Any:
-    """A recorded protocol without its nulls: a key that another version does not know was left out, if it is null."""
-    return json.loads(protocol, object_hook=lambda table: {k: v for k, v in table.items() if v is not None})
 
 
 def collected(request: CollectRequest) -> Collected:

@@ -23,8 +23,8 @@ from pathlib import Path
 from brushloop.collect.chains import DemoRequest
 from brushloop.collect.chains.demo import Demo, Size
 
-size = Size((11.0, 20.0), (0.0, 8.0), again=1, writings=0)
-Demo(DemoRequest(Path(sys.argv[1]), repeats=1), size).run()
+size = Size((11.0, 20.0), (0.0, 8.0), again=1, writings=0, repeats=1)
+Demo(DemoRequest(Path(sys.argv[1])), size).run()
 """
 """`brushloop demo` with as few presses as tell depth and tilt to the fit."""
 

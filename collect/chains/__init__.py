@@ -6,7 +6,6 @@ imported here.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -24,9 +23,7 @@ class LoopRequest:
     session: Annotated[Path, Argument(help="The session whose presses are recovered and made again.")]
     config: Rig = RIG_FILE
     out: Annotated[Path | None, Option(help="Folder for what the loop makes; <session>/loop by default.")] = None
-    fit: Annotated[Path | None, Option(help="Brush fit; default: the one in use, or a new one.")] = None
     presses: Annotated[int | None, Option(min=1, help="Only this many presses, spread evenly over the session.")] = None
-    repeats: Annotated[int, Option(min=1, max=100, help="How often each is pressed again.")] = 1
     seed: Annotated[int, Option(min=0, help="Seed of the order.")] = 1
     sheet: NewSheet = None
     armed: Arm = False
@@ -59,16 +56,8 @@ class DemoRequest:
 
     out: Annotated[Path, Option(help="Folder for everything that the demo makes.")] = Path("demo-run")
     full: Annotated[bool, Option("--full", help="More presses, and a written character: all three tables.")] = False
-    repeats: Annotated[int, Option(min=1, max=2, help="Presses per (H, alpha); one sheet holds two.")] = 2
-    rate: Annotated[float, Option(min=0.01, max=1000, help="Simulated seconds per real second.")] = 60.0
-    seed: Annotated[int, Option(min=0, help="Seed of the rig and of the order of presses.")] = 1
     brush: Annotated[Path, Option(help="The rig's brush: `paper`, `loopback`, or one described in a brush.toml.")] = (
         Path("paper")
     )
     show: Annotated[bool, Option("--open", help="Open the report in the browser at the end.")] = False
     verbose: Annotated[bool, Option("--verbose", help="Show all that the steps print, instead of in demo.log.")] = False
-
-
-def on_screen(tui: bool | None) -> bool:
-    """Whether a collection has a screen: as asked for, else if there is a terminal."""
-    return tui if tui is not None else sys.stdin.isatty() and sys.stdout.isatty()

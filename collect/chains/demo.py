@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 CHARACTER = "字"
 LOG, BAR = "demo.log", 40
 """The file that gets what the steps print; length of a full bar, in characters."""
+RATE, SEED = 60.0, 1
+"""Simulated seconds per real second; seed of the rig, of the order of presses, and of the loop."""
 IDLE_EXIT_S = 180.0
 """Time after which the rig of a killed demo ends; the evaluation between two collections takes less."""
 FPS = 12
@@ -52,6 +54,8 @@ class Size:
     """Presses that are recovered from their images and made again."""
     writings: int
     """How often the character is written; 0 leaves Table 3 empty."""
+    repeats: int = 2
+    """Presses per (H, alpha); one sheet holds two."""
 
 
 QUICK = Size((11.0, 15.0, 20.0), (0.0, 5.0, 10.0), again=6, writings=0)
@@ -82,8 +86,8 @@ class Demo:
         asked, size = self._request, self._size
         asked.out.mkdir(parents=True, exist_ok=True)
         grid = f'kind = "grid"\ndepths_mm = {list(size.depths_mm)}\ntilts_deg = {list(size.tilts_deg)}\n'
-        self._protocol.write_text(f"{grid}repeats = {asked.repeats}\nseed = {asked.seed}\n", encoding="utf-8")
-        presses = len(size.depths_mm) * len(size.tilts_deg) * asked.repeats
+        self._protocol.write_text(f"{grid}repeats = {size.repeats}\nseed = {SEED}\n", encoding="utf-8")
+        presses = len(size.depths_mm) * len(size.tilts_deg) * size.repeats
         write = [(f"write {CHARACTER} {size.writings} times", self._write)] if size.writings else []
         # Title of each step, and what does the part of it that is not done yet.
         steps = [
@@ -129,8 +133,7 @@ class Demo:
             say("the loopback rig starts in the background; its log is rig.log")
             self._config.unlink(missing_ok=True)  # the rig writes its own
             asked = self._request
-            options = {"rate": asked.rate, "seed": asked.seed, "brush": asked.brush}
-            options |= {"fps": FPS, "idle-exit": IDLE_EXIT_S}
+            options = {"rate": RATE, "seed": SEED, "brush": asked.brush, "fps": FPS, "idle-exit": IDLE_EXIT_S}
             words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
             self._rig = start(self._config, asked.out / "rig.log", *words, detached=True)
         return self._rig
@@ -157,8 +160,8 @@ class Demo:
         if (folder / LOOP_PAGE).is_file():
             return
         self._blank_sheet(folder / REPLAY)
-        presses, seed = self._size.again, self._request.seed
-        run_loop(LoopRequest(self._session, self._config, folder, presses=presses, seed=seed, sheet=1, tui=False))
+        presses = self._size.again
+        run_loop(LoopRequest(self._session, self._config, folder, presses=presses, seed=SEED, sheet=1, tui=False))
 
     def _write(self) -> None:
         folder = self._session / "written"

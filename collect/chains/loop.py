@@ -13,6 +13,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from brushloop.calibrate.artefact import FITS
 from brushloop.calibrate.commands import CompareLoopRequest, RecoverRequest, show_work
 from brushloop.calibrate.files import write_whole
 from brushloop.collect.chains import LoopRequest
@@ -28,7 +29,6 @@ from brushloop.sessions.records import BareName
 from brushloop.sessions.terminal import say
 
 SETTINGS, RECOVERED, PROTOCOL, PAGE = "settings.json", "recovered.csv", "protocol-replay.toml", "loop.html"
-FITS = "brushfit"
 LEAST_HEIGHT_MM = 2.0
 MAX_CSV_BYTES = 8 * 1024 * 1024
 
@@ -50,7 +50,7 @@ def run_loop(request: LoopRequest) -> Path:
         calibrated(folder)
     begun = begun_with(out)
     # The fit that the loop was begun with, even if another one was made since.
-    fit = request.fit or (fitted(folder) if begun is None else folder / FITS / f"{begun.fit}.json")
+    fit = fitted(folder) if begun is None else folder / FITS / f"{begun.fit}.json"
     settings = Settings(
         original=header.session_id,
         original_sha256=recording.sha256,
@@ -58,7 +58,6 @@ def run_loop(request: LoopRequest) -> Path:
         depth_range_mm=(LEAST_HEIGHT_MM, rig.brush.max_depth_mm),
         tilt_range_deg=(0.0, rig.robot.limits.tilt_deg),
         presses=request.presses,
-        repeats=request.repeats,
         seed=request.seed,
     )
     keep_settings(settings, begun, out)
@@ -66,7 +65,7 @@ def run_loop(request: LoopRequest) -> Path:
         from brushloop.calibrate.recover import recover  # slow to import
 
         say(f"recover {folder}")
-        chosen = settings.model_dump(include={"depth_range_mm", "tilt_range_deg", "presses", "repeats", "seed"})
+        chosen = settings.model_dump(include={"depth_range_mm", "tilt_range_deg", "presses", "seed"})
         show_work(recover, RecoverRequest(folder, out / RECOVERED, fit=fit, **chosen))
     check_recovered(out / RECOVERED)
     wanted = CollectRequest(request.config, out / PROTOCOL, root, sheet=request.sheet, armed=request.armed)
@@ -101,8 +100,7 @@ class Settings(BaseModel):
     depth_range_mm: tuple[float, float]
     tilt_range_deg: tuple[float, float]
     presses: int | None = None
-    """None: all, as in loops begun before this could be chosen."""
-    repeats: int
+    """None: all."""
     seed: int
 
 

@@ -100,8 +100,7 @@ def finished(config: Path, protocol: Path, out: Path, number: int) -> Path:
     """A finished session of this protocol with what that rig holds."""
     rig = load_rig(config)
     known = {"brush": rig.brush.name, "ink": rig.ink.name, "paper": rig.paper.name}
-    gone = '{"wait_after_dip_s":null,'  # a key of an earlier version
-    asked = {"session_id": f"grid-{number}", "protocol": gone + load_protocol(protocol).model_dump_json()[1:]}
+    asked = {"session_id": f"grid-{number}", "protocol": load_protocol(protocol).model_dump_json()}
     Make().session(out / f"grid-{number}", closed=True, **known, **asked)
     return out / f"grid-{number}"
 
@@ -160,7 +159,6 @@ SETTINGS = Settings(
     fit="cd",
     depth_range_mm=(2.0, 22.0),
     tilt_range_deg=(0.0, 15.0),
-    repeats=1,
     seed=1,
 )
 
