@@ -142,17 +142,12 @@ class ProofStep(Step):
 
 
 def slowly(rig: RigConfig) -> RigConfig:
-    """The same rig, with no move faster than 50 mm/s, and a delay of the camera that is measured to a tenth."""
+    """The same rig, with no move faster than 50 mm/s."""
     motion, limits = rig.motion, rig.robot.limits
     slow = {name: min(getattr(motion, name), SLOW_MM_S) for name in ("travel_speed_mm_s", "press_speed_mm_s")}
     capped = limits.model_copy(update={"speed_mm_s": min(limits.speed_mm_s, 50.0)})
-    return rig.model_copy(
-        update={
-            "motion": motion.model_copy(update=slow),
-            "robot": rig.robot.model_copy(update={"limits": capped}),
-            "camera": rig.camera.model_copy(update={"exact_delay": True}),
-        }
-    )
+    robot = rig.robot.model_copy(update={"limits": capped})
+    return rig.model_copy(update={"motion": motion.model_copy(update=slow), "robot": robot})
 
 
 def read_proof(session: Path) -> tuple[ZeroTouchResult, SelfCheckResult, list[CaptureResult]]:

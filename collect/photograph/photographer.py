@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.stats import student_95
 from brushloop.collect.errors import BadPicture, CameraLate
 from brushloop.collect.photograph.frames import ARM_SHARE, Frames, Series, Thumbnail, View, watching
 from brushloop.collect.rig.devices import Rig
@@ -36,10 +35,6 @@ MOST_GAP_S = 1.0
 """After a longer silence of camera or arm, the time of an event is unknown."""
 SLACK_S = 0.05
 """How far a busy computer may shift the times of single poses and frames."""
-LEAST_ALIKE, ALIKE_SHARE = 4, 0.75
-"""Fewer trips may agree by chance on a busy computer, and so may a smaller share of them."""
-EXACT_S = 0.015
-"""Half width of the 95 % interval that is good enough for a short delay."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,24 +56,14 @@ class CameraDelay:
     def delay_s(self) -> float:
         """Mean time from an event to the arrival of the first frame that shows it, without trips in which something
         stalled: those are farther from the median than the periods of camera and arm explain."""
-        return float(self._alike_s.mean())
-
-    @property
-    def _alike_s(self) -> Floats:
-        """Delays of the trips that agree with the median."""
         delays_s = np.array([look.delay_s for look in self.looks])
         off_s = np.abs(delays_s - np.median(delays_s))
-        typical_s = float(np.median([look.resolution_s for look in self.looks]))
-        return delays_s[off_s <= max(2.0 * typical_s, GOOD_S, float(off_s.min()))]
+        return float(delays_s[off_s <= max(2.0 * self._typical_s, GOOD_S, float(off_s.min()))].mean())
 
     @property
-    def exact(self) -> bool:
-        """Whether most of the trips agree, and by their spread the mean is known to a tenth of its value (95 %)."""
-        alike_s = self._alike_s
-        if len(alike_s) < max(LEAST_ALIKE, ALIKE_SHARE * len(self.looks)):
-            return False
-        reach_s = float(student_95(len(alike_s) - 1) * alike_s.std(ddof=1) / len(alike_s) ** 0.5)
-        return reach_s <= max(GOOD_SHARE * self.delay_s, EXACT_S)
+    def _typical_s(self) -> float:
+        """Uncertainty of the delay of one trip."""
+        return float(np.median([look.resolution_s for look in self.looks]))
 
     @property
     def spread_s(self) -> float:
@@ -89,7 +74,7 @@ class CameraDelay:
     @property
     def resolution_s(self) -> float:
         """Uncertainty of the mean delay."""
-        return float(np.median([look.resolution_s for look in self.looks])) / len(self.looks) ** 0.5
+        return self._typical_s / len(self.looks) ** 0.5
 
     @property
     def bound_s(self) -> float:
@@ -100,8 +85,7 @@ class CameraDelay:
     def known(self) -> bool:
         """Whether the trips differ by no more than the camera's period explains, and suffice to average that out."""
         good_s = max(GOOD_SHARE * self.delay_s, GOOD_S)
-        typical_s = float(np.median([look.resolution_s for look in self.looks]))
-        return self.spread_s <= max(2.0 * typical_s, good_s) and self.resolution_s <= good_s
+        return self.spread_s <= max(2.0 * self._typical_s, good_s) and self.resolution_s <= good_s
 
     def __str__(self) -> str:
         delay_ms, resolution_ms, spread_ms = (1e3 * v for v in (self.delay_s, self.resolution_s, self.spread_s))
@@ -158,11 +142,9 @@ def _gap(t_s: Floats, at_s: float) -> float:
     return 0.5 * float(t_s[after] - t_s[after - 1])
 
 
-FEWEST_LOOKS, MOST_LOOKS, MOST_EXACT_LOOKS = 2, 6, 8
+FEWEST_LOOKS, MOST_LOOKS = 2, 6
 ATTEMPTS = 4
 """Most attempts at the measurement; another follows after one that a stall or an old picture made useless."""
-MOST_UNSURE = 2
-"""Measurements whose trips do not agree, after which an exact delay is refused."""
 PATIENCE_S = 1.5
 """Waiting time beyond the longest allowed delay: distinguishes a camera that is late from one that shows nothing."""
 STAY_S = 0.15
@@ -248,12 +230,12 @@ class Photographer:
 
         Returns the delay, and the view without the arm.
         """
-        shown, exact, unsure = False, self._config.exact_delay, list[CameraDelay]()
+        shown = False
         for attempt in range(ATTEMPTS):
             # The first view may have been old: after a failed attempt, wait until every old frame has passed.
             view = await self._view_without_arm(still_s=self._patience_s if attempt else 0.0)
             looks: list[Look] = []
-            for number in range(MOST_EXACT_LOOKS if exact else MOST_LOOKS):
+            for number in range(MOST_LOOKS):
                 # Trips of different lengths cannot be confused with each other.
                 seen = await self._trip(view, stay_s=number * STAY_S)
                 if seen is None:
@@ -265,16 +247,10 @@ class Photographer:
                 elif attempt == 0:
                     looks.clear()  # these pictures may all show what the arm did before
                     break
-                so_far = CameraDelay(tuple(looks))
-                if len(looks) >= FEWEST_LOOKS and (so_far.exact if exact else so_far.known):
+                if len(looks) >= FEWEST_LOOKS and CameraDelay(tuple(looks)).known:
                     break
             if len(looks) >= FEWEST_LOOKS:
-                delay = CameraDelay(tuple(looks))
-                if delay.exact or not exact:
-                    return self._accepted(delay), view
-                unsure.append(delay)
-                if len(unsure) == MOST_UNSURE:
-                    raise self._uneven(f"{delay}, and these do not agree")
+                return self._accepted(CameraDelay(tuple(looks))), view
         raise self._uneven() if shown else self._not_shown()
 
     def _accepted(self, delay: CameraDelay) -> CameraDelay:

@@ -55,8 +55,6 @@ class CameraTable(BaseModel, frozen=True, extra="forbid"):
     """A camera whose measured delay is longer is refused."""
     max_jitter_ms: Annotated[float, Field(ge=10.0, le=10_000.0)] = 500.0
     """A camera whose measured delay varies by more is refused."""
-    exact_delay: bool = False
-    """Whether a delay that is not known to a tenth of its value (95 %) is measured again, then refused."""
     timeout_s: Annotated[float, Field(gt=0.0, le=120.0)] = 10.0
     locked: Locked = Locked()
 
