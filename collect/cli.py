@@ -116,17 +116,15 @@ def doctor(
     from brushloop.collect.rig.config import load_rig
 
     if report is not None:
-        from brushloop.collect.commission.visit import Notebook, notebook_path
+        from brushloop.collect.commission.arm import ADDRESS, write_first_report
+        from brushloop.collect.commission.visit import Notebook
 
         _check_output("--report", report, ".zip")
         if report.exists():
             raise ConfigError("--report", "", f"{report} exists and is not overwritten: choose another name")
-        if not config.exists() and (taught := notebook_path(config)).exists():
-            from brushloop.collect.commission.arm import write_first_report
-
-            asyncio.run(write_first_report(report, Notebook.load(config)))
-            known = f"{report} holds what {taught} knows and what the arm answered"
-            say(f"There is no {config} yet: {known}. Read it first.")
+        if not config.exists() and ADDRESS in (notebook := Notebook.load(config)).values:
+            asyncio.run(write_first_report(report, notebook))
+            say(f"There is no {config} yet: {report} holds what was taught and what the arm answered. Read it first.")
             return
     rig = load_rig(config)
 
@@ -136,7 +134,7 @@ def doctor(
     findings = asyncio.run(examine(rig, HostClock()))
     say(doctor_table(findings))
     if report is not None:
-        asyncio.run(write_report(report, rig, findings))
+        asyncio.run(write_report(report, rig.model_dump(mode="json"), rig.robot, findings))
         say(f"{report} holds what was asked and answered. Read it before you send it.")
     if not all(finding.well for finding in findings):
         raise typer.Exit(4)

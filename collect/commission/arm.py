@@ -10,24 +10,15 @@ from urllib.parse import urlsplit
 
 from brushloop.collect.commission.visit import Notebook, Step, Taught, Visit, line_of
 from brushloop.collect.rig.check import tool_length
-from brushloop.collect.rig.doctor import Finding, Scrubber, numbers_only, transcript, write_archive
+from brushloop.collect.rig.doctor import Finding, write_report
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, Controller, only_asking
-from brushloop.drivers.arcs.settings import read_back
+from brushloop.drivers.arcs.settings import ArcsTable, read_back
 from brushloop.drivers.arcs.wire import DEVICE, Framing, answers
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import DeviceError, DeviceTimeout, ProtocolViolation, RpcError
 from brushloop.drivers.geometry import distance, from_wire, inverse, product, turned
 
 ARCS_PORT, RTDE_PORT = 30004, 30010
-NAMES = {
-    "robot.host": "<host>",
-    "aside.address": "<host>",
-    "camera.source": "<camera>",
-    "force.host": "<host>",
-    "aside.bus": "<host>",
-    "ink.device.port": "<port>",
-}
-"""Values that identify the lab, and the placeholder for each."""
 FRAMINGS: tuple[Framing, ...] = ("sof", "bare")
 STILL_MM, STILL_DEG = 0.02, 0.01
 """An arm that is held still by hand moves by less than this between two readings."""
@@ -186,17 +177,18 @@ class ArmStep(Step):
 async def write_first_report(path: Path, notebook: Notebook) -> None:
     """`doctor --report` before there is a `rig.toml`: what is known so far, and what the arm answers word for word.
 
-    `check_report` must have passed. Raises OSError.
+    The address of the arm must be known. Raises OSError.
     """
-    scrubber = Scrubber({str(notebook.get(field) or ""): stands_for for field, stands_for in NAMES.items()})
-    how = "" if (kind := notebook.values.get("robot.kind")) is None else kind.how
-    typed, framing = str(notebook.get(ADDRESS) or ""), notebook.get("robot.framing") or FRAMINGS[0]
-    known = {
-        "framing": framing,
-        "findings": [scrubber.value(Finding("robot", typed, answers=bool(how), notes=how).as_json())],
-        "done": notebook.done,
-        "taught": numbers_only(notebook.table("")),
-        "touched": {name: touch.position_mm for name, touch in notebook.touches.items()},
-    }
-    said = await transcript(*address_of(typed), framing, scrubber) if typed else ""
-    write_archive(path, known, {"arcs.jsonl": said})
+    rig, kind = notebook.table(""), notebook.values.get("robot.kind")
+    host, port = address_of(rig[ADDRESS])
+    robot = ArcsTable(
+        kind="aubo-arcs",
+        host=host,
+        port=port,
+        framing=rig.get("robot.framing", FRAMINGS[0]),
+        rtde_port=rig.get("robot.rtde_port"),
+        tcp_offset_mm=(0.0, 0.0, 0.0),
+    )
+    finding = Finding("robot", rig[ADDRESS], answers=kind is not None, notes="" if kind is None else kind.how)
+    touched = {name: touch.position_mm for name, touch in notebook.touches.items()}
+    await write_report(path, rig, robot, [finding], done=notebook.done, touched=touched)

@@ -31,8 +31,8 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.rig.config import PREFIX, RigConfig
 from brushloop.collect.rig.devices import make_robot
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, RobotMode, survey
+from brushloop.drivers.arcs.settings import ArcsTable
 from brushloop.drivers.arcs.telemetry import rtde_answers
-from brushloop.drivers.arcs.wire import Framing
 from brushloop.drivers.camera import OpenCvCamera
 from brushloop.drivers.devices import Device, Stamp
 from brushloop.drivers.errors import DeviceError
@@ -63,10 +63,6 @@ class Finding:
     def well(self) -> bool:
         """Whether nothing is wrong."""
         return self.answers and not self.problem
-
-    def as_json(self) -> dict[str, Any]:
-        """Every field, and the verdict."""
-        return {**asdict(self), "well": self.well}
 
     async def timed(self, calls: int, ask: Callable[[], Awaitable[T]]) -> T:
         """The last answer of several calls, whose median time is the latency."""
@@ -210,6 +206,8 @@ PATTERNS = (
 )
 KEPT = frozenset({"kind", "interface", "framing", "dictionary", "method"})
 """Fields of `rig.toml` whose text is one of a few fixed words; all other text in it is left out."""
+NAMING = {"host": "<host>", "address": "<host>", "bus": "<host>", "source": "<camera>", "port": "<port>"}
+"""Fields whose text identifies a device of the lab, wherever it occurs, and the placeholder for each."""
 
 
 class Scrubber:
@@ -248,7 +246,7 @@ def _with_texts(value: Any, changed: Callable[[str, str], str], field: str = "")
             return changed(field, value)
         case dict():
             table = cast("dict[str, Any]", value)
-            return {name: _with_texts(inner, changed, name) for name, inner in table.items()}
+            return {name: _with_texts(inner, changed, name.rpartition(".")[2]) for name, inner in table.items()}
         case list() | tuple():
             return [_with_texts(inner, changed, field) for inner in cast("list[Any]", value)]
         case _:
@@ -262,50 +260,41 @@ def _user() -> str:
         return ""
 
 
-def scrubber_of(config: RigConfig) -> Scrubber:
-    """A scrubber that knows the names in `rig.toml`."""
-    force, device = config.force, config.ink.device
-    names = {config.robot.host: "<host>", config.camera.source: "<camera>"}
-    names |= {force.host or "": "<host>"} if force is not None else {}
-    names |= {device.port: "<port>"} if device is not None else {}
+def scrubber_of(rig: Mapping[str, Any]) -> Scrubber:
+    """A scrubber that knows the names in the tables of `rig.toml`."""
+    names = dict[str, str]()
+
+    def noted(field: str, text: str) -> str:
+        if field in NAMING:
+            names[text] = NAMING[field]
+        return text
+
+    _with_texts(rig, noted)
     return Scrubber(names)
 
 
-def numbers_only(table: Mapping[str, Any]) -> dict[str, Any]:
-    """A table of `rig.toml` without its texts, which may name anything."""
-    return _with_texts(table, lambda field, text: text if field in KEPT else "<text>")
+async def write_report(
+    path: Path, rig: Mapping[str, Any], robot: ArcsTable, findings: list[Finding], **known: Any
+) -> None:
+    """Record a transcript of the controller and write the archive. Raises OSError if it cannot be written.
 
-
-async def write_report(path: Path, config: RigConfig, findings: list[Finding]) -> None:
-    """Record a transcript of the controller and write the archive. Raises OSError if it cannot be written."""
-    robot, scrubber = config.robot, scrubber_of(config)
-    known = {
-        "framing": robot.framing,
-        "findings": scrubber.value([finding.as_json() for finding in findings]),
-        "rig": numbers_only(config.model_dump(mode="json")),
-    }
-    files = {"arcs.jsonl": await transcript(robot.host, robot.port, robot.framing, scrubber)}
-    if robot.rtde_port is not None:
-        answers = await rtde_answers(robot.host, robot.rtde_port)
-        files["rtde.json"] = json.dumps(scrubber.value(answers), indent=2)
-    write_archive(path, known, files)
-
-
-async def transcript(host: str, port: int, framing: Framing, scrubber: Scrubber) -> str:
-    """Every question to the controller and its answer, one JSON object a line, without names."""
-    lines = await survey(host, port, framing)
-    return "".join(json.dumps(scrubber.value(line)) + "\n" for line in lines)
-
-
-def write_archive(path: Path, known: dict[str, Any], files: dict[str, str]) -> None:
-    """Write `report.json` with what is `known`, a README and these files. Raises OSError."""
+    `rig` are the tables of `rig.toml`, of which only numbers are kept; `known` goes into `report.json` as it is.
+    """
+    scrubber = scrubber_of(rig)
     report = {
         "format": 1,
         "versions": _versions(),
         "platform": {"system": platform.platform(), "python": platform.python_version(), "cores": os.cpu_count()},
+        "framing": robot.framing,
+        "findings": scrubber.value([{**asdict(finding), "well": finding.well} for finding in findings]),
+        "rig": _with_texts(rig, lambda field, text: text if field in KEPT else "<text>"),
         **known,
     }
-    texts = {"README.txt": ABOUT, "report.json": json.dumps(report, indent=2), **files}
+    lines = [json.dumps(scrubber.value(line)) + "\n" for line in await survey(robot.host, robot.port, robot.framing)]
+    texts = {"README.txt": ABOUT, "report.json": json.dumps(report, indent=2), "arcs.jsonl": "".join(lines)}
+    if robot.rtde_port is not None:
+        answers = await rtde_answers(robot.host, robot.rtde_port)
+        texts["rtde.json"] = json.dumps(scrubber.value(answers), indent=2)
     with path.open("xb") as out, zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, text in texts.items():
             archive.writestr(name, text)

@@ -107,7 +107,7 @@ def test_names_addresses_and_paths_stay_in_the_lab(rig: Path, monkeypatch: pytes
     monkeypatch.setenv("BRUSHLOOP_ROBOT__HOST", "arm7.lab.example")
     monkeypatch.setenv("LOGNAME", "wanghui")
     monkeypatch.setattr("socket.gethostname", lambda: "rigpc")
-    scrubber = scrubber_of(load_rig(rig))
+    scrubber = scrubber_of(load_rig(rig).model_dump(mode="json"))
     said = (
         "robot: connect: arm7.lab.example:30004 as wanghui@rigpc from 192.0.2.7 (fe80::1:2:3, 00:1b:44:11:3a:b7); "
         "see /home/wanghui/rig.toml and C:\\Users\\wanghui, http://wanghui:secret@cam.example/stream, "
@@ -144,6 +144,6 @@ def test_on_the_first_day_there_is_no_rig_yet_and_the_archive_holds_what_is_know
     assert answered["rob1.RobotState.getSafetyModeType"] == {"result": "Normal"}
     with zipfile.ZipFile(report) as held:
         text = held.read("report.json").decode()
-    assert json.loads(text)["taught"]["board.squares"] == [26, 20]
+    assert json.loads(text)["rig"]["board.squares"] == [26, 20]
     assert robot.host not in text
     assert "cam.example" not in text
