@@ -108,7 +108,7 @@ def moves_of(
         case SelfCheckStep():
             moves = [
                 move
-                for number, place_mm in enumerate(triangle_on(patches, config.self_check))
+                for number, place_mm in enumerate(triangle_on(patches))
                 for move in (*inking_moves(config, dips + number), *mark_moves(config, plane, *place_mm))
             ]
             return StepMoves([*photograph_moves(config), *moves, *photograph_moves(config)], dips=3, captures=2)
@@ -244,10 +244,10 @@ def _check_sheet(rig_path: Path, path: Path, rig: RigConfig, protocol: ProtocolC
         raise ConfigError(where, field, f"{sheet.cell_mm} does not fit on {rig.paper.size_mm}")
     if rig.self_check.enabled:
         try:
-            triangle_on((sheet.patch(0),), rig.self_check)
+            triangle_on((sheet.patch(0),))
         except StepError as error:
             what = f"{error}; --arm switches the self-check on, `enabled = false` switches it off for a new session"
-            raise ConfigError(rig_path, "self_check.legs_mm", what) from None
+            raise ConfigError(rig_path, "paper.cell_mm", what) from None
 
 
 def _check_brush(path: Path, brush: BrushConfig, strokes: Iterable[Planned], patch: Patch) -> None:

@@ -147,7 +147,7 @@ async def _accepted(context: StepContext, moved_mm: float) -> None:
 async def check_rig(context: StepContext) -> SelfCheckResult:
     """The SELF_CHECK step: a scalene triangle of marks shows whether the rig is mirrored, turned or stretched."""
     run, patches = context.run, context.patches
-    places_mm = triangle_on(patches, run.rig.config.self_check)
+    places_mm = triangle_on(patches)
     checked = await context.guard.guarded(self_check(run.procedures, places_mm, partial(fill_brush, context)))
     place = {"sheet": run.store.state.sheet, "patches": tuple(patch.index for patch in patches)}
     return checked.model_copy(update=place)

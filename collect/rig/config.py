@@ -220,21 +220,11 @@ class SelfCheckConfig(Config):
     enabled: bool | None = None
     """If left out, it is on where real hardware may move: with `--arm`, or an arm that is not on this machine."""
     depth_mm: Annotated[float, Field(ge=0.5, le=10.0)] = 2.0
-    legs_mm: tuple[Annotated[float, Field(ge=8.0, le=200.0)], Annotated[float, Field(ge=8.0, le=200.0)]] = (24.0, 15.0)
-    """Legs of the triangle along paper x and y, on sheets without room for one over three patches; unequal, so that no
-    corner is mistaken for another."""
     offset_mm: Positive = 3.0
     """How far the marks may lie, on average, from where they were commanded; a soft tip lands beside its axis."""
     turn_deg: Positive = 1.0
     scale: Annotated[float, Field(gt=0.0, le=0.2)] = 0.01
     """Largest relative error of a length, on top of what one mark's own scatter explains over the triangle's extent."""
-
-    @model_validator(mode="after")
-    def _uneven(self) -> SelfCheckConfig:
-        x_mm, y_mm = self.legs_mm
-        if not 1.3 * y_mm <= x_mm:
-            raise ValueError(f"legs_mm = [{x_mm:g}, {y_mm:g}]: the first must be 1.3 times the second or more")
-        return self
 
 
 class QualityConfig(Config):
@@ -276,12 +266,6 @@ class QualityConfig(Config):
     """Gap between two groups of hairs, averaged over 2 mm of its length."""
     bent_deg: Annotated[float, Field(gt=0.0, lt=90.0)] = 5.5
     """Angle between the heading and the direction of the mark from its head to its tip."""
-
-    @model_validator(mode="after")
-    def _ordered(self) -> QualityConfig:
-        if self.dark_level >= self.bright_level:
-            raise ValueError(f"dark_level = {self.dark_level:g} must be less than bright_level = {self.bright_level:g}")
-        return self
 
 
 class RigConfig(Config):

@@ -27,6 +27,8 @@ Triangle = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
 
 UNEVEN = 0.2
 """Least misfit of the second best order of the marks; below it, a mirror image could be taken for a turn."""
+LEGS_MM = 24.0, 15.0
+"""Legs along paper x and y of a triangle within one patch; unequal, so that no corner is mistaken for another."""
 LEAST_SPAN_MM = 60.0
 """Least extent of a wide triangle along either axis."""
 MOST_OF_SHEET = 0.25
@@ -69,7 +71,7 @@ def partners(sheet: Sheet, patch: Patch, used: Set[int]) -> tuple[Patch, ...]:
     return ()
 
 
-def triangle_on(patches: Sequence[Patch], config: SelfCheckConfig) -> Triangle:
+def triangle_on(patches: Sequence[Patch]) -> Triangle:
     """One place in each of three patches, as far apart as the corners of the sheet, or three within the only one.
 
     Those within one patch are too close together to show a small error of scale. Raises `StepError` if they do not fit.
@@ -77,7 +79,7 @@ def triangle_on(patches: Sequence[Patch], config: SelfCheckConfig) -> Triangle:
     if len(patches) > 1:
         a, b, c = (patch.anchor_mm for patch in patches)
         return a, b, c
-    [patch], (x_mm, y_mm) = patches, config.legs_mm
+    [patch], (x_mm, y_mm) = patches, LEGS_MM
     if x_mm > patch.size_x_mm or y_mm > patch.size_y_mm:
         raise StepError(f"a triangle of {x_mm:g} by {y_mm:g} mm does not fit into patch {patch.index}")
     left, bottom = patch.x_mm + 0.5 * (patch.size_x_mm - x_mm), patch.y_mm + 0.5 * (patch.size_y_mm - y_mm)
@@ -91,8 +93,6 @@ async def self_check(procedures: Procedures, places_mm: Triangle, dip: Dip) -> S
     """
     rig, plane = procedures.rig, procedures.plane
     config, commanded = rig.config.self_check, np.array(places_mm, np.float64)
-    if abs(float(np.linalg.det(commanded[1:] - commanded[0]))) < 1.0 or _second_best(commanded) < UNEVEN:
-        raise StepError("the self-check's triangle is too even, or too flat, to tell a mirror image")
     async with procedures.lifted_after():
         before = await procedures.capture()
         for x_mm, y_mm in places_mm:

@@ -179,8 +179,9 @@ def test_a_self_check_takes_a_patch_before_the_first_stroke(tmp_path: Path) -> N
     assert (len(plan.placed), plan.placed[0].patch, plan.placed[41].sheet, plan.dips) == (150, 1, 1, 153)
     used = {placed.patch for placed in plan.placed if placed.sheet == 0}
     assert used == set(range(42)) - {0, 5, 36}, "the self-check lies over three corners"
-    small = rig(tmp_path, "[motion]", "[self_check]\nenabled = true\nlegs_mm = [50.0, 15.0]\n\n[motion]")
-    with pytest.raises(ConfigError, match=r"rig.toml: self_check.legs_mm: a triangle of 50 by 15 mm does not fit"):
+    small = rig(tmp_path, "[motion]", "[self_check]\nenabled = true\n\n[motion]")
+    small = small.model_copy(update={"paper": small.paper.model_copy(update={"cell_mm": (20.0, 24.0)})})
+    with pytest.raises(ConfigError, match=r"rig.toml: paper.cell_mm: a triangle of 24 by 15 mm does not fit"):
         check_protocol(tmp_path / "rig.toml", EXAMPLES / "protocol.toml", small, example("protocol.toml"))
 
 

@@ -239,7 +239,7 @@ async def test_the_self_check_presses_as_deep_as_was_checked(make_bench: MakeBen
     config, plane, sent = bench.rig.config, PaperPlane(120.0), bench.sent
     sheet = Sheet(config.paper)
     patches = (sheet.patch(0), *partners(sheet, sheet.patch(0), set()))
-    await self_check(bench.effector, triangle_on(patches, config.self_check), bench.effector.dip)
+    await self_check(bench.effector, triangle_on(patches), bench.effector.dip)
     planned = moves_of(config, plane, CHECK, patches)
     assert not not_checked(config, sent, planned.segments)
     assert not not_sent(config, planned, sent)

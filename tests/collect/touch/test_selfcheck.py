@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 from unittest.mock import AsyncMock
@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from brushloop.collect.errors import StepError
 from brushloop.collect.rig.config import PaperConfig, SelfCheckConfig
-from brushloop.collect.rig.paper import Patch, Sheet, to_base
+from brushloop.collect.rig.paper import Sheet, to_base
 from brushloop.collect.touch.selfcheck import (
+    LEGS_MM,
     Triangle,
     judge,
     partners,
@@ -95,19 +96,6 @@ async def checked(bench: Bench, places: Triangle = PLACES) -> SelfCheckResult:
     return await self_check(bench.effector, places, bench.effector.dip)
 
 
-async def test_an_even_triangle_is_refused_before_anything_moves(make_bench: MakeBench) -> None:
-    bench = make_bench()
-    at = bench.target
-    for places in (((10.0, 10.0), (60.0, 10.0), (10.0, 60.0)), ((10.0, 10.0), (60.0, 10.0), (100.0, 10.0))):
-        with pytest.raises(StepError, match="too even, or too flat"):
-            await checked(bench, places)
-    assert bench.target == at
-
-
-def triangle(patches: Sequence[Patch]) -> Triangle:
-    return triangle_on(patches, CONFIG)
-
-
 def paper(size_x_mm: float, size_y_mm: float) -> PaperConfig:
     return PaperConfig(origin_mm=(0.0, 0.0), touch_z_mm=120.0, size_mm=(size_x_mm, size_y_mm))
 
@@ -117,13 +105,13 @@ def test_a_sheet_with_room_is_checked_over_three_corners_and_a_small_one_in_one_
     first = sheet.patch(0)
     wide = partners(sheet, first, {0})
     assert [patch.index for patch in wide] == [5, 36]
-    assert triangle((first, *wide)) == tuple(patch.anchor_mm for patch in (first, *wide))
+    assert triangle_on((first, *wide)) == tuple(patch.anchor_mm for patch in (first, *wide))
     again = partners(sheet, sheet.patch(1), {0, 1, 5, 36})
     assert [patch.index for patch in again] == [4, 37], "a second attempt finds places of its own"
     assert partners(sheet, first, set(range(sheet.capacity)) - {1, 6}) == (), "what is left is too near"
     small = Sheet(paper(110.0, 80.0))
     assert partners(small, small.patch(0), set()) == ()
-    assert np.ptp(triangle((small.patch(0),)), axis=0).tolist() == pytest.approx(CONFIG.legs_mm)
+    assert np.ptp(triangle_on((small.patch(0),)), axis=0).tolist() == pytest.approx(LEGS_MM)
 
 
 @given(width=st.floats(40.0, 600.0), height=st.floats(24.0, 600.0), used=st.sets(st.integers(0, 60)))
@@ -132,7 +120,7 @@ def test_a_wide_triangle_is_always_uneven_wide_and_on_free_patches(width: float,
     patch = sheet.patch(0)
     if wide := partners(sheet, patch, used):
         assert not used & {one.index for one in wide}
-        places = np.array(triangle((patch, *wide)))
+        places = np.array(triangle_on((patch, *wide)))
         assert np.ptp(places, axis=0).min() >= 60.0
         mirrored = places * np.array([-1.0, 1.0])
         with pytest.raises(StepError, match="mirrored in x"):
@@ -210,5 +198,5 @@ async def test_what_is_wrong_at_the_rig_is_described_with_the_brush_lifted(
     sheet = Sheet(bench.rig.config.paper)
     fault(bench)
     with contextlib.nullcontext() if why is None else pytest.raises(StepError, match=why):
-        await checked(bench, triangle([sheet.patch(index) for index in patches]))
+        await checked(bench, triangle_on([sheet.patch(index) for index in patches]))
     assert bench.lifted
