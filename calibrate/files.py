@@ -31,13 +31,13 @@ class Written:
         return self.said
 
 
-def check_target(path: Path, ending: str) -> None:
+def check_target(path: Path, *endings: str) -> None:
     """Check before any work that a file may be written to `path`. Raises `CalibrationError`.
 
     A file with another suffix might be a recording or a photograph.
     """
-    if path.suffix.lower() != ending:
-        raise CalibrationError(str(path), f"must end in {ending}")
+    if path.suffix.lower() not in endings:
+        raise CalibrationError(str(path), f"must end in {' or '.join(endings)}")
     if path.is_dir():
         raise CalibrationError(str(path), "is a folder")
     check_writable(path.parent)

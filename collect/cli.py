@@ -33,18 +33,6 @@ StepArm = Annotated[
 ]
 
 
-def _check_output(option: str, path: Path, *endings: str) -> None:
-    """Raise `ConfigError` if no such file can be written to this path; before anything is computed or asked."""
-    from brushloop.collect.errors import ConfigError
-
-    if path.suffix.lower() not in endings:
-        raise ConfigError(option, "", f"{path} must end in {' or '.join(endings)}")
-    if not path.parent.is_dir():
-        raise ConfigError(option, "", f"{path}: there is no folder {path.parent}")
-    if path.is_dir():
-        raise ConfigError(option, "", f"{path} is a folder")
-
-
 app.command("strokes")(command(CollectRequest, "collect.start:run", lambda run, request: run(request)))
 
 
@@ -64,7 +52,6 @@ def plan(
     picture: Annotated[
         Path | None, typer.Option(help="Draw the sheets into this file: .png, .svg, .pdf or .jpg.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")] = False,
     arm: Annotated[
         bool, typer.Option("--arm", help="Plan for a run with --arm, which includes the self-check; moves nothing.")
     ] = False,
@@ -74,8 +61,8 @@ def plan(
 ) -> None:
     """Walk through a protocol without moving the arm: limits, sheets, dips, ink, time, and a picture of the sheets."""
     import asyncio
-    import json
 
+    from brushloop.calibrate.files import check_target
     from brushloop.collect.plan import draw_plan, make_plan, plan_table
     from brushloop.collect.protocols.config import load_protocol
     from brushloop.collect.rig.config import load_rig
@@ -83,24 +70,17 @@ def plan(
     from brushloop.collect.walk import all_poses, ask_reach, check_protocol
 
     if picture is not None:
-        _check_output("--picture", picture, *PICTURES)
+        check_target(picture, *PICTURES)
     rig, wanted = load_rig(config).settled(arm), load_protocol(protocol)
     check_protocol(config, protocol, rig, wanted)
     planned = make_plan(rig, wanted)
-    asked = None
-    if ask:
-        poses = all_poses(rig, wanted, PaperPlane(rig.paper.touch_z_mm), every_patch=True)
-        asked = asyncio.run(ask_reach(config, rig, poses))
-    if picture is not None:
-        draw_plan(rig, wanted, planned, picture)
-    if as_json:
-        say(json.dumps(planned.as_json() | {"poses_in_reach": asked}))
-        return
     say(plan_table(planned))
     if picture is not None:
+        draw_plan(rig, wanted, planned, picture)
         say(f"The sheets are drawn in {picture}")
-    if asked is not None:
-        say(f"The controller finds joints for all {asked} poses.")
+    if ask:
+        poses = all_poses(rig, wanted, PaperPlane(rig.paper.touch_z_mm), every_patch=True)
+        say(f"The controller finds joints for all {asyncio.run(ask_reach(config, rig, poses))} poses.")
 
 
 def doctor(
@@ -116,10 +96,11 @@ def doctor(
     from brushloop.collect.rig.config import load_rig
 
     if report is not None:
+        from brushloop.calibrate.files import check_target
         from brushloop.collect.commission.arm import ADDRESS, write_first_report
         from brushloop.collect.commission.visit import Notebook
 
-        _check_output("--report", report, ".zip")
+        check_target(report, ".zip")
         if report.exists():
             raise ConfigError("--report", "", f"{report} exists and is not overwritten: choose another name")
         if not config.exists() and ADDRESS in (notebook := Notebook.load(config)).values:
@@ -188,11 +169,12 @@ def show(
     picture: Annotated[Path | None, typer.Option(help="Draw it from above: .png, .svg, .pdf or .jpg.")] = None,
 ) -> None:
     """Show a rig: its box of limits and every place that the tip goes to. Asks no device."""
+    from brushloop.calibrate.files import check_target
     from brushloop.collect.rig.check import draw_rig, rig_table
     from brushloop.collect.rig.config import load_rig
 
     if picture is not None:
-        _check_output("--picture", picture, *PICTURES)
+        check_target(picture, *PICTURES)
     config = load_rig(rig)
     say(rig_table(config))
     if picture is not None:

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import TypeAdapter
 from rich.console import Group
 from rich.table import Table
 
@@ -87,10 +86,6 @@ class Plan:
     seconds_by_kind: dict[str, float]
     touches_mm: tuple[tuple[float, float], ...]
     """Points of zero touch, in the paper frame."""
-
-    def as_json(self) -> dict[str, Any]:
-        """Return every field, to be written as JSON."""
-        return TypeAdapter(Plan).dump_python(self, mode="json", exclude_none=True) | {"seconds_omit": OMITTED}
 
 
 def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:

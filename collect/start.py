@@ -30,7 +30,7 @@ from brushloop.sessions.recording import Recording
 from brushloop.sessions.terminal import plain_console, say
 
 PRESSES = frozenset({"grid", "few-strokes", "list"})
-"""Protocols whose recording can be calibrated and validated by itself; after others, no single next command exists."""
+"""Protocols whose recording can be analysed by itself; after others, no single next command exists."""
 
 
 class Collected(NamedTuple):
@@ -89,9 +89,7 @@ def ending(folder: Path, kind: str) -> list[str]:
     """Lines that name the recording of a finished session and the next command; `kind` is its protocol's kind."""
     lines = [f"recorded: {folder / folder.name}.mcap"]
     if kind in PRESSES:
-        # It may have been calibrated on the screen already.
-        command = "validate" if (folder / "calibration").is_dir() else "calibrate"
-        lines.append(f"next:     brushloop {command} {folder}")
+        lines.append(f"next:     brushloop analyse {folder}")
     return lines
 
 

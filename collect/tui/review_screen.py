@@ -23,7 +23,7 @@ from brushloop.calibrate.artefact import FITS, current
 from brushloop.calibrate.board.pix2len import Plane, see_board
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.command import BrushFit
-from brushloop.calibrate.session import RigView, rig_of
+from brushloop.calibrate.session import rig_of
 from brushloop.calibrate.stats import odd_waits, waits_of
 from brushloop.collect.engine.capture import mark_of, pictures_of
 from brushloop.collect.engine.snapshot import LastCapture
@@ -85,23 +85,17 @@ class ReviewCapture:
 class Review:
     """One session's folder, open or closed; reads it and writes nothing."""
 
-    shown_whole: str = ""
-    """Why no photograph is rectified and no presses are compared; empty where board and lens are known."""
-
     def __init__(self, folder: Path) -> None:
-        """Raises `SessionDamaged`, and `InputError` if the session was not collected here or holds links."""
+        """Raises `SessionDamaged`, and `InputError` if the session was not collected here, holds links, or does not say
+        what its rig was."""
         self.folder = folder
         if not (folder / JOURNAL_NAME).is_file():
             raise InputError(folder, f"holds no {JOURNAL_NAME}: imported photographs are compared with `validate`")
         check_folder(folder)
         self._plane: Plane | None = None
         self._pictures: dict[int, LastCapture] = {}
-        self._rig: RigView | None = None
-        try:
-            # As the session recorded it: lens files lie beside the rig's own rig.toml, not beside its snapshot here.
-            self._rig = rig_of(folder)
-        except InputError as error:
-            self.shown_whole = str(error)
+        # As the session recorded it: lens files lie beside the rig's own rig.toml, not beside its snapshot here.
+        self._rig = rig_of(folder)
         self.read()
 
     def read(self) -> None:
@@ -173,7 +167,7 @@ class Review:
         if image is None:
             raise SessionDamaged(path, f"holds no still {result.still}")
         whole = LastCapture(result.press, result.still, result.kept, verdict, image)
-        if stroke is None or stroke.cell_mm is None or self._rig is None:
+        if stroke is None or stroke.cell_mm is None:
             return whole  # a take that does not count has no stroke record
         if self._rig.lens is not None:
             image = self._rig.lens.undistort(image)
@@ -311,7 +305,7 @@ class ReviewScreen(Screen[None]):
             pictures = await asyncio.to_thread(self._review.pictures, capture)
             self._photo.show(pictures.photo)
             self._binary.show(binary_picture(pictures.binary))
-            if condition not in self._alike and not self._review.shown_whole:
+            if condition not in self._alike:
                 self._alike[condition] = await asyncio.to_thread(self._review.repeatability, condition)
                 self._show_words(self._capture or capture)
         except SessionError as error:
@@ -333,8 +327,6 @@ class ReviewScreen(Screen[None]):
             lines.append(labelled("Waited", Content.styled(f"! {capture.unlike}", "bold $text-warning")))
         elif press.dip_to_touch_s is not None:
             lines.append(labelled("Waited", f"{press.dip_to_touch_s:.1f} s from dip to touch"))
-        if self._review.shown_whole:
-            lines.append(labelled("Whole", plain(self._review.shown_whole)))
         if capture.note:
             lines.append(labelled("Note", plain(capture.note)))
         self._words.show(Content("\n").join(lines))

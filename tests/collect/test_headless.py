@@ -116,9 +116,7 @@ def test_a_folder_that_may_not_be_written_is_refused_before_anything_is_connecte
 def test_the_recording_and_what_comes_next(tmp_path: Path) -> None:
     folder = tmp_path / "grid-01"
     recorded = f"recorded: {folder}/grid-01.mcap"
-    assert ending(folder, "grid") == [recorded, f"next:     brushloop calibrate {folder}"]
-    (folder / "calibration").mkdir(parents=True)
-    assert ending(folder, "list") == [recorded, f"next:     brushloop validate {folder}"]
+    assert ending(folder, "grid") == [recorded, f"next:     brushloop analyse {folder}"]
     assert ending(folder, "write") == [recorded]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -11,6 +10,7 @@ import cv2
 import pytest
 from typer.testing import CliRunner
 
+from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.cli import app
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.plan import draw_plan, make_plan
@@ -57,12 +57,10 @@ def plan(rig_path: Path, name: str, *options: str) -> str:
     return ran.stdout
 
 
-def test_a_plan_is_shown_as_tables_or_as_one_json_object(rig_path: Path) -> None:
+def test_a_plan_is_shown_as_tables(rig_path: Path) -> None:
     words = " ".join(plan(rig_path, "protocol.toml").split())
     for expected in ("4 of 42 patches", "a fresh one before", "150 press", "not counting"):
         assert expected in words
-    made = json.loads(plan(rig_path, "protocol-write.toml", "--json"))
-    assert (made["kind"], made["dips"], made["poses_in_reach"]) == ("write", 4, None)
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in EXAMPLES.glob("*.toml")))
@@ -86,10 +84,9 @@ def test_every_example_passes_and_has_a_picture_whatever_its_names(rig_path: Pat
 @pytest.mark.parametrize(
     ("picture", "message"),
     [
-        ("plan.xyz", r"^--picture: .*plan\.xyz must end in \.png or \.svg or \.pdf or \.jpg$"),
-        ("plan", r"^--picture: .*plan must end in \.png"),
-        ("nope/plan.png", r"^--picture: .*nope/plan\.png: there is no folder .*nope$"),
-        ("folder.png", r"^--picture: .*folder\.png is a folder$"),
+        ("plan.xyz", r"plan\.xyz: must end in \.png or \.svg or \.pdf or \.jpg$"),
+        ("plan", r"plan: must end in \.png"),
+        ("folder.png", r"folder\.png: is a folder$"),
     ],
 )
 def test_a_picture_that_cannot_be_made_is_refused_before_anything_else(
@@ -97,7 +94,7 @@ def test_a_picture_that_cannot_be_made_is_refused_before_anything_else(
 ) -> None:
     (tmp_path / "folder.png").mkdir()
     rig_path.write_text("[robot")  # is not even read
-    with pytest.raises(ConfigError, match=message) as refused:
+    with pytest.raises(CalibrationError, match=message) as refused:
         plan(rig_path, "protocol.toml", "--picture", str(tmp_path / picture))
     assert refused.value.exit_code == 2
     assert sorted(path.name for path in tmp_path.iterdir()) == ["folder.png", "rig.toml"]
