@@ -21,9 +21,6 @@ CLEARANCE_MM = 8.0
 """Height above the paper at which the fast approach ends."""
 DWELL_MM = 0.05
 """Length of the slow end of the descent that serves as the dwell: ARCS's queue can only wait by moving."""
-BLEND_MM = 1.0
-"""Distance from a drawn point at which the tip may turn towards the next, so that the arm does not halt there. ARCS
-accepts no less."""
 CHECK_APPROACH_MM = 4.0
 """Height above the paper at which the slow approach of a self-check's mark begins."""
 CHECK_SPEED_MM_S = 5.0
@@ -267,7 +264,7 @@ class Procedures:
                 await robot.move(segment.target, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
             else:
                 self.target_mm = segment.poses[-1].position_mm
-                await robot.follow(segment.poses, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2, blend_mm=BLEND_MM)
+                await robot.follow(segment.poses, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
 
     async def queue(self, moves: Sequence[Move]) -> list[Pose]:
         """Send all moves to the controller before the first begins; it then ends them whatever happens to this program.

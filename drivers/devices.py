@@ -53,8 +53,6 @@ class QueuedLine:
     target: Pose
     speed_mm_s: float
     least_s: float = 0.0
-    blend_mm: float = 0.0
-    """How far before its end the next line may begin; at 0 the arm halts there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,8 +120,8 @@ class Robot(Device, Protocol):
         """Move the tip in a straight line that is checked as a whole; returns when the arm has settled."""
         ...
 
-    async def follow(self, poses: Sequence[Pose], *, speed_mm_s: float, acc_mm_s2: float, blend_mm: float) -> None:
-        """Move the tip through all poses without halting between them, corners rounded within `blend_mm`."""
+    async def follow(self, poses: Sequence[Pose], *, speed_mm_s: float, acc_mm_s2: float) -> None:
+        """Move the tip through all poses without halting between them, corners rounded within 1 mm."""
         ...
 
     async def sequence(self, lines: Sequence[QueuedLine], *, acc_mm_s2: float) -> list[Pose]:

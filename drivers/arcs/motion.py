@@ -103,27 +103,17 @@ def _not_arrived(what: str) -> MotionFailed:
 MOST_QUEUED = 16
 """Lines that the controller holds at a time. The queue of a real cabinet is not documented; see `QUEUE_FULL` below."""
 EMPTY = (-1, 0)
-LEAST_BLEND_MM = 1.0
-"""ARCS takes 0 or 1 mm to 1 m."""
+BLEND_MM = 1.0
+"""How far before the end of a line that is fed the next one may begin, so that the arm does not halt there. ARCS takes
+0, which halts, or 1 mm to 1 m."""
 
 
-def as_sent(
-    start: Pose, lines: Sequence[QueuedLine], limits: Limits, blend_mm: float | None = None
-) -> list[QueuedLine]:
-    """The lines, each slow enough for its turn of the tool.
-
-    A corner is rounded within `blend_mm` and half the shorter line, but never by less than the controller accepts. At
-    the last pose, and without `blend_mm` at every pose, the arm halts.
-    """
-    corners = [start, *(line.target for line in lines)]
-    lengths_mm = [distance(a, b)[0] for a, b in itertools.pairwise(corners)]
+def as_sent(start: Pose, lines: Sequence[QueuedLine], limits: Limits) -> list[QueuedLine]:
+    """The lines, each slow enough for its turn of the tool."""
     sent: list[QueuedLine] = []
-    for i, (before, line) in enumerate(zip(corners, lines, strict=False)):
-        rounded_mm = 0.0
-        if blend_mm is not None and i + 1 < len(lines):
-            rounded_mm = max(min(blend_mm, 0.5 * lengths_mm[i], 0.5 * lengths_mm[i + 1]), LEAST_BLEND_MM)
-        speed_mm_s = limits.turn_capped(before, line.target, line.speed_mm_s)
-        sent.append(replace(line, speed_mm_s=speed_mm_s, blend_mm=rounded_mm))
+    for line in lines:
+        sent.append(replace(line, speed_mm_s=limits.turn_capped(start, line.target, line.speed_mm_s)))
+        start = line.target
     return sent
 
 
@@ -152,6 +142,7 @@ async def feed(
 ) -> None:
     """Queue every line from `start` on, at most `MOST_QUEUED` at a time; return once the last one is queued.
 
+    Corners between them are rounded within `BLEND_MM`; at the last pose the arm halts.
     `go` raises if the arm was stopped: it is asked before every line, with nothing awaited between, because after a
     stop none may follow. Raises `RobotNotSafe`, `MotionRefused`, and `MotionFailed` where the arm was stopped meanwhile
     or does not advance.
@@ -165,9 +156,9 @@ async def feed(
     while True:
         while sent < len(lines) and room > 0:
             go()
-            line = lines[sent]
+            line, blend_mm = lines[sent], BLEND_MM if sent + 1 < len(lines) else 0.0
             try:
-                await controller.move_line(line.target, line.speed_mm_s, acc_mm_s2, line.blend_mm)
+                await controller.move_line(line.target, line.speed_mm_s, acc_mm_s2, blend_mm)
             except MotionRefused as refusal:
                 if refusal.code != ReturnCode.QUEUE_FULL or sent == 0:  # then none of those in the queue is ours
                     raise

@@ -109,12 +109,12 @@ class AuboArcs:
 
     async def move(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
         """Move the tip in a straight line; returns when the arm has settled within tolerance. See `follow`."""
-        await self.follow([target], speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2, blend_mm=0.0)
+        await self.follow([target], speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
 
-    async def follow(self, poses: Sequence[Pose], *, speed_mm_s: float, acc_mm_s2: float, blend_mm: float) -> None:
+    async def follow(self, poses: Sequence[Pose], *, speed_mm_s: float, acc_mm_s2: float) -> None:
         """Send lines through all poses without a halt between them; returns when the arm has settled at the last.
 
-        Corners may be rounded within `blend_mm` of a pose. Every pose, and every line from where the arm really is, is
+        Corners may be rounded within 1 mm of a pose. Every pose, and every line from where the arm really is, is
         checked before the first line is sent. Any failure, cancellation included, stops the arm before it is raised.
         Raises `ArmMoved` if the arm is not where it was left, `SettingsChanged` before a line down if what a press
         depends on is not as it was set, `RobotNotSafe`, `NotPowered`, `LimitExceeded`, and ValueError for no poses.
@@ -123,7 +123,7 @@ class AuboArcs:
             raise ValueError("follow: no poses")
         lines = [QueuedLine(pose, speed_mm_s) for pose in poses]
         start = await self._depart("moveLine", lines, acc_mm_s2)
-        lines = as_sent(start, lines, self._limits, blend_mm)
+        lines = as_sent(start, lines, self._limits)
         async with self._under_way("moveLine", poses[-1]) as go:
             await feed(self._motion, start, lines, acc_mm_s2, go=go, notice=self._notice)
             await until_settled(self._motion.rest, poses[-1], sum(durations_s(start, lines, acc_mm_s2)))

@@ -109,7 +109,7 @@ async def test_an_arm_that_was_moved_is_not_sent_anywhere_until_it_is_taken_up(
     await arm.confirm()
     await send(other, ELSEWHERE)
     sent = cabinet.taken
-    for refused in (arm.move(LOW, **QUICK), arm.follow([LOW, ABOVE], blend_mm=1.0, **QUICK), arm.confirm()):
+    for refused in (arm.move(LOW, **QUICK), arm.follow([LOW, ABOVE], **QUICK), arm.confirm()):
         with pytest.raises(ArmMoved, match=r"109\.\d mm and 10\.0 deg from where it was left"):
             await refused
     assert cabinet.taken == sent
@@ -150,7 +150,7 @@ async def test_what_a_press_depends_on_is_read_back_before_each_way_down(
     await arm.move(ABOVE, **QUICK)
     assert await other.ask(method, **params) == 0
     sent, before = cabinet.taken, cabinet.tool
-    for refused in (arm.move(LOW, **QUICK), arm.follow([ABOVE, LOW], blend_mm=1.0, **QUICK), arm.take_up()):
+    for refused in (arm.move(LOW, **QUICK), arm.follow([ABOVE, LOW], **QUICK), arm.take_up()):
         with pytest.raises(SettingsChanged, match=words):
             await refused
     assert cabinet.taken == sent

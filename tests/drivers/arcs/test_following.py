@@ -23,7 +23,7 @@ from brushloop.drivers.geometry import brush_pose, distance
 from tests.drivers.arcs.conftest import LIMITS, Cabinet
 from tests.drivers.failing import cut
 
-WAY = {"speed_mm_s": 40.0, "acc_mm_s2": 800.0, "blend_mm": 1.0}
+WAY = {"speed_mm_s": 40.0, "acc_mm_s2": 800.0}
 SLOW = {**WAY, "speed_mm_s": 3.0}
 
 
@@ -171,10 +171,9 @@ async def test_a_queue_without_a_size_is_a_violation(arm: AuboArcs, cabinet: Cab
         await arm.follow(LONG, **SLOW)
 
 
-def test_a_turn_slows_its_own_line_and_corners_are_never_rounded_by_less_than_the_controller_takes():
+def test_a_turn_slows_its_own_line():
     start = brush_pose(250.0, -230.0, 260.0)
     poses = [brush_pose(252.0, -230.0, 260.0), brush_pose(254.0, -230.0, 260.0, heading_deg=30.0), line(40)[-1]]
-    legs = as_sent(start, [QueuedLine(pose, 40.0) for pose in poses], LIMITS, blend_mm=5.0)
-    assert [leg.blend_mm for leg in legs] == [1.0, 1.0, 0.0]
+    legs = as_sent(start, [QueuedLine(pose, 40.0) for pose in poses], LIMITS)
     assert legs[1].speed_mm_s == pytest.approx(45.0 * 2.0 / 30.0)
     assert legs[0].speed_mm_s == 40.0

@@ -204,7 +204,7 @@ async def test_what_cannot_be_carried_out_is_refused_before_anything_is_sent(arm
     with pytest.raises(LimitExceeded):
         await arm.sequence([*PRESS, QueuedLine(brush_pose(250.0, -230.0, 60.0), 40.0)], acc_mm_s2=ACC)
     with pytest.raises(ValueError, match="no poses"):
-        await arm.follow([], speed_mm_s=40.0, acc_mm_s2=ACC, blend_mm=1.0)
+        await arm.follow([], speed_mm_s=40.0, acc_mm_s2=ACC)
     for lines in ([], [QueuedLine(DEEP, 40.0), QueuedLine(HOME, 40.0)]):
         with pytest.raises(ValueError, match="must not end where it begins"):
             await arm.sequence(lines, acc_mm_s2=ACC)
