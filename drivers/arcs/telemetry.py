@@ -40,7 +40,6 @@ STREAM = "robot telemetry"
 SET_RECIPE = 100
 GREETING_END = b"}\n\n"
 MAX_GREETING_BYTES = 256 * 1024
-MAX_MESSAGE_BYTES = 64 * 1024
 MAX_DEPTH = 16
 
 
@@ -111,7 +110,7 @@ class RtdeStream:
         self.port = port
         self.offered: dict[str, int] = {}
         """Names in the greeting that can be subscribed to, with their ids."""
-        self._decoder = FrameDecoder(max_bytes=MAX_MESSAGE_BYTES)
+        self._decoder = FrameDecoder()
         self._stream: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
         self._segments: Sequence[str] = ()
 
@@ -140,7 +139,7 @@ class RtdeStream:
         samples: list[list[Any]] = []
         async with in_time(STREAM, "read", SILENCE_S, "sample"):
             while not samples:
-                data = await self._stream[0].read(MAX_MESSAGE_BYTES)
+                data = await self._stream[0].read(65536)
                 if not data:
                     raise EOFError("the controller closed the connection")
                 messages = [decode_message(payload) for payload in self._decoder.feed(data)]

@@ -59,19 +59,15 @@ def encode(payload: bytes) -> bytes:
 class _Decoder(abc.ABC):
     """Turns a byte stream, split at any point, into what `_next` finds at its beginning."""
 
-    def __init__(self, *, max_bytes: int = MAX_BYTES) -> None:
-        self._max_bytes = max_bytes
+    def __init__(self) -> None:
         self._buffer = bytearray()
-        self._broken: str | None = None
 
     def feed(self, data: bytes) -> list[bytes]:
         """What `data` completes, in order.
 
-        Raises `ProtocolViolation` for bytes outside the format, and then on every later call: neither this `data` nor
-        anything after it can be trusted.
+        Raises `ProtocolViolation` for bytes outside the format: neither this `data` nor anything after it can be
+        trusted, and the connection must be ended.
         """
-        if self._broken is not None:
-            raise self._violation(self._broken)
         self._buffer += data
         payloads: list[bytes] = []
         while (span := self._next()) is not None:
@@ -81,12 +77,11 @@ class _Decoder(abc.ABC):
 
     @abc.abstractmethod
     def _next(self) -> slice | None:
-        """Where the first whole item in the buffer lies; None while it is incomplete."""
+        """Where the first whole item in the buffer lies; None while it is incomplete. Raises `ProtocolViolation`."""
 
-    def _violation(self, what: str) -> ProtocolViolation:
-        self._broken = what
-        self._buffer.clear()
-        return ProtocolViolation(DEVICE, "decode", what)
+
+def _violation(what: str) -> ProtocolViolation:
+    return ProtocolViolation(DEVICE, "decode", what)
 
 
 class FrameDecoder(_Decoder):
@@ -99,46 +94,42 @@ class FrameDecoder(_Decoder):
         if PING.startswith(bytes(buffer[: len(PING)])):
             return None
         if not MAGIC.startswith(bytes(buffer[:3])):
-            raise self._violation(f"expected SOF, got {bytes(buffer[:8])!r}")
+            raise _violation(f"expected SOF, got {bytes(buffer[:8])!r}")
         if len(buffer) < 4:
             return None
         if buffer[3] not in HEADERS:
-            raise self._violation(f"unknown SOF flag {buffer[3]:#04x}")
+            raise _violation(f"unknown SOF flag {buffer[3]:#04x}")
         header = HEADERS[buffer[3]]
         if len(buffer) < header.size:
             return None
         (size,) = header.unpack_from(buffer)
-        if size > self._max_bytes:
-            raise self._violation(f"frame of {size} bytes exceeds {self._max_bytes}")
+        if size > MAX_BYTES:
+            raise _violation(f"frame of {size} bytes exceeds {MAX_BYTES}")
         end = header.size + size
         return slice(header.size, end) if len(buffer) >= end else None
 
 
-MAX_DEPTH = 64
-"""No reply nests deeper than five; the parser must not run out of stack."""
-
 _TOKEN = re.compile(rb'[{}\[\]]|"(?:[^"\\]|\\.)*+("?)', re.DOTALL)
 """A bracket or a string, whose end is the group: empty if it has not arrived."""
-_CLOSES = {ord("}"): ord("{"), ord("]"): ord("[")}
 
 
 class BareDecoder(_Decoder):
-    """Turns a byte stream, split at any point, into JSON documents by their brackets, bounded in size and depth."""
+    """Turns a byte stream, split at any point, into JSON documents by their brackets."""
 
-    def __init__(self, *, max_bytes: int = MAX_BYTES) -> None:
-        super().__init__(max_bytes=max_bytes)
+    def __init__(self) -> None:
+        super().__init__()
         self._at = 0
-        self._open: list[int] = []
-        """Brackets before `_at` that are not closed."""
+        self._open = 0
+        """Number of brackets before `_at` that are not closed."""
 
     def _next(self) -> slice | None:
-        if not self._open:
+        if self._open == 0:
             del self._buffer[: len(self._buffer) - len(self._buffer.lstrip(b" \t\r\n"))]
             if self._buffer and self._buffer[0] not in b"{[":
-                raise self._violation(f"expected JSON, got {bytes(self._buffer[:8])!r}")
+                raise _violation(f"expected JSON, got {bytes(self._buffer[:8])!r}")
         end = self._scan()
-        if (end or len(self._buffer)) > self._max_bytes:
-            raise self._violation(f"document exceeds {self._max_bytes} bytes")
+        if (end or len(self._buffer)) > MAX_BYTES:
+            raise _violation(f"document exceeds {MAX_BYTES} bytes")
         if end is None:
             return None
         self._at = 0
@@ -152,15 +143,12 @@ class BareDecoder(_Decoder):
                 self._at = token.start()
                 return None
             byte, self._at = buffer[token.start()], token.end()
-            if byte in _CLOSES:
-                if self._open.pop() != _CLOSES[byte]:
-                    raise self._violation("brackets do not match")
-                if not self._open:
+            if byte in b"{[":
+                self._open += 1
+            elif byte in b"}]":
+                self._open -= 1
+                if self._open == 0:
                     return self._at
-            elif byte != ord('"'):
-                self._open.append(byte)
-                if len(self._open) > MAX_DEPTH:
-                    raise self._violation(f"nested deeper than {MAX_DEPTH}")
         self._at = len(buffer)
         return None
 

@@ -11,7 +11,7 @@ import json
 from collections.abc import Callable
 from typing import Any, cast
 
-from brushloop.drivers.arcs.telemetry import MAX_MESSAGE_BYTES, SET_RECIPE, decode_message, encode_sample
+from brushloop.drivers.arcs.telemetry import SET_RECIPE, decode_message, encode_sample
 from brushloop.drivers.arcs.wire import PING, BareDecoder, FrameDecoder, encode, parameters
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import ProtocolViolation
@@ -164,7 +164,7 @@ class RtdeServer(LoopbackServer):
         """Greet the client, then serve its topics until it disconnects."""
         hello = {"protocol": "rtde", "version": 1, "input": {"set_recipe": SET_RECIPE}, "output": OUTPUTS}
         writer.write(json.dumps(hello, separators=(",", ":")).encode() + b"\n\n")
-        decoder = FrameDecoder(max_bytes=MAX_MESSAGE_BYTES)
+        decoder = FrameDecoder()
         pushes: dict[int, asyncio.Task[None]] = {}
         try:
             while data := await reader.read(65536):
