@@ -94,7 +94,7 @@ class Identity:
     model: str
     firmware: str
     simulated: bool
-    """True if the device itself says that it is the loopback rig, or shows a recording; never from configuration."""
+    """True if the device itself says that it is the loopback rig; never from configuration."""
 
 
 class Device(Protocol):

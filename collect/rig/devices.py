@@ -36,7 +36,7 @@ class Rig:
 
     @property
     def simulated(self) -> bool:
-        """Whether any device belongs to the loopback rig, or replays a recording."""
+        """Whether any device belongs to the loopback rig."""
         known = (self.robot_identity, self.camera_identity, self.force_identity, self.ink_identity)
         return any(identity.simulated for identity in known if identity is not None)
 

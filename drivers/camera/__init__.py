@@ -2,7 +2,7 @@
 
 An unread capture hands back frames that are seconds old (its buffer cannot be shortened). A grabber thread reads all
 the time and keeps only the newest frame; `fresh` then waits for one that was exposed late enough, decodes it and looks
-at it. A live source that ends is opened again, with a notice. Frames that are black, saturated, torn, frozen or late
+at it. A source that ends is opened again, with a notice. Frames that are black, saturated, torn, frozen or late
 are named and skipped.
 
 JPEGs that are pushed over HTTP are kept as they come. Every other source is read through OpenCV, which decodes each
@@ -163,7 +163,7 @@ class OpenCvCamera:
         self._skipped: Counter[FrameFault] = Counter()
         """Frames that were passed over, by the thread or when somebody looked at them."""
         self._lost_ns: int | None = None
-        """Since when a live source has been gone."""
+        """Since when the source has been gone."""
         self._ended: DeviceError | None = None
         self._closing = threading.Event()
         """Ends the thread after its current read."""
@@ -248,8 +248,6 @@ class OpenCvCamera:
                     self._read_all(source, opening_ns)
                 if self._closing.is_set():
                     return
-                if not source.live:
-                    raise ConnectionLost(DEVICE, "read", f"{self._table.source} ended")
                 self._lost_ns = self._clock.now_ns()
                 self._on_notice("camera: the stream ended and is opened again")
                 self._closing.wait(REOPEN_AFTER_S)
@@ -274,7 +272,7 @@ class OpenCvCamera:
             late, repeated = backlog.is_late(arrival_ns), is_repeated(picture, before)
             torn = source.patches and not repeated and is_patched(picture, before)
             before = picture
-            if source.live and (late or repeated):
+            if late or repeated:
                 self._skipped[FrameFault.LATE if late else FrameFault.FROZEN] += 1
             elif torn:
                 self._skipped[FrameFault.TORN] += 1

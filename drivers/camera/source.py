@@ -48,7 +48,7 @@ class CameraTable(BaseModel, frozen=True, extra="forbid"):
 
     kind: Literal["opencv"]
     source: str = Field(min_length=1)
-    """Stream URL, video file, or device number as text."""
+    """Stream URL, or device number as text."""
     latency_ms: Annotated[float, Field(ge=0.0, le=10_000.0)] = 250.0
     """Approximate time from exposure to arrival, used by `doctor` and the live picture. A run measures it."""
     max_delay_ms: Annotated[float, Field(ge=50.0, le=10_000.0)] = 1500.0
@@ -83,7 +83,6 @@ class JpegStream:
     `simulated` is True for the loopback camera, which identifies itself.
     """
 
-    live = True
     patches = False
 
     def __init__(self, table: CameraTable) -> None:
@@ -141,11 +140,13 @@ class JpegStream:
 
 
 class Capture:
-    """A `cv2.VideoCapture` on a device, a stream or a file, its settings locked and read back.
+    """A `cv2.VideoCapture` on a device or a stream, its settings locked and read back.
 
-    `live` is False for a file; `settings` are those read back, by name; `simulated` is True for recordings; `patches`
-    where what is missing of a JPEG is filled from the picture before.
+    `settings` are those read back, by name; `patches` is True where what is missing of a JPEG is filled from the
+    picture before.
     """
+
+    simulated = False
 
     def __init__(self, table: CameraTable) -> None:
         """Raises `ConnectionLost`, and `DeviceError` for a setting that the camera does not keep."""
@@ -156,8 +157,9 @@ class Capture:
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         source = table.source
         is_device = source.isdecimal()
-        self.live = is_device or "://" in source
-        self.simulated = not self.live
+        if not is_device and ("://" not in source or source.startswith("file:")):
+            what = f"{source} is neither the number of a device nor the address of a stream"
+            raise ConnectionLost(DEVICE, "open", what)  # a recording would pass for the sheet
         timeout_ms = round(table.timeout_s * 1e3)
         # One decoder thread: frame-parallel decoding would hold every frame back by one or more periods.
         stream = [

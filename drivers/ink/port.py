@@ -18,7 +18,7 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, Field
 
-from brushloop.drivers.devices import Identity, Well
+from brushloop.drivers.devices import Device, Well
 from brushloop.drivers.errors import (
     ConnectionLost,
     DeviceError,
@@ -63,7 +63,7 @@ class InkTable(BaseModel, ABC, frozen=True, extra="forbid"):
 MINUTE_NS = 60 * 10**9
 
 
-class InkDevice(ABC):
+class InkDevice(Device, ABC):
     """A `Device` that keeps the well filled as its table says. Connecting gives no ink.
 
     It keeps to the limit of a dose and of a minute, and adds up what it has given. A dose that failed counts against
@@ -77,19 +77,11 @@ class InkDevice(ABC):
         self._dosed_ml = 0.0
 
     @abstractmethod
-    async def connect(self) -> Identity:
-        """As for any `Device`."""
-
-    @abstractmethod
     async def replenish(self) -> Well:
         """Before a dip: add ink if the table asks for it.
 
         Raises `InkRefused` or `DoseLost` where only a person can help, else `DeviceError`.
         """
-
-    @abstractmethod
-    async def close(self) -> None:
-        """As for any `Device`."""
 
     @abstractmethod
     async def _give(self, volume_ml: float) -> None:

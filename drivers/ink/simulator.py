@@ -194,7 +194,6 @@ class PumpFirmware:
 
     def __init__(self, well: Well | None = None, *, ml_per_revolution: float = 0.1) -> None:
         self.well = well or Well(10.0, capacity_ml=20.0)
-        self.reservoir_ml = RESERVOIR_ML
         self.rpm = 0.0
         self.starts = 0
         self.running = False
@@ -224,8 +223,6 @@ class PumpFirmware:
 
     def _settle(self) -> None:
         now_s = time.monotonic()
-        turned_ml = (self.rpm if self.running else 0.0) / 60.0 * self._ml_per_revolution * (now_s - self._since_s)
-        volume_ml = min(turned_ml, self.reservoir_ml)  # an empty tube pumps air
-        self.reservoir_ml -= volume_ml
-        self.well.add(volume_ml)
+        ml_per_s = (self.rpm if self.running else 0.0) / 60.0 * self._ml_per_revolution
+        self.well.add(ml_per_s * (now_s - self._since_s))
         self._since_s = now_s

@@ -8,7 +8,6 @@ import re
 import threading
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from pathlib import Path
 from typing import Any, ClassVar
 
 import cv2
@@ -43,7 +42,7 @@ SOUND = jpeg_of(page())
 class Feed:
     """A source whose pictures a test hands over, and its clock: a picture comes a tenth of a second after the other."""
 
-    live, simulated, patches = True, False, False
+    simulated, patches = False, False
     settings: ClassVar[dict[str, float]] = {}
 
     def __init__(self) -> None:
@@ -267,7 +266,7 @@ def test_frames_that_waited_in_a_buffer_are_late(latency_ms: int, arrivals_ms: l
     assert [k for k, at_ms in enumerate(arrivals_ms) if backlog.is_late(at_ms * MS)] == late
 
 
-# ---------------------------------------------------------------- recordings and settings
+# ---------------------------------------------------------------- sources and settings
 
 
 @asynccontextmanager
@@ -353,21 +352,12 @@ async def test_an_address_that_is_refused_says_why():
             await camera_at(address).connect()
 
 
-async def test_a_file_that_is_missing_or_over_is_a_lost_connection(tmp_path: Path) -> None:
-    with pytest.raises(ConnectionLost):
-        await camera_at(str(tmp_path / "nowhere.avi")).connect()
-    path = tmp_path / "short.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (640, 480), isColor=False)
-    for _ in range(5):
-        writer.write(page())
-    writer.release()
+@pytest.mark.parametrize("recording", ["short.avi", "file:///tmp/short.avi"])
+async def test_a_recording_is_no_camera_and_a_stream_has_no_settings(recording: str) -> None:
+    with pytest.raises(ConnectionLost, match="neither the number of a device nor the address of a stream"):
+        await camera_at(recording).connect()
     with pytest.raises(DeviceError, match="gain cannot be set through"):
-        await camera_at(str(path), locked=Locked(gain=1.0)).connect()
-    camera = camera_at(str(path))
-    await camera.connect()
-    with pytest.raises(ConnectionLost, match="ended"):
-        await camera.fresh(Stamp(HostClock().now_ns() + 3600 * 10**9))
-    await camera.close()
+        await camera_at("rtsp://camera", locked=Locked(gain=1.0)).connect()
 
 
 class FakeDevice:
