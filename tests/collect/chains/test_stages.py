@@ -1,4 +1,4 @@
-"""What the chains of commands do in which order, keep, and refuse before anything moves; no rig."""
+"""What the chains of commands do in which order, keep, and refuse before anything moves; one of them on a rig."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from brushloop.calibrate.validate import command
 from brushloop.calibrate.validate.command import ValidationOutput
 from brushloop.calibrate.writing import FILE as PLAN
 from brushloop.calibrate.writing import PROTOCOL, Figure, Plan, PlannedBy
+from brushloop.calibrate.writing.compare import ANOTHER, PLANNED, REFERENCE, SIMULATED, WrittenRecord
 from brushloop.collect.chains import LoopRequest, WritingRequest, demo, loop, writing
 from brushloop.collect.chains.loop import SETTINGS as FILE
 from brushloop.collect.chains.loop import Settings, begun_with, check_recovered, keep_settings, run_loop
@@ -32,9 +33,12 @@ from brushloop.collect.errors import ConfigError, StrokesLeftOut
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.start import Collected, finished_session
+from brushloop.drivers.loopback import simulate
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import rig_toml
 from brushloop.sessions.journal import JOURNAL_NAME
+from brushloop.sessions.recording import Recording
+from tests.command import brushloop
 from tests.sessions.conftest import Make
 
 # The demo
@@ -295,3 +299,50 @@ def test_a_fresh_sheet_is_asked_for_before_anything_is_planned(tmp_path: Path, m
     with pytest.raises(ConfigError, match="Put a fresh sheet in"):
         Writing(request).run()
     assert commands.ran == []
+
+
+# On the loopback rig
+
+CROSS = "stroke,x_mm,y_mm,width_mm\n1,12,24,5\n1,36,24,5\n2,24,37,5\n2,24,11,5\n"
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(600)
+def test_a_character_is_written_twice_and_compared(tmp_path: Path) -> None:
+    def printed(*words: str | Path, code: int = 0) -> str:
+        """What the command prints, or why it is refused before anything moves (code 2)."""
+        ran = brushloop(*words)
+        assert ran.returncode == code, ran.stderr
+        return ran.stderr if code else ran.stdout
+
+    what, out, sessions = tmp_path / "cross.csv", tmp_path / "written", tmp_path / "sessions"
+    what.write_text(CROSS, encoding="utf-8")
+    write = ("write", what, "--config", tmp_path / "rig.toml", "--out", out, "--sessions", sessions)
+    write = (*write, "--no-tui", "--cell-mm", "48", "--repeats")
+    with simulate(tmp_path):
+        printed(*write, "2")
+    [session] = sessions.iterdir()
+    assert [stroke.stroke_id for stroke in Recording(session).stroke_records()] == ["cross-r01", "cross-r02"]
+
+    record = WrittenRecord.read(out)
+    assert record.source == "loopback rig"
+    binary = [row for row in record.table_3 if (row.tone, row.polarity) == ("binary", "ink = 1")]
+    rows = {(row.pair, row.alignment): row for row in binary}
+    assert rows[REFERENCE, "mm"].csim.n == 2
+    assert rows[REFERENCE, "mm"].reference == "cross.csv"
+    assert rows[PLANNED, "mm"].csim.avg > 95.0
+    # The brush writes nearly the same twice; that it does not write what the uncalibrated model thinks is a finding.
+    assert rows[ANOTHER, "mm"].csim.avg > 93.0
+    assert 55.0 < rows[SIMULATED, "size-normalised"].csim.avg < 99.9
+    page = (out / "written.html").read_text(encoding="utf-8")
+    assert '<span class="source">loopback rig</span>' in page
+    assert (out / "figure-13.png").stat().st_size > 10_000
+
+    # Done is done, and what was planned stays: another count is another plan.
+    assert "brushloop collect" not in printed(*write, "2")
+    assert "repeats: plans 2 writings, not 3: use another --out" in printed(*write, "3", code=2)
+
+    # A session is compared with the plan that it was drawn from, and with no other.
+    plan = tmp_path / "plan"
+    printed("write", "plan", "--out", plan, "--steps", "1", "--cell-mm", "48", what)
+    assert "'cross' was not drawn from this plan" in printed("write", "compare", session, "--plan", plan, code=2)
