@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +17,12 @@ from brushloop.collect.engine.control import State
 from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.open_or_resume import Opening
 from brushloop.collect.engine.snapshot import Snapshot
-from brushloop.collect.errors import Parked
+from brushloop.collect.errors import ConfigError, Parked
 from brushloop.collect.protocols.kinds import GridConfig
 from brushloop.collect.rig.config import load_rig
-from brushloop.collect.rig.devices import Rig, make_robot
+from brushloop.collect.rig.devices import Rig, make_robot, sole_driver
 from brushloop.collect.start import collect, ending
+from brushloop.drivers import host as sole
 from brushloop.drivers.devices import Identity
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.config import SimConfig
@@ -30,20 +33,29 @@ from brushloop.sessions.store import SessionStore
 from tests.collect.tui.fake import picture, watched
 from tests.rigs import Lab
 from tests.runs import until, wait_for_end
-from tests.waiting import PATIENCE_S, wait_until
+from tests.waiting import wait_until
 
 
-def test_a_signal_stops_the_process_and_the_same_command_goes_on(wired_lab: Lab) -> None:
-    """SIGTERM to a process of its own; the command that goes on is this process."""
-    lab = wired_lab
-    lab.write_protocol("[11.0, 13.0]")
-    run = lab.process()
-    wait_until(lambda: lab.rig.world.presses, "a press", process=run)
-    run.send_signal(signal.SIGTERM)
-    _, stderr = run.communicate(timeout=PATIENCE_S)
-    assert run.returncode == 4, stderr
-    assert stderr.splitlines()[-1].startswith("brushloop: stopped; the same command resumes from here")
-    assert "Traceback" not in stderr
+def at_each_mark(lab: Lab, monkeypatch: pytest.MonkeyPatch, number: signal.Signals) -> None:
+    """Send this process a signal whenever a press has left its mark."""
+    leave = lab.rig.world._leave_mark
+
+    def leave_and_send(deepest: Any) -> None:
+        leave(deepest)
+        os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(lab.rig.world, "_leave_mark", leave_and_send)
+
+
+def test_a_signal_stops_the_run_and_the_same_command_goes_on(bare_lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab = bare_lab
+    lab.write_protocol()
+    with monkeypatch.context() as patch:
+        at_each_mark(lab, patch, signal.SIGTERM)
+        ran = lab.command()
+    assert ran.returncode == 4, ran.stderr
+    assert ran.stderr.splitlines()[-1].startswith("brushloop: stopped; the same command resumes from here")
+    assert "Traceback" not in ran.stderr
     assert lab.at_rest
 
     again = lab.command()
@@ -58,20 +70,15 @@ def test_where_nobody_watches_any_more_the_step_ends_and_the_arm_parks(
 ) -> None:
     """Nobody is there to lift a brush that was stopped on the paper."""
     lab = bare_lab
-    leave = lab.rig.world._leave_mark
 
     def output_closed(_engine: Engine) -> None:
         wait_until(lambda: lab.rig.world.presses, "a press")
         raise BrokenPipeError
 
-    def leave_and_close(deepest: Any) -> None:
-        leave(deepest)
-        os.kill(os.getpid(), signal.SIGHUP)  # a shell may pass it on again
-
     if goes_away == "output":
         monkeypatch.setattr(start, "show_progress", output_closed)
     else:
-        monkeypatch.setattr(lab.rig.world, "_leave_mark", leave_and_close)
+        at_each_mark(lab, monkeypatch, signal.SIGHUP)  # a shell may pass it on again
     lab.write_protocol(repeats=10)
     ran = lab.command()
     assert (ran.returncode, ran.stdout) == (4, "")
@@ -96,6 +103,53 @@ def test_a_session_that_is_open_elsewhere_is_refused_before_anything_moves(bare_
     assert ran.stderr.splitlines()[-1].endswith("another brushloop has this session open")
     elsewhere.release()
     assert lab.command().returncode == 0
+
+
+# One arm, one driver: whatever the temporary folder, whoever the user, and for no longer than the process lives
+
+ARM = "127.0.0.1", 1 + os.getpid() % 60_000
+"""No other test has this address; nothing connects to it."""
+HOLD = """
+import encodings.idna, os, sys, time
+from brushloop.collect.rig.devices import sole_driver
+if len(sys.argv) > 3:
+    os.setuid(int(sys.argv[3]))
+with sole_driver(sys.argv[1], int(sys.argv[2])):
+    print("has it", flush=True)
+    time.sleep(600)
+"""
+NOBODY = 65534
+ROOT = pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root becomes another user")
+
+
+@pytest.mark.parametrize("user", [(), pytest.param((str(NOBODY),), marks=ROOT)], ids=["same user", "another user"])
+def test_a_second_driver_is_refused_while_the_first_lives_and_not_afterwards(tmp_path: Path, user: tuple[str, ...]):
+    """Whatever its temporary folder."""
+    command, environment = [sys.executable, "-c", HOLD, *map(str, ARM), *user], {**os.environ, "TMPDIR": str(tmp_path)}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as holder:
+        try:
+            assert holder.stdout is not None
+            assert holder.stdout.readline() == "has it\n"
+            who = rf"another brushloop is driving the arm at 127.*: process {holder.pid} of "
+            with pytest.raises(ConfigError, match=who):
+                sole_driver(*ARM).__enter__()
+        finally:
+            holder.kill()
+    with sole_driver(*ARM):
+        pass
+
+
+def test_where_the_kernel_keeps_no_names_a_lock_that_all_may_open_does(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sole.sys, "platform", "darwin")
+    for _ in range(2):
+        with sole_driver(*ARM), pytest.raises(ConfigError, match="cannot be named"):
+            sole_driver(*ARM).__enter__()
+    for left in Path("/tmp").glob("brushloop-arm-*.lock"):
+        assert left.stat().st_mode & 0o777 == 0o666
+        left.unlink()
+
+
+# What is refused first, and what is printed last
 
 
 def test_a_folder_that_may_not_be_written_is_refused_before_anything_is_connected(
