@@ -7,6 +7,7 @@ however a run ends, it says so if the brush may be down, and what to do; and say
 from __future__ import annotations
 
 import asyncio
+import errno
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -28,7 +29,11 @@ from brushloop.drivers.errors import (
 )
 from brushloop.drivers.geometry import distance
 from brushloop.drivers.sim.faults import ALWAYS, Fault, Phase
+from brushloop.sessions.errors import SessionError
+from brushloop.sessions.mcap_writer import McapWriter
+from brushloop.sessions.recording import Recording
 from brushloop.sessions.store import SessionStore
+from tests.journal_lines import read_lines
 from tests.rigs import BARE, Lab
 from tests.runs import until, wait_for_end
 
@@ -340,9 +345,51 @@ def test_an_end_with_the_brush_in_the_paper_says_so_and_what_to_do(lab: Lab, end
 
 
 @pytest.mark.parametrize("ends", ["park", "stop"])
-def test_a_run_that_ends_at_travel_height_does_not_speak_of_the_brush(lab: Lab, ends: str) -> None:
+def test_a_pause_lasts_until_it_is_ended_and_an_end_at_travel_height_does_not_speak_of_the_brush(
+    lab: Lab, ends: str
+) -> None:
     engine = lab.started()
     engine.pause()
     until(engine, lambda now: now.state is State.PAUSED)
+    later_s = lab.rig.time.now_s + 10.0
+    until(engine, lambda _: lab.rig.time.now_s > later_s)
+    assert (engine.snapshot().state, lab.presses) == (State.PAUSED, [])
     getattr(engine, ends)()
     assert DOWN not in said_at_the_end(engine)
+    assert engine.snapshot().parked
+
+
+# The disk belongs to the process that records, so a full one is no fault of the rig
+
+
+@pytest.mark.parametrize("room", [0, 3, pytest.param(60, marks=pytest.mark.soak)])
+def test_a_disk_that_fills_up_ends_the_run_and_with_room_the_same_command_goes_on(
+    bare_lab: Lab, monkeypatch: pytest.MonkeyPatch, room: int
+) -> None:
+    """`room`: messages that fit."""
+    record, written = McapWriter.record, list[Any]()
+
+    def onto_a_full_disk(table: McapWriter, outgoing: Any) -> None:
+        written.append(outgoing)
+        if len(written) > room:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        record(table, outgoing)
+
+    with monkeypatch.context() as full:
+        full.setattr(McapWriter, "record", onto_a_full_disk)
+        with pytest.raises(SessionError, match="No space left on device"):
+            bare_lab.run()
+    assert bare_lab.engines[-1].snapshot().state is State.FAILED
+    assert bare_lab.at_rest
+    assert bare_lab.rig.faults.phase() in (Phase.PARKED, Phase.RESTING)
+    assert bare_lab.rig.world.tool().z_mm >= bare_lab.rig.config.table.paper_z_mm + 8.0
+    folder = bare_lab.session
+    events = [line["event"] for line in read_lines(folder / "journal.jsonl")]
+    # Where the last message of a step does not fit, the journal has no word for its end either: begun, not done.
+    assert events.count("begin") == events.count("done") + 1
+    assert events.count("void") <= 1
+    assert len(bare_lab.state.cut) + len(bare_lab.state.running) == 1
+    assert len(list(folder.glob("*.part"))) == 1, "the evidence is kept"
+
+    bare_lab.run()
+    assert len(list(Recording(folder).captures())) == 1
