@@ -64,7 +64,7 @@ def wired_lab(tmp_path: Path) -> Iterator[Lab]:
 
 @dataclass
 class Collected:
-    """A session of four strokes, from its beginning to its end."""
+    """A session of four strokes, from its beginning to its end, armed and without a self-check."""
 
     lab: Lab
     """Its rig has ended; the world remembers what was pressed."""
@@ -80,4 +80,5 @@ def collected(tmp_path_factory: pytest.TempPathFactory) -> Collected:
     """For whoever only looks at what a run leaves; nobody writes into it."""
     with rigs.wireless_lab(tmp_path_factory.mktemp("collected"), COARSE) as lab:
         rigs.coarse(lab).write_protocol(tilts="[0.0, 10.0]")
-        return Collected(lab, lab.run())
+        lab.edit_rig("", "\n[self_check]\nenabled = false\n")
+        return Collected(lab, lab.run(armed=True))

@@ -63,7 +63,7 @@ def test_a_question_that_nobody_answered_is_asked_again_on_resume(sharp_lab: Lab
     assert until(left, lambda now: now.prompt is not None).state is State.ASKING
     left.park()  # as `q` does, and a lost connection
     ended_by(left, Parked)
-    assert left.snapshot().given_up == 0
+    assert (left.snapshot().given_up, left.snapshot().prompt) == (0, None)
 
     resumed = sharp_lab.engine(on_screen=True)
     questions = answered_alike(resumed, "g")
