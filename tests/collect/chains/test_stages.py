@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 from typer.testing import CliRunner
 
-import brushloop.__main__
+from brushloop.__main__ import app
 from brushloop.calibrate.commands import (
     CompareWrittenRequest,
     FitFootprintRequest,
@@ -114,7 +114,7 @@ EVALUATED = ["calibrate", "fit", "fresh sheet", "loop 6", "validate"]
 
 def run(folder: Path, *more: str) -> None:
     """Run the command. Raises what ended it."""
-    CliRunner().invoke(brushloop.__main__.app, ["demo", "--out", str(folder), *more], catch_exceptions=False)
+    CliRunner().invoke(app, ["demo", "--out", str(folder), *more], catch_exceptions=False)
 
 
 def test_strokes_that_were_left_out_end_in_a_report_that_can_be_opened_and_exit_code_3(
