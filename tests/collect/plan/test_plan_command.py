@@ -1,4 +1,4 @@
-"""`brushloop collect plan`: tables, JSON, a picture, the controller's word on reach; and `collect` as it was."""
+"""`brushloop collect plan`: tables, a picture, the controller's word on reach; and `collect` as it was."""
 
 from __future__ import annotations
 
