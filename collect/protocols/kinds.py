@@ -17,16 +17,19 @@ from pydantic import AfterValidator, AliasChoices, BaseModel, ConfigDict, Field,
 
 from brushloop.calibrate.stats import spread_out
 from brushloop.collect.protocols.steps import (
+    BoardStep,
     Drawn,
     HeadingDeg,
     InCellMm,
     PathDepthMm,
     Planned,
     Protocol,
+    SelfCheckStep,
     TiltDeg,
     TrajectoryPoint,
+    ZeroTouchStep,
     balanced,
-    stroke_steps,
+    takes,
 )
 from brushloop.collect.rig.config_file import Config
 from brushloop.collect.rig.paper import Layout
@@ -89,8 +92,18 @@ class StrokesConfig(Config):
         """Every stroke exactly once, in order. With a `layout`, conditions are spread over the sheet."""
 
     def steps(self, layout: Layout | None = None, *, self_check: bool = False) -> Protocol:
-        """Return the generator of steps. The layout changes the order of the steps, never their keys."""
-        return stroke_steps(self.planned(layout), board_every=self.board_every, self_check=self_check)
+        """Zero touch, board, self-check if wanted, then dip, press or draw, capture for each stroke.
+
+        The layout changes the order of the steps, never their keys.
+        """
+        yield ZeroTouchStep(0)
+        yield BoardStep(0)
+        if self_check:
+            yield SelfCheckStep(0)
+        for number, stroke in enumerate(self.planned(layout)):
+            if self.board_every is not None and number > 0 and number % self.board_every == 0:
+                yield BoardStep(number // self.board_every)
+            yield from takes(stroke)
 
 
 class RoundsConfig(StrokesConfig):
@@ -375,7 +388,7 @@ class WriteConfig(RoundsConfig):
         """Every figure, under the condition of its deepest point."""
         strokes: list[Planned] = []
         for figure in self.figures:
-            drawn = Drawn([list(stroke.points) for stroke in figure.strokes], self.cell_mm, self.speed_mm_s)
+            drawn = Drawn([list(stroke.points) for stroke in figure.strokes], self.speed_mm_s)
             points = itertools.chain.from_iterable(drawn.strokes)
             _, _, depth_mm, tilt_deg, _ = max(points, key=lambda point: point[2])
             strokes.append(Planned(f"{figure.name}-r{repeat:02d}", Condition(depth_mm, tilt_deg), repeat, drawn=drawn))

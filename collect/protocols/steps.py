@@ -48,8 +48,6 @@ class Drawn:
     """The strokes that a DRAW step draws on one patch."""
 
     strokes: list[list[TrajectoryPoint]]
-    cell_mm: tuple[float, float]
-    """Size of the figure's patch."""
     speed_mm_s: float
 
 
@@ -196,18 +194,6 @@ def with_review(plan: Iterable[Planned], reviewed: ReviewResult) -> list[Planned
         replace(p, stroke_id=f"{p.stroke_id}{AGAIN}", index=indices[p.stroke_id]) if p.stroke_id in indices else p
         for p in plan
     ]
-
-
-def stroke_steps(plan: Iterable[Planned], *, board_every: int | None, self_check: bool) -> Protocol:
-    """Zero touch, board, self-check if wanted, then dip, press or draw, capture for each stroke of the plan."""
-    yield ZeroTouchStep(0)
-    yield BoardStep(0)
-    if self_check:
-        yield SelfCheckStep(0)
-    for number, stroke in enumerate(plan):
-        if board_every is not None and number > 0 and number % board_every == 0:
-            yield BoardStep(number // board_every)
-        yield from takes(stroke)
 
 
 def takes(stroke: Planned) -> Protocol:
