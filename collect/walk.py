@@ -179,8 +179,8 @@ def sheet_of(config: RigConfig, protocol: ProtocolConfig) -> Sheet:
 
 
 def steps_on(config: RigConfig, protocol: ProtocolConfig) -> Protocol:
-    """The steps as this rig runs them: balanced over its sheet, with the self-check if it is on."""
-    return protocol.steps(sheet_of(config, protocol), self_check=bool(config.self_check.enabled))
+    """The steps as this rig runs them: with the self-check if it is on."""
+    return protocol.steps(self_check=bool(config.self_check.enabled))
 
 
 def as_planned(step: Step, sheet: int, patch: int) -> StepResult | None:

@@ -68,8 +68,7 @@ class Engine:
         self._request = opening.request
         self._rig_config = opening.rig
         self._resumes = resumes
-        layout = sheet_of(opening.rig, opening.protocol)
-        progress = Progress(opening.protocol, clock, layout, resumes)
+        progress = Progress(opening.protocol, clock, sheet_of(opening.rig, opening.protocol), resumes)
         self._run = Run(opening, progress, Asker(watched=bool(self._request.on_screen), waiting=self._waiting))
         self._clock = clock
         self._task: asyncio.Task[None] | None = None

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from brushloop.collect.operator import OperatorRequest, Prompt
     from brushloop.collect.photograph.checks import Verdict
     from brushloop.collect.protocols.config import ProtocolConfig
-    from brushloop.collect.rig.paper import Layout
+    from brushloop.collect.rig.paper import Sheet
     from brushloop.drivers.host import Clock
     from brushloop.sessions.store import SessionStore
 
@@ -189,16 +189,16 @@ def no_pose_text(now: Snapshot) -> str:
 class Progress:
     """Progress of one run; written by the engine's thread, read from any."""
 
-    def __init__(self, protocol: ProtocolConfig, clock: Clock, layout: Layout, resumes: Path | None) -> None:
-        """`layout` is that of the sheet; it determines the order of the strokes. `resumes` is the session's folder."""
+    def __init__(self, protocol: ProtocolConfig, clock: Clock, sheet: Sheet, resumes: Path | None) -> None:
+        """`resumes` is the folder of the session that is resumed."""
         self._clock = clock
         self._lock = threading.Lock()
-        self._planned = protocol.planned(layout)
+        self._planned = protocol.planned()
         self.plan = self._planned
         """Every stroke, those that were marked bad in a review replaced by their repetition."""
         self.left = self._planned
         """Those that neither count nor are left out."""
-        self._layout = layout
+        self._sheet = sheet
         self._store: SessionStore | None = None
         self._started_ns = clock.now_ns()
         self._over_ns: int | None = None
@@ -302,8 +302,7 @@ class Progress:
         kept, bad = ([press for press, mark in made.values() if mark is wanted] for wanted in (Mark.KEPT, Mark.BAD))
         ended = {press.stroke_id for press in (*kept, *left_out)}
         self.plan, self.left = plan, [stroke for stroke in plan if stroke.stroke_id not in ended]
-        sheet, layout = state.sheet, self._layout
-        on_sheet = tuple(marks.get((sheet, patch)) for patch in range(layout.capacity))
+        on_sheet = tuple(marks.get((state.sheet, patch)) for patch in range(self._sheet.capacity))
         self._change(
             strokes_done=len(kept),
             strokes_planned=len(plan),
@@ -312,7 +311,7 @@ class Progress:
             given_up=len(left_out),
             eta_s=self._eta_s(times_ns),
             ink_level=ink_level,
-            sheet=SheetMap(sheet + 1, layout.columns, on_sheet),
+            sheet=SheetMap(state.sheet + 1, self._sheet.columns, on_sheet),
         )
 
     def _grid(

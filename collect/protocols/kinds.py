@@ -28,11 +28,9 @@ from brushloop.collect.protocols.steps import (
     TiltDeg,
     TrajectoryPoint,
     ZeroTouchStep,
-    balanced,
     takes,
 )
 from brushloop.collect.rig.config_file import Config
-from brushloop.collect.rig.paper import Layout
 from brushloop.sessions.records import Condition
 
 MAX_STROKES = 10_000
@@ -88,19 +86,16 @@ class StrokesConfig(Config):
     the start."""
 
     @abstractmethod
-    def planned(self, layout: Layout | None = None) -> list[Planned]:
-        """Every stroke exactly once, in order. With a `layout`, conditions are spread over the sheet."""
+    def planned(self) -> list[Planned]:
+        """Every stroke exactly once, in order."""
 
-    def steps(self, layout: Layout | None = None, *, self_check: bool = False) -> Protocol:
-        """Zero touch, board, self-check if wanted, then dip, press or draw, capture for each stroke.
-
-        The layout changes the order of the steps, never their keys.
-        """
+    def steps(self, *, self_check: bool = False) -> Protocol:
+        """Zero touch, board, self-check if wanted, then dip, press or draw, capture for each stroke."""
         yield ZeroTouchStep(0)
         yield BoardStep(0)
         if self_check:
             yield SelfCheckStep(0)
-        for number, stroke in enumerate(self.planned(layout)):
+        for number, stroke in enumerate(self.planned()):
             if self.board_every is not None and number > 0 and number % self.board_every == 0:
                 yield BoardStep(number // self.board_every)
             yield from takes(stroke)
@@ -112,7 +107,7 @@ class RoundsConfig(StrokesConfig):
     repeats: Repeats = 1
     """Rounds."""
     seed: Seed | None = None
-    """Shuffles each round and spreads the conditions over the sheet; if left out, the order is that of the round."""
+    """Shuffles each round; if left out, the order is that of the round."""
 
     @abstractmethod
     def round(self, repeat: int) -> list[Planned]:
@@ -126,10 +121,10 @@ class RoundsConfig(StrokesConfig):
         distinct([stroke.stroke_id for stroke in self.planned()])
         return self
 
-    def planned(self, layout: Layout | None = None) -> list[Planned]:
-        """Every stroke of every round; with a seed shuffled, and balanced over the sheet where its layout is known.
+    def planned(self) -> list[Planned]:
+        """Every stroke of every round, each round shuffled with a seed.
 
-        Rounds keep a drift of ink or paper from looking like an effect of H or alpha. The balance does the same for
+        Rounds keep a drift of ink or paper from looking like an effect of H or alpha. Shuffling does the same for
         unevenness of the paper or of the camera's view.
         """
         rounds = [self.round(repeat) for repeat in range(1, self.repeats + 1)]
@@ -138,12 +133,8 @@ class RoundsConfig(StrokesConfig):
             for k, strokes in enumerate(rounds):
                 rng.shuffle(order)
                 rounds[k] = [strokes[i] for i in order]
-        numbers = itertools.count()
-        rounds = [[replace(stroke, index=next(numbers)) for stroke in strokes] for strokes in rounds]
-        if self.seed is not None and layout is not None and layout.capacity > 0:
-            orders = balanced([[stroke.condition for stroke in strokes] for strokes in rounds], layout, self.seed)
-            rounds = [[strokes[i] for i in order] for strokes, order in zip(rounds, orders, strict=True)]
-        return [stroke for strokes in rounds for stroke in strokes]
+        strokes = itertools.chain.from_iterable(rounds)
+        return [replace(stroke, index=index) for index, stroke in enumerate(strokes)]
 
 
 # Presses of a grid
@@ -187,8 +178,8 @@ class FewStrokesConfig(_DesignConfig):
     strokes: Annotated[int, Field(ge=1, le=MAX_STROKES)] = 9
     """Number of presses. After every (H, alpha) once, the same order begins again."""
 
-    def planned(self, layout: Layout | None = None) -> list[Planned]:
-        """The presses in the order of the design, which does not depend on the sheet."""
+    def planned(self) -> list[Planned]:
+        """The presses in the order of the design."""
         order = [Condition(depth_mm, tilt_deg) for depth_mm, tilt_deg in spread_out(self.depths_mm, self.tilts_deg)]
         presses = [self.press(order[k % len(order)], k // len(order) + 1) for k in range(self.strokes)]
         return [replace(press, index=k) for k, press in enumerate(presses)]

@@ -1,26 +1,17 @@
-"""Steps: the units of a protocol and of resume, each kind a class with its parameters. Then the strokes of a plan: the
-steps of each, and their order over the sheet.
-
-Conditions are spread over the sheet. Its patches are used in order, so a stroke's number determines its place. The
-sheet is cut into three bands of rows and three of columns; within each round, strokes are assigned to places so that
-each (H, alpha) lies about equally often in each band. Rounds stay whole, so a drift of ink still affects every
-condition alike. A void press shifts what follows by one patch: only the plan stays balanced.
+"""Steps: the units of a protocol and of resume, each kind a class with its parameters. Then the strokes of a plan, and
+the steps of each.
 """
 
 from __future__ import annotations
 
 import hashlib
 import itertools
-from collections import defaultdict
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Generator, Iterable
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, get_args
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter
 
-from brushloop.collect.rig.paper import Layout
 from brushloop.sessions.events import (
     CaptureResult,
     DipResult,
@@ -171,8 +162,7 @@ class Planned:
     repeat: int
     """Round, from 1."""
     index: int = 0
-    """Number in the plan before it was balanced over the sheet. The keys of its steps are made with it, so that they do
-    not depend on the sheet."""
+    """Number in the plan, which is part of the keys of its steps."""
     dwell_s: float = 0.0
     drawn: Drawn | None = None
     """The figure; None for a press."""
@@ -210,38 +200,3 @@ def takes(stroke: Planned) -> Protocol:
         seen = yield CaptureStep(index, marked.press, again_of, drawn is not None)
         if not (isinstance(seen, CaptureResult) and seen.retake):
             break
-
-
-BANDS = 3
-
-
-def balanced(rounds: Sequence[Sequence[Condition]], layout: Layout, seed: int) -> list[list[int]]:
-    """The order of each round, as indices into it.
-
-    `rounds` holds the condition of every stroke. The same arguments give the same order in every process.
-    """
-    from scipy.optimize import linear_sum_assignment
-
-    rng, capacity = np.random.default_rng(seed), layout.capacity
-    rows, columns = np.divmod(np.arange(capacity), layout.columns)
-    bands = np.arange(BANDS)[:, None]
-    # (2 * BANDS, capacity): the bands in which each patch lies.
-    lies_in = np.concatenate((BANDS * rows // layout.rows == bands, BANDS * columns // layout.columns == bands))
-    weights = 1.0 / np.maximum(lies_in.mean(axis=1), 1.0 / capacity)
-    counts: dict[Condition, NDArray[np.float64]] = defaultdict(lambda: np.zeros(2 * BANDS))
-    orders: list[list[int]] = []
-    first = 0
-    for conditions in rounds:
-        order = rng.permutation(len(conditions))
-        for start in range(0, len(order), capacity):  # of a round larger than a sheet, one sheet after the other
-            strokes = order[start : start + capacity].copy()
-            here = lies_in[:, (first + start + np.arange(len(strokes))) % capacity]
-            # By how much (count^2 / share), summed over the bands, grows if a stroke is made on a patch.
-            growths = [(weights * (2.0 * counts[conditions[stroke]] + 1.0)) @ here for stroke in strokes]
-            _, chosen = linear_sum_assignment(np.array(growths) + 1e-6 * rng.random((len(strokes), len(strokes))))
-            order[start + chosen] = strokes
-            for stroke, patch in zip(strokes, chosen, strict=True):
-                counts[conditions[stroke]] += here[:, patch]
-        orders.append(order.tolist())
-        first += len(order)
-    return orders

@@ -13,20 +13,6 @@ from brushloop.collect.rig.config import PaperConfig
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import Quaternion, brush_pose, of_angles, product, turned, unit
 
-
-@dataclass(frozen=True)
-class Layout:
-    """How a sheet is divided into patches, filled row by row from the far edge."""
-
-    columns: int
-    rows: int
-
-    @property
-    def capacity(self) -> int:
-        """Patches on a sheet."""
-        return self.columns * self.rows
-
-
 ANCHOR_SHARE = 0.75
 """Place of the zero-touch point along a patch, as a share of its width: the mark extends mostly toward -x."""
 
@@ -52,7 +38,7 @@ class Patch:
         return self.x_mm, self.y_mm, self.size_x_mm, self.size_y_mm
 
 
-class Sheet(Layout):
+class Sheet:
     """The patches of one sheet, row by row from the far edge, so that the arm never reaches across wet ink."""
 
     def __init__(self, paper: PaperConfig, cell_mm: tuple[float, float] | None = None) -> None:
@@ -60,9 +46,14 @@ class Sheet(Layout):
         self.cell_mm = paper.cell_mm if cell_mm is None else cell_mm
         width, height = paper.size_mm
         cell_w, cell_h = self.cell_mm
-        super().__init__(columns=int(width // cell_w), rows=int(height // cell_h))
+        self.columns, self.rows = int(width // cell_w), int(height // cell_h)
         self._left = 0.5 * (width - self.columns * cell_w)
         self._bottom = 0.5 * (height - self.rows * cell_h)
+
+    @property
+    def capacity(self) -> int:
+        """Patches on the sheet."""
+        return self.columns * self.rows
 
     @property
     def corners(self) -> list[Patch]:
