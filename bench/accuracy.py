@@ -33,16 +33,16 @@ from bench.brushes import (
     simulated_rig,
 )
 from bench.harness import BenchError, Result, at_most, brushloop, machine, rounds_of
-from bench.prior import BRISTLE
+from bench.prior import NOT_BRISTLE
 from brushloop.calibrate.compare import TABLE_2
-from brushloop.calibrate.fit.fit import Prior, fit_presses, learned
+from brushloop.calibrate.fit.fit import fit_presses
 from brushloop.calibrate.fit.heldout import BEZIER, FITTED, Refit, held_out_scores, leave_condition_out, refit
 from brushloop.calibrate.loop import LoopRecord
 from brushloop.calibrate.presses import read_for_fit
 from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.writing.compare import HEADLINE, REFERENCE, SIMULATED, WrittenRecord
 from brushloop.drivers.sim.brush.spec import PAPER, load_brush
-from brushloop.model.fitted import FittedPress
+from brushloop.model.fitted import FittedPress, Prior, learned
 from brushloop.model.generator import SHIPPED_GENERATOR
 from brushloop.model.presses import Presses, image_of
 from brushloop.twin.run import TWIN, fit_twin, workers
@@ -104,7 +104,7 @@ def few(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
 def _pressed(n: int | None, seed: int) -> Iterator[tuple[str, Presses, Prior]]:
     """The presses of the first `n` brushes, and the prior that does not know their family."""
     for name in BRUSHES[: rounds_of(n, len(BRUSHES))]:
-        prior = learned((BRISTLE,)) if name in BRISTLE_SETS else learned()
+        prior = learned(NOT_BRISTLE) if name in BRISTLE_SETS else learned()
         with tempfile.TemporaryDirectory() as folder:
             try:
                 session = Path(folder) / name

@@ -21,12 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.brushes import BRISTLE_SETS, CELLS, bristle_session
-from brushloop.calibrate.fit.fit import FILE, KnownBrush, Prior, fit_presses
+from brushloop.calibrate.fit.fit import fit_presses
 from brushloop.calibrate.presses import read_for_fit
-from brushloop.model.fitted import NAMES, chance_within
+from brushloop.model.fitted import NAMES, PRIOR, Prior, chance_within
 from brushloop.model.presses import Grid, Presses
 
-BRISTLE = "bristle simulation"
+BRISTLE, NOT_BRISTLE = "bristle simulation", "without the bristle simulation"
 SIZE_PX, PX_MM, TOUCH_MM = 128, 0.3, (29.1, 19.2)
 """The images of made-up marks, and where the tip touches on them, from the left and top edge."""
 ROWS = slice(28, 100)
@@ -132,12 +132,12 @@ def _bezier(rng: np.random.Generator) -> Shape:
     return lambda share: np.interp(1.0 - np.abs(share), place, width)
 
 
-def known() -> Iterator[KnownBrush]:
-    """Every brush of the prior, fitted. Raises BenchError where a bristle set is not at hand."""
+def known() -> Iterator[tuple[str, Floats]]:
+    """Family and parameters of every brush of the prior. Raises BenchError where a bristle set is not at hand."""
     for name in BRISTLE_SETS:
         with tempfile.TemporaryDirectory() as folder:
             _, presses, _ = read_for_fit(bristle_session(Path(folder) / name, name))
-        yield _fitted(name, BRISTLE, presses)
+        yield BRISTLE, _fitted(presses)
     centres = np.asarray((np.arange(SIZE_PX) + 0.5) * PX_MM, np.float64)
     grid = Grid(centres - TOUCH_MM[0], (TOUCH_MM[1] - centres)[ROWS])
     for family in FAMILIES:
@@ -145,21 +145,22 @@ def known() -> Iterator[KnownBrush]:
             brush = made_up(family, number)
             ink = np.array([brush.ink(*cell, grid) for cell in CELLS])
             presses = Presses(brush.radius_mm, brush.length_mm, grid, np.array(CELLS), ink)
-            yield _fitted(f"{family} {number + 1}", family, presses)
+            yield family, _fitted(presses)
 
 
-def _fitted(name: str, family: str, presses: Presses) -> KnownBrush:
+def _fitted(presses: Presses) -> Floats:
     about_published = Prior(np.zeros(len(NAMES)), np.eye(len(NAMES)))
-    press = fit_presses(presses, residual=False, prior=about_published)
-    return KnownBrush(name=name, family=family, values=tuple(round(float(v), 5) for v in press.values))
+    return fit_presses(presses, residual=False, prior=about_published).values.round(5)
 
 
 def main() -> None:
-    """Write the file."""
+    """Write the prior of all brushes, and the one that the bench of the bristle simulation uses."""
     brushes = list(known())
-    rows = ",\n  ".join(json.dumps(brush._asdict()) for brush in brushes)
-    FILE.write_text(f'{{"brushes": [\n  {rows}\n]}}\n', encoding="utf-8")
-    sys.stdout.write(f"{len(brushes)} brushes: {FILE}\n")
+    sets = {"all": brushes, NOT_BRISTLE: [brush for brush in brushes if brush[0] != BRISTLE]}
+    priors = {name: Prior.of_brushes(known) for name, known in sets.items()}
+    numbers = {name: {"mean": p.mean.tolist(), "precision": p.precision.tolist()} for name, p in priors.items()}
+    PRIOR.write_text(json.dumps(numbers) + "\n", encoding="utf-8")
+    sys.stdout.write(f"{len(brushes)} brushes: {PRIOR}\n")
 
 
 if __name__ == "__main__":

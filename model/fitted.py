@@ -10,12 +10,22 @@ The widest place lies at lean H tan(alpha) + origin_mm + origin_gain h from the 
 direction in which the ferrule leans; friction holds the tip back, so lean may be < 1.
 The two ends may differ from these lengths, and the edges from the profile, by what `FittedPress` calls residuals.
 The defaults are CCD-BSM as published.
+
+What the presses of a brush do not determine has the values that a prior expects: the mean and precision of the
+parameters over brushes of several families of shape, each fitted to many strokes (`python -m bench.prior` makes
+`prior.json`). Each family counts with the square root of its number of brushes, so that a large one does not make the
+others implausible. The covariance is shrunk toward its diagonal, because there are few brushes, and it has a floor,
+because the next brush may belong to none of the families.
 """
 
 from __future__ import annotations
 
+import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,11 +78,57 @@ PARAMETERS = (
     Parameter("heel_tilt", "1/deg", 0.0, 0.03, -0.09, 0.2, "growth of the heel side with tilt, beside the length's"),
 )
 NAMES = tuple(parameter.name for parameter in PARAMETERS)
+PRIOR = Path(__file__).with_name("prior.json")
+SHRINKAGE = 0.3
+FLOOR = 0.15
+"""Least standard deviation of a parameter, in units of its spread."""
 
 
 def published() -> Floats:
     """The parameters of CCD-BSM as published, (17,)."""
     return np.array([parameter.start for parameter in PARAMETERS])
+
+
+def spreads() -> Floats:
+    """The plausible spread of each parameter, (17,)."""
+    return np.array([parameter.spread for parameter in PARAMETERS])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior:
+    """A normal distribution of the parameters over their spreads: `mean` (17,) and `precision` (17, 17)."""
+
+    mean: Floats
+    precision: Floats
+
+    @classmethod
+    def of_brushes(cls, known: Sequence[tuple[str, Floats]]) -> Prior:
+        """The prior from the families and the parameters (17,) of these brushes."""
+        families = [family for family, _ in known]
+        weights = np.array([families.count(family) ** -0.5 for family in families])
+        weights /= weights.sum()
+        off = (np.array([values for _, values in known]) - published()) / spreads()
+        mean = weights @ off
+        covariance = (off - mean).T @ ((off - mean) * weights[:, None]) / (1.0 - np.sum(weights**2))
+        covariance += SHRINKAGE * (np.diag(np.diag(covariance)) - covariance)
+        return cls(mean, np.linalg.inv(covariance + FLOOR**2 * np.eye(len(mean))))
+
+    @property
+    def values(self) -> Floats:
+        """The mean in the parameters' own units, within their bounds."""
+        low, high = (np.array([getattr(p, end) for p in PARAMETERS]) for end in ("low", "high"))
+        return np.clip(published() + spreads() * self.mean, low, high)
+
+    def off(self, values: Floats) -> Floats:
+        """Distance of parameters from the mean, over their spreads, (17,)."""
+        return (values - published()) / spreads() - self.mean
+
+
+@cache
+def learned(brushes: str = "all") -> Prior:
+    """The prior of `PRIOR`, which also holds the one that the bench of a family uses, without that family."""
+    prior = json.loads(PRIOR.read_text(encoding="utf-8"))[brushes]
+    return Prior(np.array(prior["mean"]), np.array(prior["precision"]))
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,24 +9,14 @@ the profile. Over the strokes, each of these numbers is a polynomial in depth an
 The scales of the polynomial's constant, of its other terms and of the deviations are those with the greatest marginal
 likelihood on a grid (D. MacKay, "Bayesian interpolation", 1992), with a weak prior on each scale. So the fit smooths
 strokes that repeat badly and follows strokes that repeat well.
-
-The prior is the mean and covariance of the parameters over known brushes. `prior.json` holds those of brushes of
-several families of shape, each fitted to many strokes (`python -m bench.prior` makes it). Each family counts with the
-square root of its number of brushes, so that one large family does not make the others implausible. The covariance is
-shrunk toward its diagonal, because there are few brushes, and it has a floor, because the next brush may belong to none
-of the families.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from itertools import product
 from operator import itemgetter
-from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,11 +28,13 @@ from brushloop.model.fitted import (
     PARAMETERS,
     TERMS,
     FittedPress,
+    Prior,
     Sizes,
     chance_within,
     command_terms,
+    learned,
     modes,
-    published,
+    spreads,
 )
 from brushloop.model.presses import DepthTilt, Grid, Presses
 
@@ -50,10 +42,6 @@ Floats = NDArray[np.float64]
 
 SPREAD_MM = 0.15
 """Variation of an edge from press to press (scale of a logistic)."""
-FILE = Path(__file__).with_name("prior.json")
-SHRINKAGE = 0.3
-FLOOR = 0.15
-"""Least standard deviation of a parameter, in units of its spread."""
 
 ALL = tuple(range(len(NAMES)))
 SCALE = tuple(NAMES.index(name) for name in ("lam", "heel_gain", "tip_gain", "origin_mm"))
@@ -78,59 +66,6 @@ END_MM = 1.5
 END_NOISE = 4.0
 """Variance of a pixel times the number of pixels whose errors are correlated, where an end is sought."""
 END_STEP_MM, END_ROUNDS = 0.05, 4
-
-
-class KnownBrush(NamedTuple):
-    """A brush of the prior: its parameters, in the order of `NAMES`."""
-
-    name: str
-    family: str
-    values: Sequence[float]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Prior:
-    """A normal distribution of the parameters over their spreads: `mean` (17,) and `precision` (17, 17)."""
-
-    mean: Floats
-    precision: Floats
-
-    @property
-    def values(self) -> Floats:
-        """The mean in the parameters' own units, within their bounds."""
-        low, high = (np.array([getattr(p, end) for p in PARAMETERS]) for end in ("low", "high"))
-        return np.clip(published() + spreads() * self.mean, low, high)
-
-    def off(self, values: Floats) -> Floats:
-        """Distance of parameters from the mean, over their spreads, (17,)."""
-        return (values - published()) / spreads() - self.mean
-
-
-def spreads() -> Floats:
-    """The plausible spread of each parameter, (17,)."""
-    return np.array([parameter.spread for parameter in PARAMETERS])
-
-
-@cache
-def learned(without_families: tuple[str, ...] = ()) -> Prior:
-    """The prior from `prior.json`; a bench leaves out the family that it scores."""
-    known = [KnownBrush(**brush) for brush in json.loads(FILE.read_text(encoding="utf-8"))["brushes"]]
-    return of_brushes([brush for brush in known if brush.family not in without_families])
-
-
-def of_brushes(known: Sequence[KnownBrush]) -> Prior:
-    """The prior from these brushes. Raises ValueError for fewer than two."""
-    if len(known) < 2:
-        raise ValueError("a prior needs at least two brushes")
-    families = [brush.family for brush in known]
-    weights = np.array([families.count(family) ** -0.5 for family in families])
-    weights /= weights.sum()
-    off = (np.array([brush.values for brush in known]) - published()) / spreads()
-    mean = weights @ off
-    covariance = (off - mean).T @ ((off - mean) * weights[:, None]) / (1.0 - np.sum(weights**2))
-    covariance += SHRINKAGE * (np.diag(np.diag(covariance)) - covariance)
-    widened = np.asarray(covariance + FLOOR**2 * np.eye(len(mean)), np.float64)
-    return Prior(mean, np.asarray(np.linalg.solve(widened, np.eye(len(mean))), np.float64))
 
 
 def fit_presses(

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.compare import KEYS, MM_BINARY, Alignment, similarity
-from brushloop.calibrate.fit.fit import Floats, Prior, fit_presses
+from brushloop.calibrate.fit.fit import Floats, fit_presses
 from brushloop.calibrate.scores import Stat, statistics
 from brushloop.calibrate.stats import CEILING, ceiling_values, pair_means
 from brushloop.calibrate.work import Arrays, Scheduler, Store, key_of, threads
 from brushloop.model.ccdbsm import DomainError
-from brushloop.model.fitted import FittedPress
+from brushloop.model.fitted import FittedPress, Prior
 from brushloop.model.presses import DepthTilt, Draw, Presses, image_of, refit_bezier
 from brushloop.sessions.terminal import Progress, counted, unseen
 

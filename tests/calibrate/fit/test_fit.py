@@ -14,12 +14,23 @@ from brushloop.calibrate.artefact import FITS, current
 from brushloop.calibrate.commands import FitRequest
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.command import FEWEST_CONDITIONS, BrushFit, fit_press_session, sizes_of
-from brushloop.calibrate.fit.fit import KnownBrush, draw, fit_presses, learned, of_brushes, regress, spreads
+from brushloop.calibrate.fit.fit import draw, fit_presses, regress
 from brushloop.calibrate.fit.heldout import FITTED, leave_condition_out
 from brushloop.calibrate.session import open_session
 from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.validate.tables import Report
-from brushloop.model.fitted import NAME, NAMES, PARAMETERS, TERMS, FittedPress, command_terms, published
+from brushloop.model.fitted import (
+    NAME,
+    NAMES,
+    PARAMETERS,
+    TERMS,
+    FittedPress,
+    Prior,
+    command_terms,
+    learned,
+    published,
+    spreads,
+)
 from brushloop.model.presses import Grid, Presses
 from tests.photographed import imported_presses
 
@@ -139,22 +150,13 @@ def test_the_prior_lies_among_the_known_brushes_and_admits_others() -> None:
     assert np.all(deviation >= 0.15)
 
 
-def test_a_family_can_be_left_out_and_none_is_of_the_loopback_rig() -> None:
-    assert not np.allclose(learned(("leaf",)).mean, learned().mean)
-    for unknown in ("no such family", "loopback rig"):
-        assert np.array_equal(learned((unknown,)).mean, learned().mean)
-
-
 def test_a_large_family_does_not_outweigh_a_small_one() -> None:
-    def brush(family: str, lam: float) -> KnownBrush:
+    def brush(lam: float) -> np.ndarray:
         values = published()
         values[0] = lam
-        return KnownBrush(name=f"{family} {lam}", family=family, values=tuple(values))
+        return values
 
-    prior = of_brushes([*[brush("large", 1.0)] * 16, brush("small", 2.0)])
-    assert prior.values[0] == pytest.approx(1.2)
-    with pytest.raises(ValueError, match="at least two"):
-        of_brushes([brush("only", 1.0)])
+    assert Prior.of_brushes([*[("large", brush(1.0))] * 16, ("small", brush(2.0))]).values[0] == pytest.approx(1.2)
 
 
 def test_strokes_that_repeat_are_followed_and_strokes_that_do_not_are_smoothed() -> None:
