@@ -218,7 +218,7 @@ class CompareLoopRequest:
 class PlanRequest:
     """Plan characters: depth from the width of each stroke, heading along it, then refined until the image matches."""
 
-    what: Annotated[str, Argument(help="Characters (字 子 永 are shipped), or a .csv trajectory.")]
+    what: Annotated[str, Argument(help="Characters; 字 子 永 are shipped.")]
     out: Annotated[Path, Option(help="Folder for protocol-write.toml and plan.png.")] = Path("write-plan")
     data: CharacterData = None
     radius_mm: Annotated[float, Option(min=0.5, max=50, help="Radius R of the brush.")] = 6.0

@@ -22,7 +22,7 @@ from brushloop.calibrate.files import Written
 from brushloop.calibrate.report import BLUE, picture_grid, save_picture, write_files
 from brushloop.calibrate.session import OpenSession
 from brushloop.model.ccdbsm import Brush, DomainError
-from brushloop.model.characters.glyph import CHARACTERS, parse_csv, parse_glyph, paths_of, reference, swept
+from brushloop.model.characters.glyph import CHARACTERS, parse_glyph, paths_of, reference
 from brushloop.model.characters.plan import Patch, Reach, StrokePath, covered, drawn, first_lead, lead
 from brushloop.model.drag import NAMES, Floats, Footprint
 from brushloop.model.similarity import csim, ssim
@@ -122,7 +122,7 @@ class Round(Frozen):
 
 
 class Figure(Frozen):
-    """What is written on one patch: a character or a drawing, as it is wanted, and as it is planned."""
+    """What is written on one patch: a character or practice strokes, as it is wanted, and as it is planned."""
 
     name: Annotated[str, Field(min_length=1, max_length=60)]
     source: str
@@ -235,7 +235,7 @@ def as_medians(paths: Sequence[StrokePath]) -> Medians:
 
 
 def plan(request: PlanRequest, _progress: Progress = unseen) -> Written:
-    """Plan each character of a text, or a trajectory file, and write protocol, plan and picture.
+    """Plan each character of a text, and write protocol, plan and picture.
 
     Raises `CalibrationError` that names option, or file and field.
     """
@@ -306,27 +306,15 @@ def planned_figure(
 
 def read_wanted(what: str, data: Path | None, patch: Patch) -> list[Figure]:
     """Read the figures to write. Raises `CalibrationError` that names file and field."""
-    if what.lower().endswith(".csv") and len(what) > len(".csv"):
-        figures = [_drawn_by_hand(Path(what), patch)]
-    elif not 1 <= len(what) <= MAX_FIGURES or not what.isprintable() or any(c.isspace() for c in what):
-        raise CalibrationError("character", f"expected 1 to {MAX_FIGURES} characters, or a .csv trajectory")
-    elif len(set(what)) != len(what):
+    if not 1 <= len(what) <= MAX_FIGURES or not what.isprintable() or any(c.isspace() for c in what):
+        raise CalibrationError("character", f"expected 1 to {MAX_FIGURES} characters")
+    if len(set(what)) != len(what):
         raise CalibrationError("character", "the same character twice: the protocol's `repeats` writes it again")
-    else:
-        figures = [_character(name, data, patch) for name in what]
+    figures = [_character(name, data, patch) for name in what]
     for figure in figures:
         if not figure.wanted.any():
             raise CalibrationError(figure.name, "has no width anywhere: nothing would be written")
     return figures
-
-
-def _drawn_by_hand(path: Path, patch: Patch) -> Figure:
-    try:
-        paths = parse_csv(read_bounded(path).decode(), patch, STEP_MM)
-    except ValueError as error:
-        raise CalibrationError(str(path), str(error)) from None
-    name = "".join(c if c.isalnum() or c in "-_" else "-" for c in path.stem)[:50].strip("-") or "figure"
-    return Figure(name=name, source=path.name, medians=as_medians(paths), wanted=swept(paths, patch.side_mm))
 
 
 def _character(name: str, data: Path | None, patch: Patch) -> Figure:

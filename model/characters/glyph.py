@@ -1,20 +1,13 @@
-"""What is written, and its image: a character of hanzi-writer, or a trajectory of the user's.
+"""What is written, and its image: a character of hanzi-writer.
 
 A character has an outline and a median for each stroke, in font units: 1024 per side, x to the right, y upward from
--124 at the bottom to 900 at the top. A trajectory is CSV with the columns `x_mm`, `y_mm`, `width_mm` (the width that
-the stroke should have there) and, for several strokes, `stroke` (a number that changes from one stroke to the next).
-Positions are relative to the patch's lower left corner. The data is not trusted: sizes are bounded, and an error is one
-line.
+-124 at the bottom to 900 at the top. The data is not trusted: sizes are bounded, and an error is one line.
 """
 
 from __future__ import annotations
 
-import csv
-import io
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from pathlib import Path
 from typing import Annotated
 
@@ -24,7 +17,7 @@ from fontTools.pens.recordingPen import RecordingPen
 from fontTools.svgLib.path import parse_path as follow_svg
 from pydantic import BaseModel, Field, ValidationError
 
-from brushloop.model.characters.plan import Floats, Image, Patch, StrokePath, grid, lengths_along, resampled
+from brushloop.model.characters.plan import Floats, Image, Patch, StrokePath, resampled
 from brushloop.model.outline import Outline, through
 from brushloop.model.raster import SIZE_PX, coverage
 
@@ -33,9 +26,6 @@ CHARACTERS = Path(__file__).parent / "data"
 MAX_GLYPH_CHARS = 256 * 1024
 MAX_SEGMENTS = 1024
 MAX_UNITS = 4096.0
-MAX_POINTS = 10_000
-MAX_WIDTH_MM = 100.0
-COLUMNS = ("x_mm", "y_mm", "width_mm")
 _CUBIC_PIECES = 8
 _Unit = Annotated[float, Field(ge=-MAX_UNITS, le=MAX_UNITS)]
 
@@ -154,47 +144,3 @@ def distance_to(loop: Floats, points: Floats) -> Floats:
     """The distance of (N, 2) points to a closed polyline (M, 2), (N,); 0 outside it."""
     contour = np.ascontiguousarray(loop, np.float32)
     return np.array([max(0.0, cv2.pointPolygonTest(contour, (x, y), True)) for x, y in points.tolist()])
-
-
-def parse_csv(text: str, patch: Patch, step_mm: float) -> list[StrokePath]:
-    """The paths of a trajectory; raises ValueError that names the line."""
-    rows = csv.DictReader(io.StringIO(text, newline=""), strict=True, skipinitialspace=True)
-    points: list[tuple[str, list[float]]] = []
-    try:
-        if missing := [name for name in COLUMNS if name not in (rows.fieldnames or [])]:
-            raise ValueError(f"has no column {missing[0]}")
-        for row in rows:
-            for name, most in zip(COLUMNS, (patch.side_mm, patch.side_mm, MAX_WIDTH_MM), strict=True):
-                if not 0.0 <= float(row[name] or "nan") <= most:
-                    raise ValueError(f"{name}: must be a number, 0 to {most:g} (given: {row[name]!r:.40})")
-            points.append((row.get("stroke") or "", [float(row[name]) for name in COLUMNS]))
-            if len(points) > MAX_POINTS:
-                raise ValueError(f"more than {MAX_POINTS} points")
-    except (csv.Error, ValueError) as error:
-        raise ValueError(f"line {rows.line_num}: {error}") from None
-    strokes = [np.array([point for _, point in stroke]) for _, stroke in groupby(points, key=lambda point: point[0])]
-    if not strokes:
-        raise ValueError("holds no stroke")
-    return [_path(stroke, number, step_mm) for number, stroke in enumerate(strokes, 1)]
-
-
-def _path(stroke: Floats, number: int, step_mm: float) -> StrokePath:
-    along = lengths_along(stroke[:, :2])
-    if along[-1] < 2 * step_mm:
-        raise ValueError(f"stroke {number}: is {along[-1]:.3g} mm long, expected at least {2 * step_mm:g} mm")
-    even = resampled(stroke[:, :2], step_mm)
-    at = np.linspace(0, along[-1], len(even))
-    return StrokePath(even, 0.5 * np.interp(at, along, stroke[:, 2]))
-
-
-def swept(paths: Sequence[StrokePath], side_mm: float, size_px: int = SIZE_PX) -> Image:
-    """The image of discs along paths: the intended look of a user's trajectory with widths."""
-    x, y = np.meshgrid(*grid(side_mm, size_px))
-    image = np.zeros((size_px, size_px))
-    for path in paths:
-        along = lengths_along(path.points)
-        at = np.linspace(0, along[-1], max(2, math.ceil(along[-1] / (0.25 * side_mm / size_px))))
-        for cx, cy, r in zip(*(np.interp(at, along, v) for v in (*path.points.T, path.half_width_mm)), strict=True):
-            edge = (r - np.hypot(x - cx, y - cy)) * size_px / side_mm
-            image = np.maximum(image, np.clip(0.5 + edge, 0, 1))
-    return image.astype(np.float32)

@@ -45,7 +45,6 @@ from brushloop.calibrate.writing.learn import FIGURES, MARGIN, fitted, learned, 
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.kinds import WriteConfig
 from brushloop.model.ccdbsm import Brush
-from brushloop.model.characters.glyph import swept
 from brushloop.model.characters.plan import (
     Patch,
     Reach,
@@ -101,21 +100,16 @@ def test_a_data_set_is_a_folder_with_a_file_for_each_character(tmp_path: Path) -
     [figure] = read_wanted("一", tmp_path, PATCH)
     assert len(figure.paths) == 1
     assert figure.wanted.max() == 1.0
+    protocol = load_protocol(writing.plan(PlanRequest("一", tmp_path / "out", data=tmp_path, steps=4)).path)
+    assert isinstance(protocol, WriteConfig)
+    points = protocol.figures[0].strokes[0].points
+    _, _, depth_mm, tilt_deg, _ = points[len(points) // 2]
+    wide_mm = 2.0 * figure.paths[0].half_width_mm.max()
+    assert MODEL.profile(depth_mm, tilt_deg).width_mm[0] == pytest.approx(wide_mm, abs=0.5)
     for content, words in ((b"\xff\xfe", "'utf-8' codec can't decode"), (b"{}", "strokes: Field required")):
         (tmp_path / "一.json").write_bytes(content)
         with pytest.raises(CalibrationError, match=rf"一\.json: {words}"):
             read_wanted("一", tmp_path, PATCH)
-
-
-def test_a_trajectory_is_planned_with_the_widths_it_asks_for(tmp_path: Path) -> None:
-    rows = ["x_mm,y_mm,width_mm", "10,35,3", "60,35,3"]
-    (tmp_path / "my line.csv").write_text("\n".join(rows))
-    protocol = load_protocol(writing.plan(PlanRequest(str(tmp_path / "my line.csv"), tmp_path / "out", steps=4)).path)
-    assert isinstance(protocol, WriteConfig)
-    assert protocol.figures[0].name == "my-line"
-    points = protocol.figures[0].strokes[0].points
-    _, _, depth_mm, tilt_deg, _ = points[len(points) // 2]
-    assert MODEL.profile(depth_mm, tilt_deg).width_mm[0] == pytest.approx(3.0, abs=0.5)
 
 
 @pytest.mark.parametrize(
@@ -124,7 +118,6 @@ def test_a_trajectory_is_planned_with_the_widths_it_asks_for(tmp_path: Path) -> 
         (("一",), "is not shipped (子 字 永)"),
         (("一", "--data", "nowhere"), "nowhere/一.json: no such file"),
         (("字字",), "the same character twice"),
-        (("no.csv",), "no.csv: no such file"),
         (("字", "--tilt-range", "0", "45"), "tilts end at 30 deg"),
         (("字", "--depth-range", "5", "5"), "depth_mm = (5, 5)"),
         (("字", "--depth-range", "1", "60"), "depth_mm = 60 is outside"),
@@ -214,7 +207,8 @@ def test_a_plan_keeps_its_images_and_its_points(tmp_path: Path) -> None:
 
 SIDE_MM = 48.0
 LINE = StrokePath(np.column_stack((np.linspace(12.0, 36.0, 9), np.full(9, 24.0))), np.full(9, 2.0))
-WANTED = swept([LINE], SIDE_MM)
+X_MM, Y_MM = np.meshgrid(*grid(SIDE_MM, 128))
+WANTED = (np.hypot(X_MM - np.clip(X_MM, 12.0, 36.0), Y_MM - 24.0) < 2.0).astype(np.float32)
 
 
 def brush_of(**changed: float) -> Footprint:

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brushloop.model.characters.glyph import parse_csv, parse_glyph, parse_path, paths_of, reference
+from brushloop.model.characters.glyph import parse_glyph, parse_path, paths_of, reference
 from brushloop.model.characters.plan import Patch
 
 SQUARE = "M 100 100 L 100 300 L 300 300 L 300 100 Z"
@@ -90,28 +90,3 @@ def test_any_path_is_arcs_or_an_error(path: str) -> None:
     except ValueError:
         return
     assert np.isfinite(arcs).all()
-
-
-def test_a_hand_gives_paths_and_widths() -> None:
-    text = "stroke,x_mm,y_mm,width_mm\n1,10,10,2\n1,30,10,4\n2,10,30,3\n2,10,50,3\n"
-    first, second = parse_csv(text, Patch(), 2.0)
-    assert first.points[[0, -1]].tolist() == [[10.0, 10.0], [30.0, 10.0]]
-    assert first.half_width_mm[[0, -1]].tolist() == [1.0, 2.0]
-    assert second.points[[0, -1]].tolist() == [[10.0, 30.0], [10.0, 50.0]]
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("x_mm,y_mm\n1,2\n", "has no column width_mm"),
-        ("x_mm,y_mm,width_mm\n1,2\n", "line 2: width_mm: must be a number"),
-        ("x_mm,y_mm,width_mm\n1,900,3\n", "line 2: y_mm: must be a number, 0 to 70"),
-        ("x_mm,y_mm,width_mm\n1,x,3\n", "line 2: could not convert"),
-        ("x_mm,y_mm,width_mm\n", "holds no stroke"),
-        ("x_mm,y_mm,width_mm\n1,1,3\n2,1,3\n", "stroke 1: is 1 mm long"),
-        ('x_mm,y_mm,width_mm\n"1,1,3\n', "unexpected end of data"),
-    ],
-)
-def test_a_bad_hand_is_one_line(text: str, words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        parse_csv(text, Patch(), 2.0)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from brushloop.model.ccdbsm import Brush
-from brushloop.model.characters.glyph import parse_glyph, paths_of, reference, swept
+from brushloop.model.characters.glyph import parse_glyph, paths_of, reference
 from brushloop.model.characters.plan import (
     Patch,
     Phase,
@@ -143,7 +143,10 @@ def hook() -> StrokePath:
 
 def test_leading_the_brush_puts_the_ink_on_the_corner() -> None:
     path, brush, reach = hook(), Footprint(), Reach()
-    wanted = swept([path], SIDE_MM, SIZE_PX)
+    x, y = (each[..., None] for each in np.meshgrid(*grid(SIDE_MM, SIZE_PX)))
+    along = np.linspace(0.0, len(path.points) - 1.0, 200)
+    discs = (np.interp(along, np.arange(len(path.points)), each) for each in (*path.points.T, path.half_width_mm))
+    wanted = np.any(np.hypot(x - next(discs), y - next(discs)) < next(discs), axis=-1).astype(np.float32)
 
     def wrong(strokes: list[np.ndarray]) -> int:
         seen = covered(drawn([brush] * len(strokes), strokes, SIDE_MM, SIZE_PX), SIDE_MM)
