@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.harness import ROOT, BenchError, brushloop, started
-from brushloop.calibrate.stats import spread_out
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
+from brushloop.model.presses import spread_out
 from brushloop.sessions.imports import ImportOptions, import_photographs
 
 DEPTHS_MM, TILTS_DEG = (11.0, 13.0, 15.0, 17.0, 20.0), (0.0, 5.0, 10.0)

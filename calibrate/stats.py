@@ -1,4 +1,4 @@
-"""Statistics: summaries with intervals, paired tests, the ceiling, the order of a design, and odd waits.
+"""Statistics: summaries with intervals, paired tests, the ceiling, and odd waits.
 
 Equal scores give equal numbers.
 
@@ -14,7 +14,6 @@ presses has strays of its own.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
@@ -22,7 +21,6 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.model.presses import DepthTilt
 from brushloop.sessions.events import CaptureResult
 from brushloop.sessions.journal import RunState
 
@@ -193,32 +191,6 @@ def holm(p_values: Sequence[float]) -> list[float]:
     order, left = np.argsort(p), len(p) - np.arange(len(p))
     p[order] = np.maximum.accumulate(np.minimum(1.0, left * p[order]))
     return p.tolist()
-
-
-def farthest_first(places: Floats, first: int, count: int) -> list[int]:
-    """Rows of (n, d) `places`, from the row `first`, each as far as possible from those before; `count` is at most n.
-
-    A maximin design that can stop anywhere, after R. Kennard and L. Stone, "Computer aided design of experiments"
-    (1969). Of equally distant rows the upper one comes first.
-    """
-    order, nearest = [first], np.full(len(places), np.inf)
-    while len(order) < count:
-        nearest = np.minimum(nearest, np.linalg.norm(places - places[order[-1]], axis=1))
-        nearest[order] = -1.0
-        order.append(int(np.round(nearest, 9).argmax()))
-    return order
-
-
-def spread_out(depths_mm: Sequence[float], tilts_deg: Sequence[float]) -> list[DepthTilt]:
-    """Every condition once, each as far as possible from those before it: the first few describe any brush well.
-
-    Both axes are scaled to the range of the grid. The first condition is the shallowest at the least tilt.
-    """
-    conditions = list(itertools.product(depths_mm, tilts_deg))
-    places = np.array(conditions)
-    range_of = np.ptp(places, axis=0)
-    places = (places - places.min(axis=0)) / np.where(range_of > 0.0, range_of, 1.0)
-    return [conditions[k] for k in farthest_first(places, conditions.index(min(conditions)), len(conditions))]
 
 
 def waits_of(state: RunState) -> dict[int, float]:

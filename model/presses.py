@@ -1,11 +1,14 @@
 """Presses of one brush as images around the point of touch: their sizes, and the Bezier stroke regressed on them.
 
+At the end stands the order in which conditions are pressed.
+
 The sizes are measured in the ink and no stroke model takes part, so what they mean does not depend on the family of the
 brush.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -154,3 +157,29 @@ def image_of(mark: Outline, grid: Grid) -> Floats:
     bottom_mm = grid.y_mm[:, None] - 0.5 * grid.px_mm
     inside = np.clip(above - bottom_mm, 0.0, grid.px_mm) - np.clip(below - bottom_mm, 0.0, grid.px_mm)
     return inside.reshape(len(grid.y_mm), -1, FINE).mean(axis=2) / grid.px_mm
+
+
+def farthest_first(places: Floats, first: int, count: int) -> list[int]:
+    """Rows of (n, d) `places`, from the row `first`, each as far as possible from those before; `count` is at most n.
+
+    A maximin design that can stop anywhere, after R. Kennard and L. Stone, "Computer aided design of experiments"
+    (1969). Of equally distant rows the upper one comes first.
+    """
+    order, nearest = [first], np.full(len(places), np.inf)
+    while len(order) < count:
+        nearest = np.minimum(nearest, np.linalg.norm(places - places[order[-1]], axis=1))
+        nearest[order] = -1.0
+        order.append(int(np.round(nearest, 9).argmax()))
+    return order
+
+
+def spread_out(depths_mm: Sequence[float], tilts_deg: Sequence[float]) -> list[DepthTilt]:
+    """Every condition once, each as far as possible from those before it: the first few describe any brush well.
+
+    Both axes are scaled to the range of the grid. The first condition is the shallowest at the least tilt.
+    """
+    conditions = list(itertools.product(depths_mm, tilts_deg))
+    places = np.array(conditions)
+    range_of = np.ptp(places, axis=0)
+    places = (places - places.min(axis=0)) / np.where(range_of > 0.0, range_of, 1.0)
+    return [conditions[k] for k in farthest_first(places, conditions.index(min(conditions)), len(conditions))]

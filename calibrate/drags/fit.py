@@ -25,8 +25,8 @@ from pydantic import Field, model_validator
 from brushloop.calibrate.artefact import FittedValue, Frozen, SessionFit
 from brushloop.calibrate.drags import COMMANDS, MM_PER_PX, Drags, commanded_path
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.stats import farthest_first
 from brushloop.model.drag import DragModel, Drawings, Floats, Indices, Trails, derivatives, fit_to_ink, lagging
+from brushloop.model.presses import farthest_first
 from brushloop.model.similarity import binary_scores
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.messages import decode_gray

@@ -15,7 +15,6 @@ from typing import Annotated, ClassVar, Literal, Self, TypeVar, cast
 
 from pydantic import AfterValidator, AliasChoices, BaseModel, ConfigDict, Field, ValidationInfo, model_validator
 
-from brushloop.calibrate.stats import spread_out
 from brushloop.collect.protocols.steps import (
     BoardStep,
     Drawn,
@@ -31,6 +30,7 @@ from brushloop.collect.protocols.steps import (
     takes,
 )
 from brushloop.collect.rig.config_file import Config
+from brushloop.model.presses import spread_out
 from brushloop.sessions.records import Condition
 
 MAX_STROKES = 10_000

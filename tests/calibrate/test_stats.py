@@ -10,7 +10,6 @@ import pytest
 
 from brushloop.calibrate.stats import (
     ceiling_values,
-    farthest_first,
     holm,
     interval_over_groups,
     is_near,
@@ -19,6 +18,7 @@ from brushloop.calibrate.stats import (
     paired,
     summarise,
 )
+from brushloop.model.presses import farthest_first
 from brushloop.model.similarity import binary_scores
 
 CONDITIONS = 6
