@@ -55,15 +55,12 @@ class Artefact(Frozen):
         Raises `InputError` if there is none, and `CalibrationError` for any other file or version, or an edited one.
         """
         data = read_bounded(path)
-        if not NAME.fullmatch(path.name.encode()):
-            what = f"is not a result of brushloop, whose name is {HASH_CHARS} hexadecimal digits and .json"
-            raise CalibrationError(str(path), what)
         try:
             artefact = cls.model_validate_json(data)
         except ValidationError as error:
             raise invalid(str(path), error) from None
         if hashlib.sha256(data).hexdigest()[:HASH_CHARS] != path.stem:
-            raise CalibrationError(str(path), "was edited: its name is not the hash of its contents")
+            raise CalibrationError(str(path), "was edited or renamed: its name is not the hash of its contents")
         return artefact
 
     def save(self, folder: Path) -> Path:
