@@ -16,7 +16,6 @@ from pathlib import Path
 from statistics import fmean
 
 import numpy as np
-from filelock import FileLock, Timeout
 from rich.table import Table
 
 from brushloop.calibrate.artefact import FITS, current
@@ -43,7 +42,6 @@ from brushloop.sessions.records import Source
 from brushloop.sessions.terminal import Progress, unseen
 
 FOLDER = "validation"
-LOCK = ".lock"
 LOOP, WRITTEN = "loop", "written"
 """Folders of a session, where its loop and its characters are looked for; `written` also beside all sessions."""
 MAX_PICTURE_BYTES = 16 * 1024 * 1024
@@ -56,29 +54,28 @@ Strokes = dict[tuple[str, ...], float]
 
 @dataclass(frozen=True, slots=True)
 class ValidationOutput:
-    """Written output: one report of presses, or one for each session of drags."""
+    """Written output: a report of presses, or of one session of drags."""
 
     folder: Path
     report: Report | None = None
-    drags: tuple[DragValidation, ...] = ()
+    drags: DragValidation | None = None
     notes: tuple[str, ...] = ()
     """What was found beside the sessions and left out, and why."""
     gates: tuple[str, ...] = ()
 
     @property
     def page(self) -> Path:
-        """The report; of several sessions of drags, the first one."""
-        several = f"{self.drags[0].header.session_id}/" if len(self.drags) > 1 else ""
-        return self.folder / f"{several}report.html"
+        """The report's page."""
+        return self.folder / "report.html"
 
     def lines(self) -> Iterator[object]:
         """What the command prints: lines and tables."""
-        for drags in self.drags:
-            yield from drag_summary(drags)
+        if self.drags is not None:
+            yield from drag_summary(self.drags)
         if self.report is not None:
             yield from terminal_lines(self.report)
         yield from self.notes
-        yield f"Report: {self.folder / 'report.html'}"
+        yield f"Report: {self.page}"
 
     def check(self) -> None:
         """Check the gates, once the report is written. Raises `GateMissed` if any is missed."""
@@ -121,19 +118,17 @@ def validate(
     if len(kinds) > 1:
         raise CalibrationError(str(sessions[-1].recording.path), "mixes presses and drags: validate them separately")
     if kinds == {"drag"}:
-        return _drags(request, sessions, folder, progress)
+        if len(sessions) > 1:
+            raise CalibrationError(str(sessions[1].recording.path), "holds drags: validate one such session at a time")
+        drags = validate_drags(sessions[0].recording.path, request.fit, progress)
+        write_drags(drags, folder, request.command)
+        return ValidationOutput(folder, drags=drags, gates=request.gates)
     beside = find_beside(sessions)
     folder.mkdir(parents=True, exist_ok=True)
-    try:
-        with (
-            FileLock(folder / LOCK, timeout=0),
-            cluster(request.scheduler) if request.scheduler else threads(request.workers) as scheduler,
-        ):
-            outcome = validate_presses(sessions, request, scheduler, progress)
-            report = _write(outcome, folder, curves, beside)
-            return ValidationOutput(folder, report, notes=tuple(beside.notes), gates=request.gates)
-    except Timeout:
-        raise CalibrationError(str(folder), "another validation is writing there") from None
+    with cluster(request.scheduler) if request.scheduler else threads(request.workers) as scheduler:
+        outcome = validate_presses(sessions, request, scheduler, progress)
+        report = _write(outcome, folder, curves, beside)
+    return ValidationOutput(folder, report, notes=tuple(beside.notes), gates=request.gates)
 
 
 def open_session(place: Path | Recording, fit: Path | None = None) -> FittedSession:
@@ -214,18 +209,6 @@ def _write(outcome: Outcome, folder: Path, curves: Sequence[Curve], beside: Besi
     files["report.html"] = page_of(outcome, report, curves, names, beside.figures_13)
     write_files(folder, files)
     return report
-
-
-def _drags(
-    request: ValidateRequest, sessions: Sequence[FittedSession], folder: Path, progress: Progress
-) -> ValidationOutput:
-    validated: list[DragValidation] = []
-    for session in sessions:
-        validation = validate_drags(session.recording.path, request.fit, progress)
-        target = folder / session.header.session_id if len(sessions) > 1 else folder
-        write_drags(validation, target, request.command)
-        validated.append(validation)
-    return ValidationOutput(folder, drags=tuple(validated), gates=request.gates)
 
 
 def _folder(request: ValidateRequest) -> Path:
@@ -316,18 +299,12 @@ def compare(request: DiffRequest, _progress: Progress = unseen) -> Difference:
 
 
 def report_path(place: Path) -> Path:
-    """Find report.json: the file given, or the one in a report's or session's folder, or next to a recording.
+    """Find report.json: the file given, or the one in a report's or session's folder.
 
     If there is none, raises `CalibrationError` that names the command to run.
     """
-    if not place.exists():
-        raise CalibrationError(str(place), "does not exist: give a report.json, or a session that was validated")
-    if place.is_file() and place.suffix == ".json":
-        return place
-    # Search only a recording's own folder: a report next to a session's folder may be about several sessions.
-    folder = place.parent if place.is_file() else place
-    for path in (folder / Report.FILE, folder / FOLDER / Report.FILE):
-        if path.is_file():
+    for path in (place, place / Report.FILE, place / FOLDER / Report.FILE):
+        if path.is_file() and path.suffix == ".json":
             return path
     why = f"was not validated: run `brushloop validate {shlex.quote(str(place))}` first, or give a report.json"
     raise CalibrationError(str(place), why)

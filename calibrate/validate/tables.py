@@ -60,8 +60,6 @@ PACKAGES = ("brushloop", "numpy", "opencv-python-headless", "scikit-image", "num
 STRICT: Key = (Alignment.MM, Tone.BINARY)
 NORMAL: Key = (Alignment.SIZE_NORMALISED, Tone.BINARY)
 """The comparison where size and place count, and that of the paper."""
-MAX_CONDITIONS = 60
-"""Most conditions that have statistics of their own."""
 MISSING = {
     "ccd-bsmg": "not in this run: give a trained one with --generator",
     ROBOT_WRITING: "not in this run: “brushloop repress SESSION” presses recovered strokes again; then validate again",
@@ -136,7 +134,7 @@ class Report(Sealed):
     shown: str
     """Model shown in the pictures: the best calibrated one on held-out conditions, if there is one."""
     stats: tuple[Stat, ...]
-    """Over all conditions, and in each unless there are too many different (H, alpha) for a table."""
+    """Over all conditions, and in each."""
     refused: tuple[Refused, ...]
     by_strokes: tuple[Step, ...]
     """Similarity against number of strokes; empty without --ablations."""
@@ -194,15 +192,14 @@ def report_of(
 
 
 def _stats(scores: Scores) -> Iterator[Stat]:
-    """Yield the statistics of all conditions together, then of single conditions unless there are too many."""
+    """Yield the statistics of all conditions together, then of each."""
     another = 100.0 * scores.of(ANOTHER)
     ceiling: Floats = np.apply_along_axis(ceiling_values, 0, another, scores.group_of)
     percent = {model: 100.0 * scores.of(model) for model in scores.models} | {CEILING: ceiling}
     presses = {kind.name for kind in KINDS_OF_PRESS}
     for model, values in percent.items():
         yield from statistics(model, values, scores.group_of, None, None if model in presses else ceiling)
-    conditions = scores.conditions()
-    for condition, at in conditions.items() if len(conditions) <= MAX_CONDITIONS else ():
+    for condition, at in scores.conditions().items():
         for model, values in percent.items():
             yield from statistics(model, values[at], scores.group_of[at], (condition.depth_mm, condition.tilt_deg))
 
