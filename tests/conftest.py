@@ -41,7 +41,7 @@ TOLERATED = ("asyncio_", "pytest_timeout", "ThreadPoolExecutor")
 FIRST = (
     "tests/test_demo.py",
     "tests/collect/tui/test_session.py",
-    "tests/collect/photograph/test_recognised.py",
+    "tests/collect/photograph/test_checks.py",
     "tests/calibrate/fit",
     "tests/model/test_generator.py",
     "tests/collect/commission/test_first_day.py",

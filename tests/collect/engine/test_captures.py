@@ -32,7 +32,7 @@ from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Condition, Topic
 from tests.calibrate.given import kept_lens
 from tests.rigs import Lab
-from tests.runs import answer, answered_alike, ended_by, until, wait_for_end
+from tests.runs import answered_alike, ended_by, until
 
 
 def test_a_split_stroke_is_pressed_again_on_a_new_patch_and_only_the_sound_one_counts(sharp_lab: Lab) -> None:
@@ -83,17 +83,6 @@ def test_ink_on_a_patch_that_should_be_blank_is_seen_before_the_brush_is_dipped(
     assert world.well.ml == ink_ml
 
 
-def test_a_full_sheet_is_changed_on_the_screen_and_the_run_goes_on(sharp_lab: Lab) -> None:
-    sharp_lab.edit_rig("cell_mm = [40.0, 24.0]", "cell_mm = [100.0, 60.0]")
-    sharp_lab.write_protocol("[13.0, 15.0]", "[0.0]")
-    engine = sharp_lab.started(on_screen=True)
-    until(engine, lambda now: now.prompt is not None)
-    sharp_lab.rig.world.fresh_sheet()
-    answer(engine, "Sheet 1 is full", "g")
-    wait_for_end(engine)
-    assert engine.snapshot().strokes_done == 2
-
-
 FIGURE = """kind = "write"
 cell_mm = [50.0, 36.0]
 [[figures]]
@@ -106,10 +95,10 @@ points = [[12.0, 26.0, 1.0, 0.0, 0.0], [37.0, 26.0, 1.0, 0.0, 0.0]]
 """
 
 
-def test_the_peak_force_of_a_figure_is_that_of_its_deepest_stroke(sharp_lab: Lab) -> None:
-    (sharp_lab.folder / "protocol.toml").write_text(FIGURE + SHALLOW, encoding="utf-8")
-    sharp_lab.run()
-    [drawn] = sharp_lab.state.results(PressResult)
+def test_the_peak_force_of_a_figure_is_that_of_its_deepest_stroke(lab: Lab) -> None:
+    (lab.folder / "protocol.toml").write_text(FIGURE + SHALLOW, encoding="utf-8")
+    lab.run()
+    [drawn] = lab.state.results(PressResult)
     assert (drawn.peak_force_n or 0.0) > 0.02, "the shallow stroke comes last and reaches 0.007 N"
     assert drawn.depths_mm == pytest.approx((5.0, 1.0), abs=0.1)
 

@@ -19,7 +19,7 @@ from brushloop.sessions.recording import Recording
 from brushloop.sessions.store import SessionStore
 from tests.collect.conftest import Collected
 from tests.rigs import SMALL_VIEW, Lab
-from tests.runs import answered_alike, ended_by, question, until, wait_for_end
+from tests.runs import answer, answered_alike, ended_by, question, until, wait_for_end
 
 ELSEWHERE = replace(SMALL_VIEW, centre_mm=(SMALL_VIEW.centre_mm[0] + 3.0, SMALL_VIEW.centre_mm[1]))
 
@@ -78,23 +78,26 @@ def test_stop_before_anything_has_moved(lab: Lab) -> None:
 
 
 def test_a_full_sheet_asks_for_a_fresh_one_and_goes_on_with_it(lab: Lab) -> None:
-    lab.edit_rig("cell_mm = [40.0, 24.0]", "cell_mm = [120.0, 80.0]")
-    lab.write_protocol("[11.0, 13.0, 15.0]", "[0.0, 10.0]")  # 6 presses, 4 patches
+    lab.edit_rig("cell_mm = [40.0, 24.0]", "cell_mm = [120.0, 150.0]")
+    lab.write_protocol("[11.0, 12.0, 13.0, 14.0, 15.0]")  # 5 presses, 2 patches
     with pytest.raises(SheetFull, match="--sheet 2"):
         lab.run()
     assert [*lab.state.files.values()][-1].kind == "capture", "no brush was dipped for a sheet that was full"
     assert not [begin.kind for begin, _ in lab.state.cut if begin.kind == "dip"]
     engine = lab.started(sheet=2)
-    until(engine, lambda now: now.strokes_done == 5)
+    until(engine, lambda now: now.strokes_done == 3)
     engine.stop()
     ended_by(engine, CollectAborted)
     with pytest.raises(ConfigError, match="only 2 or 3"):
         lab.run(sheet=5)
-    lab.run(sheet=2)  # the same command again: the sheet is not changed twice
-    assert sum(1 for _ in Recording(lab.session).captures()) == 6
+    engine = lab.started(sheet=2, on_screen=True)  # the same command again: the sheet is not changed twice
+    answer(engine, "Resume", "g")
+    answer(engine, "Sheet 2 is full", "g")
+    wait_for_end(engine)
+    assert sum(1 for _ in Recording(lab.session).captures()) == 5
     presses = sum(lab.state.attempts[step.key] for step in lab.state.files.values() if step.kind == "press")
     assert len(lab.state.used_patches) == presses, "no patch is used twice"
-    assert {sheet for sheet, _ in lab.state.used_patches} == {0, 1}
+    assert {sheet for sheet, _ in lab.state.used_patches} == {0, 1, 2}
 
 
 def test_real_hardware_is_not_moved_unless_armed_or_allowed_on_the_screen(
