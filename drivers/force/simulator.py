@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.force.sri_m8123 import BUS_OFF, COMMAND_ID, LOOPBACK_CHANNEL, START, STOP, Wrench, encode_round
+from brushloop.drivers.host import alongside
 from brushloop.drivers.loopback import BACKLOG_BYTES, LoopbackServer
 
 BUS_ERROR = 0x04
@@ -79,61 +80,47 @@ FRAME_S = 0.0002
 
 
 class SocketcandServer(LoopbackServer):
-    """One board on one bus, for any number of clients."""
+    """One board on one bus. Each client gets rounds of its own."""
 
     def __init__(self, board: ForceBoard, *, rate_hz: float) -> None:
         super().__init__()
         self.board = board
         self._period_s = 1.0 / rate_hz
-        self._listeners: set[asyncio.StreamWriter] = set()
-        self._streaming: asyncio.Task[None] | None = None
-
-    async def stop(self) -> None:
-        """Close the listener and every client, and end the stream."""
-        await super().stop()
-        if self._streaming is not None:
-            self._streaming.cancel()
-            await asyncio.gather(self._streaming, return_exceptions=True)
-            self._streaming = None
 
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Greet the client, then relay frames both ways until it disconnects."""
+        """Open the bus for the client, then relay its frames and the board's until it disconnects."""
         writer.write(b"< hi >")
         try:
-            while True:
-                command = await reader.readuntil(b">")
-                match command.decode("ascii").strip(" \r\n<>").split(" "):
-                    case ["open", name]:
-                        writer.write(b"< ok >" if name == LOOPBACK_CHANNEL else b"< error could not open bus >")
-                    case ["rawmode"]:
-                        writer.write(b"< ok >")
-                        self._listeners.add(writer)
-                    case ["send", can_id, _, *data]:
-                        self.board.obey(CanFrame(int(can_id, 16), bytes(int(byte, 16) for byte in data)))
-                        if self._streaming is None or self._streaming.done():
-                            self._streaming = asyncio.create_task(self._stream(), name="force rounds")
-                    case _:
-                        writer.write(b"< error unknown command >")
-                await writer.drain()
+            while (words := await _command(reader)) != ["rawmode"]:
+                writer.write(b"< ok >" if words == ["open", LOOPBACK_CHANNEL] else b"< error could not open bus >")
+            writer.write(b"< ok >")
+            async with alongside(self._send_rounds(writer), "force rounds"):
+                while True:
+                    match await _command(reader):
+                        case ["send", can_id, _, *data]:
+                            self.board.obey(CanFrame(int(can_id, 16), bytes(int(byte, 16) for byte in data)))
+                        case _:
+                            writer.write(b"< error unknown command >")
         except ValueError as error:
             raise ProtocolViolation("socketcand", "read", f"not a command: {error}") from None
-        finally:
-            self._listeners.discard(writer)
 
-    async def _stream(self) -> None:
+    async def _send_rounds(self, writer: asyncio.StreamWriter) -> None:
         loop = asyncio.get_running_loop()
         due_s = loop.time()
-        while self.board.streaming and self._listeners:
+        while not writer.is_closing():
             # Real time, like that of an adapter's clock, whatever the rate of simulated time. It is read once: a board
             # sends its frames in one burst, however busy the computer is.
             at_s = time.time()
-            frames = self.board.round()
-            text = "".join(_ascii(frame, at_s + place * FRAME_S) for place, frame in enumerate(frames)).encode()
-            for writer in self._listeners:
-                if not writer.is_closing() and writer.transport.get_write_buffer_size() < BACKLOG_BYTES:
-                    writer.write(text)
+            text = "".join(_ascii(frame, at_s + place * FRAME_S) for place, frame in enumerate(self.board.round()))
+            if writer.transport.get_write_buffer_size() < BACKLOG_BYTES:
+                writer.write(text.encode())
             due_s = max(due_s + self._period_s, loop.time())
             await asyncio.sleep(due_s - loop.time())
+
+
+async def _command(reader: asyncio.StreamReader) -> list[str]:
+    """The words of the next command. Raises ValueError for bytes that are no text."""
+    return (await reader.readuntil(b">")).decode("ascii").strip(" \r\n<>").split(" ")
 
 
 def _ascii(frame: CanFrame, at_s: float) -> str:
