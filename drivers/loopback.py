@@ -14,7 +14,6 @@ import signal
 import socket
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass
@@ -74,25 +73,19 @@ def start(config: Path, log: Path, *options: str, detached: bool = False) -> Loo
 
 
 @contextlib.contextmanager
-def simulate(
-    folder: Path | None = None, *, rate: float = RATE, seed: int = 1, brush: str = "loopback"
-) -> Generator[LoopbackRig]:
+def simulate(folder: Path, *, rate: float = RATE, brush: str = "loopback") -> Generator[LoopbackRig]:
     """Serve a loopback rig until the end of the block, `rate` simulated seconds in a real one.
 
-    Its files are kept in `folder`; without one they go with the block. `brush` as for `brushloop sim`. Raises
-    `RigDidNotStart`.
+    Its files are kept in `folder`. `brush` as for `brushloop sim`. Raises `RigDidNotStart`.
     """
-    with tempfile.TemporaryDirectory(prefix="brushloop-rig-") as own:
-        place = (folder or Path(own)).resolve()
-        place.mkdir(parents=True, exist_ok=True)
-        config = place / "rig.toml"
-        config.unlink(missing_ok=True)  # that of an earlier rig, which no longer serves
-        options = ("--rate", str(rate), "--seed", str(seed), "--brush", brush)
-        rig = start(config, place / "rig.log", *options)
-        try:
-            yield rig
-        finally:
-            rig.end()
+    folder.mkdir(parents=True, exist_ok=True)
+    config = folder.resolve() / "rig.toml"
+    config.unlink(missing_ok=True)  # that of an earlier rig, which no longer serves
+    rig = start(config, folder / "rig.log", "--rate", str(rate), "--brush", brush)
+    try:
+        yield rig
+    finally:
+        rig.end()
 
 
 ANSWER_S = 120.0
