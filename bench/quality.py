@@ -140,7 +140,7 @@ class Bench:
         match label:
             case Failure.BLANK:
                 pressed = rng.random() < 0.5
-                flaw = Flaw.BLANK
+                load = 0.0
             case Failure.MISPLACED:
                 away_mm = rng.uniform(3.0, 10.0) if rng.random() < 0.75 else rng.uniform(10.0, 40.0)
                 turn = rng.uniform(0.0, 2.0 * math.pi)

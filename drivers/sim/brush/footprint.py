@@ -59,8 +59,6 @@ class Flaw(StrEnum):
     """The last third of the bundle has a sideways set: the tip is bowed off the axis."""
     DRY = "dry"
     """Most hairs carry no ink: streaks."""
-    BLANK = "blank"
-    """No ink at all; severity makes no difference."""
     FAINT = "faint"
     """Thin ink: the whole outline, but pale."""
 
@@ -92,11 +90,7 @@ class Trouble:
 
     def flow(self, flow: Vector) -> Vector:
         """Ink flow (m,) per hair, given that of a flawless press."""
-        if self.flaw is Flaw.BLANK:
-            return np.zeros_like(flow)
-        if self.flaw is Flaw.DRY:
-            return flow * (self.thirst >= DRY_SHARE * self.severity)
-        return flow
+        return flow * (self.thirst >= DRY_SHARE * self.severity) if self.flaw is Flaw.DRY else flow
 
     def displace(
         self, x_mm: Vector, y_mm: Vector, across: Vector, to_tip_mm: Vector, squash_mm: Vector, half_width_mm: Vector

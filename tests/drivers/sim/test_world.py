@@ -42,7 +42,6 @@ FLAWED = {
     Flaw.SPLIT: 7618.547,
     Flaw.BENT: 7289.363,
     Flaw.DRY: 4110.589,
-    Flaw.BLANK: 0.0,
     Flaw.FAINT: 3394.469,
 }
 """Ink of a press of the default brush with each flaw."""
