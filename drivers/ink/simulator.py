@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import math
 import os
 import struct
 import tempfile
@@ -96,16 +95,10 @@ BRUSH_ML = 0.5
 class Well:
     """The ink well, a straight pot whose bottom is at height 0: dips lower its level, doses raise it."""
 
-    def __init__(self, ml: float, capacity_ml: float, ml_per_mm: float = 1.0) -> None:
-        self.ml = ml
-        self.capacity_ml = capacity_ml
+    def __init__(self, ml_per_mm: float = 1.0, level_mm: float = 10.0, depth_mm: float = 20.0) -> None:
+        self.ml = level_mm * ml_per_mm
+        self.capacity_ml = depth_mm * ml_per_mm
         self._ml_per_mm = ml_per_mm
-
-    @classmethod
-    def round(cls, radius_mm: float, level_mm: float, depth_mm: float) -> Well:
-        """A round pot that is `depth_mm` deep, filled to `level_mm`."""
-        ml_per_mm = math.pi * radius_mm**2 / 1e3
-        return cls(level_mm * ml_per_mm, depth_mm * ml_per_mm, ml_per_mm)
 
     @property
     def level_mm(self) -> float:
@@ -132,7 +125,7 @@ class StationFirmware:
     """The ink station's side of docs/ink-station.md, with a well, a reservoir and a light; its lid is always open."""
 
     def __init__(self, well: Well | None = None) -> None:
-        self.well = well or Well(10.0, capacity_ml=20.0)
+        self.well = well or Well()
         self.reservoir_ml = RESERVOIR_ML
         self.light = 0.0
         self._memory: tuple[bytes, bytes] = (b"", b"")
@@ -187,13 +180,15 @@ class StationFirmware:
 
 
 REQUEST_BYTES = 8
+PUMP_ML = 0.1
+"""Delivery of the pump, ml per revolution."""
 
 
 class PumpFirmware:
     """A simulated pump, unit 1 on its line."""
 
-    def __init__(self, well: Well | None = None, *, ml_per_revolution: float = 0.1) -> None:
-        self.well = well or Well(10.0, capacity_ml=20.0)
+    def __init__(self, well: Well | None = None, *, ml_per_revolution: float = PUMP_ML) -> None:
+        self.well = well or Well()
         self.rpm = 0.0
         self.starts = 0
         self.running = False

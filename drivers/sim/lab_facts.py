@@ -139,14 +139,14 @@ def held(place: Place, *, turn_deg: float = 0.0, tilt_deg: float = 0.0, toward_d
 
 def draw(seed: int, rate: float = 1.0, picture_px: tuple[int, int] = PICTURE_PX) -> Facts:
     """The lab of this seed: drawn again until the arm reaches everything and the camera sees the board."""
-    for attempt in itertools.count():
-        facts = _guess(np.random.default_rng([seed, 16, attempt]), seed, rate, picture_px)
-        if facts is None:
-            continue
+
+    def works(facts: Facts) -> bool:
         board = [facts.config.table.corner("board", name) for name in CORNERS]
-        if in_picture(facts.config, board, BOARD_MARGIN_PX) and reaches(facts.config, poses(facts)):
-            return facts
-    raise AssertionError("unreachable")
+        return in_picture(facts.config, board, BOARD_MARGIN_PX) and reaches(facts.config, poses(facts))
+
+    rngs = (np.random.default_rng([seed, 16, attempt]) for attempt in itertools.count())
+    guesses = (_guess(rng, seed, rate, picture_px) for rng in rngs)
+    return next(facts for facts in guesses if facts is not None and works(facts))
 
 
 def _guess(rng: np.random.Generator, seed: int, rate: float, picture_px: tuple[int, int]) -> Facts | None:

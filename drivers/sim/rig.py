@@ -14,7 +14,8 @@ from typing import Any, Self
 
 from brushloop.drivers.force.simulator import ForceBoard, SocketcandServer
 from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL
-from brushloop.drivers.ink.simulator import PtyLine, PumpFirmware, StationFirmware
+from brushloop.drivers.host import alongside
+from brushloop.drivers.ink.simulator import PUMP_ML, PtyLine, PumpFirmware, StationFirmware
 from brushloop.drivers.loopback import LoopbackServer, RigRefused
 from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.config import SimConfig
@@ -25,8 +26,6 @@ from brushloop.drivers.sim.world import World, push_on
 TEMPLATE = Path(__file__).with_name("rig.toml.j2")
 """Of the `rig.toml`, as an operator would have taught it."""
 LOOPBACK_HEAD = "# The loopback rig"
-PUMP_ML = 0.1
-"""Delivery of the loopback pump, ml per revolution."""
 PORTS = {"arcs": 30004, "rtde": 30010, "camera": 8080, "force": 29536}
 """Of a real rig, by what is served there."""
 HOST = "127.0.0.1"
@@ -65,16 +64,6 @@ class LoopbackRig:
         self.config = config
         self.host = host
         self.world = World(config)
-        self.force = None
-        if config.force_sensor:
-            noise_n, noise_nm = config.force_noise_n, config.force_noise_nm
-            board = ForceBoard(self.world.wrench, noise_n=noise_n, noise_nm=noise_nm, seed=config.seed)
-            self.force = SocketcandServer(board, rate_hz=config.force_hz)
-        self.ink: PtyLine | None = None
-        if config.ink_device == "station":
-            self.ink = PtyLine(StationFirmware(self.world.well))
-        elif config.ink_device == "pump":
-            self.ink = PtyLine(PumpFirmware(self.world.well, ml_per_revolution=PUMP_ML))
         self.arcs = ArcsServer(self.world)
         self.rtde = RtdeServer(self.arcs)
         self.faults = self.arcs.faults
@@ -83,12 +72,18 @@ class LoopbackRig:
         """What the camera looks at."""
         self.camera = MjpegServer(self.world, lambda tool: self.scene.render(tool), self.faults)
         self.servers: dict[str, LoopbackServer] = {"arcs": self.arcs, "rtde": self.rtde, "camera": self.camera}
-        self._ports = ports or {}
-        if self.ink is not None:
+        self.force: SocketcandServer | None = None
+        if config.force_sensor:
+            noise_n, noise_nm = config.force_noise_n, config.force_noise_nm
+            board = ForceBoard(self.world.wrench, noise_n=noise_n, noise_nm=noise_nm, seed=config.seed)
+            board.next_fault = functools.partial(self.faults.kind_met, Device.FORCE)
+            self.force = self.servers["force"] = SocketcandServer(board, rate_hz=config.force_hz)
+        self.ink: PtyLine | None = None
+        if config.ink_device != "none":
+            firmware = PumpFirmware if config.ink_device == "pump" else StationFirmware
+            self.ink = PtyLine(firmware(self.world.well))
             self.ink.next_fault = functools.partial(self.faults.kind_met, Device.INK)
-        if self.force is not None:
-            self.force.board.next_fault = functools.partial(self.faults.kind_met, Device.FORCE)
-            self.servers["force"] = self.force
+        self._ports = ports or {}
         self._open = contextlib.AsyncExitStack()
 
     async def __aenter__(self) -> Self:
@@ -100,8 +95,8 @@ class LoopbackRig:
                 await asyncio.to_thread(push_on, self.config.brush)  # it is slow to find
             if self.ink is not None:
                 opening.enter_context(self.ink)
-            watching = asyncio.create_task(self.faults.watch(self.arcs.cabinet.safety_stop), name="faults")
-            opening.callback(watching.cancel)
+            watching = alongside(self.faults.watch(self.arcs.cabinet.safety_stop), "faults")
+            await opening.enter_async_context(watching)
             self._open = opening.pop_all()
         return self
 

@@ -150,7 +150,7 @@ class World:
         """Scripted flaw and severity by the index of the press; severity 0 rules out a spontaneous split."""
         self.ink_load = 0.0
         table = config.table
-        self.well = Well.round(table.well_radius_mm, table.ink_level_mm, table.well_depth_mm)
+        self.well = Well(math.pi * table.well_radius_mm**2 / 1e3, table.ink_level_mm, table.well_depth_mm)
         self.version = 0
         """Number of visible changes to the sheet so far."""
         self._contact: list[Pose] = []
