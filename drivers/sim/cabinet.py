@@ -16,7 +16,7 @@ from brushloop.drivers.arcs.controller import LOOPBACK_CONTROL_BOX, MOVING_ALLOW
 from brushloop.drivers.arcs.wire import numbers
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import from_wire, to_wire
-from brushloop.drivers.sim.kinematics import LIMITS_DEG, Joints, Matrix, forward, inverse, matrix_of, pose_of
+from brushloop.drivers.sim.kinematics import Joints, Matrix, forward, inverse, matrix_of, pose_of
 from brushloop.drivers.sim.world import World
 
 BOOT_S = 0.7
@@ -24,8 +24,6 @@ POWER_ON_S = 1.0
 """Time from `poweron` to Idle."""
 BRAKE_RELEASE_S = 1.0
 POWER_OFF_S = 0.3
-
-EMERGENCY_STOPS = frozenset({SafetyMode.SYSTEM_EMERGENCY_STOP, SafetyMode.ROBOT_EMERGENCY_STOP})
 
 
 class Power:
@@ -52,7 +50,7 @@ class Power:
 
     def power_on(self) -> int:
         """Request power; Idle comes `POWER_ON_S` later."""
-        if self.safety in EMERGENCY_STOPS:
+        if self.safety == SafetyMode.ROBOT_EMERGENCY_STOP:
             return ReturnCode.BAD_STATE
         if self.mode == RobotMode.POWER_OFF:
             self.then((0.0, RobotMode.BOOTING), (BOOT_S, RobotMode.POWER_ON), (POWER_ON_S, RobotMode.IDLE))
@@ -94,6 +92,7 @@ class Cabinet:
         self.tcp_offset = [0.0] * 6
         """Flange to tool centre point as configured: x, y, z in m and three angles in rad. The true tip stays."""
         self.payload: list[Any] = [0.0, [0.0] * 3, [0.0] * 3, [0.0] * 6]
+        """Mass in kg, centre of gravity in m, and what a robot has beside."""
         self.collision_level = 6
         self.speed_fraction = 1.0
         self.operational_mode = "Automatic"
@@ -112,10 +111,11 @@ class Cabinet:
             self.hold(HARD_STOP_M_S2)
         else:
             self.stop(HARD_STOP_M_S2, HARD_STOP_M_S2)
-        if mode in EMERGENCY_STOPS:
+        if mode == SafetyMode.ROBOT_EMERGENCY_STOP:
             self.power.then((0.0, RobotMode.POWER_OFF))
-        if mode in EMERGENCY_STOPS or self.power.safety not in EMERGENCY_STOPS:
-            self.power.safety = mode
+        elif self.power.safety == SafetyMode.ROBOT_EMERGENCY_STOP:
+            return
+        self.power.safety = mode
 
     def release(self) -> str:
         """End a safety stop as a person at the arm would; return the previous safety mode.
@@ -209,8 +209,6 @@ class Cabinet:
         q = numbers("moveJoint", p["q"])
         if (code := self._admit(p)) != ReturnCode.OK:
             return code
-        if any(abs(v) > math.radians(limit) for v, limit in zip(q, LIMITS_DEG, strict=True)):
-            return self._out_of_reach()
         added = self.motion.add_joints(tuple(q), p["v"], p["a"], self.now_s())
         return ReturnCode.OK if added else ReturnCode.REQUEST_IGNORED
 
@@ -238,17 +236,10 @@ class Cabinet:
         self.motion.advance(self.now_s())
         return self.motion.size
 
-    def configure(self, name: str, value: object, allowed: bool = True) -> int:
-        """Set one of the cabinet's settings, if the value is allowed."""
-        if not allowed:
-            return -ReturnCode.INVALID_ARGUMENT
+    def configure(self, name: str, value: object) -> int:
+        """Set one of the cabinet's settings."""
         setattr(self, name, value)
         return ReturnCode.OK
-
-    def set_payload(self, p: Params) -> int:
-        """Take mass in kg, centre of gravity in m, and what a robot has beside."""
-        cog_m, aom = numbers("setPayload", p["cog"], 3), numbers("setPayload", p["aom"], 3)
-        return self.configure("payload", [p["m"], cog_m, aom, p["inertia"]], 0.0 <= p["m"] <= 5.0)
 
     def peek(self, count: int, after: int) -> list[dict[str, Any]]:
         """The newest `count` messages after a time stamp."""
@@ -267,9 +258,7 @@ def methods(cabinet: Cabinet) -> dict[str, Callable[[Params], Any]]:
         "MotionControl.stopLine": lambda p: cabinet.stop(p["acc"], p["acc_rot"]),
         "MotionControl.stopMove": lambda _: cabinet.hold(),
         "MotionControl.startMove": lambda _: cabinet.resume(),
-        "MotionControl.setSpeedFraction": lambda p: cabinet.configure(
-            "speed_fraction", p["fraction"], 0.0 < p["fraction"] <= 1.0
-        ),
+        "MotionControl.setSpeedFraction": lambda p: cabinet.configure("speed_fraction", p["fraction"]),
         "MotionControl.getSpeedFraction": lambda _: cabinet.speed_fraction,
         "MotionControl.getExecId": lambda _: motion.exec_id(now_s()),
         "MotionControl.getQueueSize": lambda _: cabinet.queue_size(),
@@ -279,19 +268,15 @@ def methods(cabinet: Cabinet) -> dict[str, Callable[[Params], Any]]:
         "RobotConfig.getDof": lambda _: 6,
         "RobotConfig.setTcpOffset": lambda p: cabinet.configure("tcp_offset", numbers("setTcpOffset", p["offset"])),
         "RobotConfig.getTcpOffset": lambda _: cabinet.tcp_offset,
-        "RobotConfig.setPayload": cabinet.set_payload,
+        "RobotConfig.setPayload": lambda p: cabinet.configure("payload", [p["m"], p["cog"], p["aom"], p["inertia"]]),
         "RobotConfig.getPayload": lambda _: cabinet.payload,
-        "RobotConfig.setCollisionLevel": lambda p: cabinet.configure(
-            "collision_level", p["level"], 0 <= p["level"] <= 9
-        ),
+        "RobotConfig.setCollisionLevel": lambda p: cabinet.configure("collision_level", p["level"]),
         "RobotConfig.getCollisionLevel": lambda _: cabinet.collision_level,
         "RobotManage.poweron": lambda _: power.power_on(),
         "RobotManage.startup": lambda _: power.start_up(),
         "RobotManage.poweroff": lambda _: cabinet.power_off(),
         "RobotManage.getOperationalMode": lambda _: cabinet.operational_mode,
-        "RobotManage.setOperationalMode": lambda p: cabinet.configure(
-            "operational_mode", p["mode"], p["mode"] in ("Disabled", "Automatic", "Manual")
-        ),
+        "RobotManage.setOperationalMode": lambda p: cabinet.configure("operational_mode", p["mode"]),
         "RobotManage.isSimulationEnabled": lambda _: True,  # no arm is behind this controller
         "RobotState.getRobotModeType": lambda _: power.mode.value,
         "RobotState.getSafetyModeType": lambda _: power.safety.value,
