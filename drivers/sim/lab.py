@@ -9,8 +9,6 @@ import asyncio
 import math
 import os
 import secrets
-import zlib
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -60,7 +58,7 @@ THINGS = (*TOUCHED, "upright", "well", "wash-pot", "park", "clear-view", "hold-b
 class UnknownLab(LoopbackRig):
     """`async with UnknownLab(seed) as lab:` serves until the block ends; `hand` asks the person for something.
 
-    An error of the hand depends on the seed, the thing, and how often it was asked for.
+    The errors of the hand come from the seed, one after the other.
     """
 
     def __init__(
@@ -85,18 +83,15 @@ class UnknownLab(LoopbackRig):
         """The gateway and bus of the force sensor."""
         self.arcs.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
         self.arcs.cabinet.payload = [self.facts.payload_kg, [0.0] * 3, [0.0] * 3, [0.0] * 6]
-        self._noise = np.random.default_rng([seed, 17])
+        self._noise, self._luck = (np.random.default_rng([seed, stream]) for stream in (17, 31))
         self.servers["room"] = MjpegServer(self.world, self._wall)
         if not self.facts.speaks_arcs:
             del self.servers["arcs"], self.servers["rtde"]
             # the software before ARCS takes connections, and answers nothing that ARCS would
             self.servers["older"] = LoopbackServer()
         self._trap = trap
-        self._asked: Counter[str] = Counter()
         self._touches = 0
         self._pulled: list[int] = []
-        self._busy = asyncio.Lock()
-        """The person does one thing at a time."""
 
     def _wall(self, _tool: Pose) -> NDArray[np.uint8]:
         """What the second camera sees: a wall, and no sheet."""
@@ -123,16 +118,15 @@ class UnknownLab(LoopbackRig):
 
     async def hand(self, act: str = "", to: str = "", index: int = 0, corner: str = "") -> dict[str, Any]:
         """What the person did: `says`, and for `bring` whether it was `reached`. Raises ValueError, with one line."""
-        async with self._busy:
-            match act:
-                case "bring":
-                    return await self.bring(to, index, corner)
-                case "measure":
-                    return {"says": self._measured(to)}
-                case "mend":
-                    return {"says": await self.mend()}
-                case _:
-                    raise ValueError(f"act = {act!r} is not one of bring, measure, mend")
+        match act:
+            case "bring":
+                return await self.bring(to, index, corner)
+            case "measure":
+                return {"says": self._measured(to)}
+            case "mend":
+                return {"says": await self.mend()}
+            case _:
+                raise ValueError(f"act = {act!r} is not one of bring, measure, mend")
 
     async def bring(self, to: str, index: int = 0, corner: str = "") -> dict[str, Any]:
         """Guide the tip to one of `THINGS`, or hold or push it. Raises ValueError for another thing or corner."""
@@ -179,7 +173,7 @@ class UnknownLab(LoopbackRig):
 
     def aim(self, to: str, index: int, name: str) -> Pose:
         """Pose of the tip for a thing. Raises ValueError for one that the lab does not have."""
-        rng, place = self._luck(to, index, name), self.facts.place(to, name)
+        rng, place = self._luck, self.facts.place(to, name)
         turn_deg = float(rng.normal(0.0, 5.0))
         tilt_deg, toward_deg = 0.0, 0.0
         if to == "pin":
@@ -200,8 +194,7 @@ class UnknownLab(LoopbackRig):
 
     def _grip(self, index: int) -> Pose:
         """How the board is held before the camera: each time at another slant and in another part of the picture."""
-        rng = self._luck("hold-board", index, "")
-        view, table = self.facts.config.view, self.facts.config.table
+        rng, view, table = self._luck, self.facts.config.view, self.facts.config.table
         slant_deg, toward_deg, turn_deg, (x, y) = GRIPS[index % len(GRIPS)]
         size_x_mm, size_y_mm = table.board_size_mm
         high = view.height_px / view.width_px
@@ -221,11 +214,6 @@ class UnknownLab(LoopbackRig):
         if what not in lengths_mm:
             raise ValueError(f"to = {what!r} is not one of {', '.join(lengths_mm)}")
         return f"{round(lengths_mm[what], 2):g}"
-
-    def _luck(self, to: str, index: int, name: str) -> np.random.Generator:
-        key = f"{to} {index} {name}"
-        self._asked[key] += 1
-        return np.random.default_rng([self.facts.config.seed, 31, zlib.crc32(key.encode()), self._asked[key]])
 
     async def _push(self, index: int) -> None:
         """Push the tip for `PUSH_S`, in the direction of this index of `PUSHES`."""
