@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.force.sri_m8123 import BUS_OFF, COMMAND_ID, LOOPBACK_CHANNEL, START, STOP, Wrench, encode_round
 from brushloop.drivers.host import alongside
-from brushloop.drivers.loopback import BACKLOG_BYTES, LoopbackServer
+from brushloop.drivers.loopback import LoopbackServer
 
 BUS_ERROR = 0x04
 """Class of an error frame: the controller has a problem but is on the bus."""
@@ -112,8 +112,8 @@ class SocketcandServer(LoopbackServer):
             # sends its frames in one burst, however busy the computer is.
             at_s = time.time()
             text = "".join(_ascii(frame, at_s + place * FRAME_S) for place, frame in enumerate(self.board.round()))
-            if writer.transport.get_write_buffer_size() < BACKLOG_BYTES:
-                writer.write(text.encode())
+            writer.write(text.encode())
+            await writer.drain()  # a client that does not read is sent nothing more until it has caught up
             due_s = max(due_s + self._period_s, loop.time())
             await asyncio.sleep(due_s - loop.time())
 

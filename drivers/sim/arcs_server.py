@@ -16,7 +16,7 @@ from brushloop.drivers.arcs.wire import PING, BareDecoder, FrameDecoder, encode,
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.geometry import to_wire
-from brushloop.drivers.loopback import BACKLOG_BYTES, LoopbackServer
+from brushloop.drivers.loopback import LoopbackServer
 from brushloop.drivers.sim.cabinet import Cabinet, methods
 from brushloop.drivers.sim.faults import KINDS, LOST, STOPS, Device, Fault, FaultBoard
 from brushloop.drivers.sim.world import World
@@ -186,18 +186,17 @@ class RtdeServer(LoopbackServer):
         due, before_s = loop.time(), self._cabinet.now_s()
         while not writer.is_closing():
             now_s, tip = self._cabinet.now_s(), world.tool()
-            if writer.transport.get_write_buffer_size() < BACKLOG_BYTES:
-                # With fast simulated time a whole press might pass between two pushes: rests are pushed too.
-                rests = [
-                    rest for rest in world.motion.rests if before_s < rest.at_s <= now_s and world.clock.rate > 1.0
-                ]
-                for at_s, pose in (*((rest.at_s, rest.pose) for rest in rests), (now_s, tip)):
-                    fault = self.faults.meet(Device.TELEMETRY)
-                    late_s = 0.0 if fault is None else fault.late_s
-                    if fault is None or fault.kind != "mute":
-                        sample = encode_sample(chanel, [self._value(name, at_s, pose) for name in names])
-                        loop.call_later(late_s, self.write, writer, sample)
+            # With fast simulated time a whole press might pass between two pushes: rests are pushed too.
+            rests = world.motion.rests if world.clock.rate > 1.0 else ()
+            passed = [(rest.at_s, rest.pose) for rest in rests if before_s < rest.at_s <= now_s]
+            for at_s, pose in (*passed, (now_s, tip)):
+                fault = self.faults.meet(Device.TELEMETRY)
+                late_s = 0.0 if fault is None else fault.late_s
+                if fault is None or fault.kind != "mute":
+                    sample = encode_sample(chanel, [self._value(name, at_s, pose) for name in names])
+                    loop.call_later(late_s, self.write, writer, sample)
             before_s = now_s
+            await writer.drain()  # a client that does not read is sent nothing more until it has caught up
             due = max(due + period_s, loop.time())
             await asyncio.sleep(due - loop.time())
 
