@@ -310,15 +310,11 @@ class MjpegServer(LoopbackServer):
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer any request with the stream."""
         async with asyncio.timeout(5.0):
-            request = await reader.readuntil(b"\r\n\r\n")
+            await reader.readuntil(b"\r\n\r\n")
         writer.write(
             b"HTTP/1.0 200 OK\r\nCache-Control: no-store\r\nServer: " + LOOPBACK_SERVER.encode() + b"\r\n"
             b"Content-Type: multipart/x-mixed-replace; boundary=" + BOUNDARY.encode() + b"\r\n\r\n"
         )
-        if not request.startswith(b"HEAD"):
-            await self._stream(writer)
-
-    async def _stream(self, writer: asyncio.StreamWriter) -> None:
         loop = asyncio.get_running_loop()
         due_s = sent_s = loop.time()
         shown = b""
