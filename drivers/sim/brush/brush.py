@@ -78,10 +78,9 @@ class Brush:
         +x by `tilt_deg` and then descends. Columns grow with +x, rows with -y. The upright bundle bends
         toward -x, its set. A depth of 0 or less leaves the paper blank; a flaw of severity 0 has no effect. Raises
         ValueError, naming value and range, if `depth_mm` exceeds 0.9 length cos(tilt), or tilt is outside
-        0 .. 30 deg, `ink_load` or `severity` outside 0 .. 1 (1 = freshly dipped), or `press_seed` is negative.
+        0 .. 30 deg, or `ink_load` outside 0 .. 1 (1 = freshly dipped).
         """
-        self._check(depth_mm, tilt_deg, ink_load, press_seed)
-        within("severity", severity, 0.0, 1.0)
+        self._check(depth_mm, tilt_deg, ink_load)
         if depth_mm <= 0.0:
             return blank_footprint()
         trouble = FLAWLESS
@@ -150,17 +149,16 @@ class Brush:
         if not path:
             raise ValueError("a drag needs at least one waypoint")
         deepest = max(w.depth_mm for w in path)
-        self._check(deepest, tilt_deg, ink_load, press_seed)
+        self._check(deepest, tilt_deg, ink_load)
         if deepest <= LEAST_DEPTH_MM:
             return blank_footprint()
         stances = _stances(self.spec, math.ceil(deepest), float(tilt_deg))
         tuft = wet_tuft(self._bundle, self._bristles, FLAWLESS, self._rng(press_seed, LIE))
         return draw_drag(path, stances, math.radians(heading_deg), tuft, ink_load, self._rng(press_seed, PAPER))
 
-    def _check(self, depth_mm: float, tilt_deg: float, ink_load: float, press_seed: int) -> None:
+    def _check(self, depth_mm: float, tilt_deg: float, ink_load: float) -> None:
         within("tilt_deg", tilt_deg, 0.0, MAX_TILT_DEG)
         within("ink_load", ink_load, 0.0, 1.0)
-        within("press_seed", press_seed, 0, 2**63 - 1)
         within("depth_mm", depth_mm, -math.inf, self.deepest_mm(tilt_deg))
 
     def _rng(self, press_seed: int, stream: int) -> np.random.Generator:

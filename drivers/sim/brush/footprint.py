@@ -185,11 +185,6 @@ def grow_bristles(spec: BrushSpec, rng: np.random.Generator) -> Bristles:
     return Bristles(across, outward, short, phase, far.argmin(axis=1), float(rng.normal(0.0, spec.bow_mm)))
 
 
-def clump_flow(clump_ink: Vector, ink_load: float) -> Vector:
-    """Ink flow (CLUMPS,) in 0 .. 1: after a dip every clump gives ink, below a load of about 0.4 some are dry."""
-    return np.clip(1.9 * ink_load - 0.75 * clump_ink, 0.0, 1.0)
-
-
 MARGIN_MM = 3.0
 """Blank border around the mark."""
 
@@ -227,7 +222,8 @@ class Tuft:
         from r to r - squash / 2; the half width rises to r (r / (r - squash / 2))^splay_power.
         """
         bundle, bristles, spec = self.bundle, self.bristles, self.bundle.spec
-        flow = self.trouble.flow(clump_flow(self.clump_ink, load)[bristles.clump])
+        # after a dip every clump gives ink, below a load of about 0.4 some are dry
+        flow = self.trouble.flow(np.clip(1.9 * load - 0.75 * self.clump_ink, 0.0, 1.0)[bristles.clump])
         film_mm = DRY_FILM_MM + (spec.film_mm - DRY_FILM_MM) * load
         link_mm = bundle.link_mm
         node = np.arange(bundle.radius_mm.size, dtype=np.float64)
