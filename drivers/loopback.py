@@ -28,10 +28,10 @@ POLL_S = 0.05
 RATE = 30.0
 
 
-class RigDidNotStart(RuntimeError):
-    """The loopback rig ended, or did not serve in time; holds what it printed."""
+class RigRefused(Exception):
+    """The loopback rig did not start, or cannot do what it was asked: says which file, field, socket or request."""
 
-    exit_code: ClassVar[int] = 4
+    exit_code: ClassVar[int] = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class LoopbackRig:
 def start(config: Path, log: Path, *options: str, detached: bool = False) -> LoopbackRig:
     """Start `brushloop sim` and wait until it has written `config`, which must not exist yet.
 
-    Detached, it is not reached by Ctrl-C in this terminal. Raises `RigDidNotStart`.
+    Detached, it is not reached by Ctrl-C in this terminal. Raises `RigRefused`, with what it printed.
     """
     command = [sys.executable, "-m", "brushloop", "sim", "--write-rig", str(config), *options]
     with log.open("ab") as file:
@@ -67,7 +67,7 @@ def start(config: Path, log: Path, *options: str, detached: bool = False) -> Loo
     while not config.exists():
         if process.poll() is not None or time.monotonic() > deadline:
             rig.end()
-            raise RigDidNotStart(f"the loopback rig did not start; {log} says: {log.read_text(errors='replace')}")
+            raise RigRefused(f"the loopback rig did not start; {log} says: {log.read_text(errors='replace')}")
         time.sleep(POLL_S)
     return rig
 
@@ -76,7 +76,7 @@ def start(config: Path, log: Path, *options: str, detached: bool = False) -> Loo
 def simulate(folder: Path, *, rate: float = RATE, brush: str = "loopback") -> Generator[LoopbackRig]:
     """Serve a loopback rig until the end of the block, `rate` simulated seconds in a real one.
 
-    Its files are kept in `folder`. `brush` as for `brushloop sim`. Raises `RigDidNotStart`.
+    Its files are kept in `folder`. `brush` as for `brushloop sim`. Raises `RigRefused`.
     """
     folder.mkdir(parents=True, exist_ok=True)
     config = folder.resolve() / "rig.toml"
@@ -90,12 +90,6 @@ def simulate(folder: Path, *, rate: float = RATE, brush: str = "loopback") -> Ge
 
 ANSWER_S = 120.0
 """Longest wait for an answer: a person in the lab may have to act first."""
-
-
-class RigRefused(Exception):
-    """What was asked of the loopback rig cannot be done: one line that names the file, field, socket or request."""
-
-    exit_code: ClassVar[int] = 2
 
 
 def ask(path: Path, request: Mapping[str, object]) -> dict[str, Any]:
@@ -119,8 +113,6 @@ def ask(path: Path, request: Mapping[str, object]) -> dict[str, Any]:
             raise RigRefused(f"{path}: not the control socket of a rig")
 
 
-BACKLOG_BYTES = 32 * 1024
-"""A client that does not read is sent no more samples until it has caught up."""
 ENDS_OF_A_CLIENT = (
     *(ConnectionError, TimeoutError, asyncio.IncompleteReadError),  # it disconnected
     *(ProtocolViolation, asyncio.LimitOverrunError),  # it does not speak the protocol

@@ -128,7 +128,7 @@ class Demo:
         say(verdict(report))
 
     def _started(self) -> LoopbackRig:
-        """The rig of this demo; started, with a blank sheet, where it is first needed. Raises `RigDidNotStart`."""
+        """The rig of this demo; started, with a blank sheet, where it is first needed. Raises `RigRefused`."""
         if self._rig is None:
             say("the loopback rig starts in the background; its log is rig.log")
             self._config.unlink(missing_ok=True)  # the rig writes its own
