@@ -170,9 +170,8 @@ def _outline(calibration: Calibration, sheet_mm: tuple[float, float]) -> Floats:
     """(n, 2) points of the sheet's edge in the photograph; its sides are bent where the lens bends them."""
     x, y = sheet_mm
     corners = np.array([[0.0, 0.0], [x, 0.0], [x, y], [0.0, y]])
-    along = np.linspace(0.0, 1.0, SIDE_POINTS)[:-1, None]
-    sides = [a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
-    return calibration.to_image(np.concatenate(sides))
+    sides = np.linspace(corners, np.roll(corners, -1, axis=0), SIDE_POINTS)[:-1]
+    return calibration.to_image(sides.swapaxes(0, 1).reshape(-1, 2))
 
 
 def _trust(calibration: Calibration, moved: Sequence[str]) -> Iterator[Point]:

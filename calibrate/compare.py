@@ -227,17 +227,14 @@ def best_shift(moving: NDArray[Any], fixed: NDArray[Any]) -> NDArray[Any]:
     return np.stack([image[row : row + height, column : column + width] for image, (row, column) in corners])
 
 
-Triple = tuple[float, float, float]
-"""Max, min, avg."""
-
-
 @dataclass(frozen=True, slots=True)
 class Printed:
     """A row of the CCD-BSMG paper's tables, in percent; the paper used its own brush, ink and preprocessing."""
 
     label: str
-    csim: Triple
-    ssim: Triple
+    csim: tuple[float, float, float]
+    """Max, min, avg."""
+    ssim: tuple[float, float, float]
 
 
 ROBOT_WRITING = "robot writing"

@@ -29,7 +29,7 @@ from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.files import Written
 from brushloop.calibrate.presses import Refused, read_presses, rectified
 from brushloop.calibrate.session import Calibration, OpenSession, open_session
-from brushloop.calibrate.stroke.preprocess import Prepared
+from brushloop.calibrate.stroke.preprocess import Gray, Prepared
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.generator import SHIPPED_GENERATOR
 from brushloop.model.strokes import Prediction
@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from brushloop.calibrate.recover import Recovered
     from brushloop.calibrate.validate.command import ValidationOutput
 
-Gray = NDArray[np.uint8]
 SAMPLE_COLUMNS = ("episode_index", "frame_index", "t_ns", "log_ns", "sequence")
 """Numbers of the stroke and of the sample within it; times at the device and the recorder; the sample's own number."""
 

@@ -15,7 +15,6 @@ from html import escape
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brushloop.calibrate.commands import RecoverRequest
 from brushloop.calibrate.compare import MM_PER_PX
@@ -24,7 +23,7 @@ from brushloop.calibrate.files import check_target, write_whole
 from brushloop.calibrate.fit.command import BrushFit
 from brushloop.calibrate.presses import Press, Refused, cut, read_presses
 from brushloop.calibrate.session import OpenSession, open_session
-from brushloop.calibrate.stats import student_95
+from brushloop.calibrate.stats import Floats, student_95
 from brushloop.model.inversion import Flag, Inverter, Range
 from brushloop.sessions.disk import csv_text
 from brushloop.sessions.records import Condition
@@ -45,7 +44,6 @@ MOST = 0.8
 """Share of that range from which on an interval is not informative."""
 USELESS = frozenset({Flag.BLANK, Flag.DID_NOT_CONVERGE, Flag.CUT})
 """Flags that exclude a stroke: it is listed with the reason and not pressed again."""
-Floats = NDArray[np.float64]
 LEAST_CONDITIONS = 3
 """With fewer other conditions, the model error is unknown."""
 NORMAL_95 = 1.96

@@ -166,15 +166,14 @@ def cluster(address: str) -> Generator[Scheduler]:
     except (OSError, ValueError, TypeError, ImportError) as error:
         raise CalibrationError(where, f"no Dask scheduler there ({in_one_line(error)})") from None
     try:
-        threads_of: dict[str, int] = client.nthreads()
-        if not threads_of:
-            raise CalibrationError(where, "the cluster has no worker")
         answers: dict[str, Any] = client.run(software, on_error="return")
+        if not answers:
+            raise CalibrationError(where, "the cluster has no worker")
         for worker, answer in answers.items():
             if answer != software():
                 version_there = " ".join(str(answer).split())
                 raise CalibrationError(where, f"worker {worker} has {version_there}; {software()} is needed there")
-        yield Scheduler(client.get_executor(pure=False), sum(threads_of.values()))
+        yield Scheduler(client.get_executor(pure=False), sum(client.nthreads().values()))
     finally:
         client.close()
 

@@ -73,8 +73,6 @@ SPREAD_STEPS = 6
 AGREEMENT_SD = 0.05
 """Relative standard error of the disagreement of repeats, 1 - CSIM. It averages over the whole edge of each mark, so it
 is better known than the four deviations, each of one number a mark: without one repeat of four it changes by 3 %."""
-
-
 COARSE_MM = (1.2, 0.5)
 """Blurs of the first passes of the search."""
 FINE_MM = 0.3

@@ -19,7 +19,6 @@ from itertools import product
 from operator import itemgetter
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brushloop.model.damped import Damping, Equations, descend
 from brushloop.model.fitted import (
@@ -28,6 +27,7 @@ from brushloop.model.fitted import (
     PARAMETERS,
     TERMS,
     FittedPress,
+    Floats,
     Prior,
     Sizes,
     chance_within,
@@ -37,8 +37,6 @@ from brushloop.model.fitted import (
     spreads,
 )
 from brushloop.model.presses import DepthTilt, Grid, Presses
-
-Floats = NDArray[np.float64]
 
 SPREAD_MM = 0.15
 """Variation of an edge from press to press (scale of a logistic)."""

@@ -27,7 +27,6 @@ PER_CONDITION = 3
 """Presses of each other condition that a fit uses; more did not change it."""
 MAX_STROKES = 60
 
-
 Predicted = tuple[Floats, Mapping[str, Images]]
 """The ink of the presses of one condition, (n, rows, columns), and what each model predicts there without them."""
 

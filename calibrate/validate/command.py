@@ -114,7 +114,7 @@ def validate(
     check_writable(folder)
     sessions = [open_session(place, request.fit) for place in opened or request.places]
     one_source(sessions)
-    kinds = {session.strokes[0].kind for session in sessions}
+    kinds = {stroke.kind for session in sessions for stroke in session.strokes}
     if len(kinds) > 1:
         raise CalibrationError(str(sessions[-1].recording.path), "mixes presses and drags: validate them separately")
     if kinds == {"drag"}:
@@ -136,15 +136,12 @@ def open_session(place: Path | Recording, fit: Path | None = None) -> FittedSess
     session = open_recording(place)
     path = session.recording.path
     closed = replay(path.parent / JOURNAL_NAME).closed if (path.parent / JOURNAL_NAME).is_file() else None
-    sha256 = session.sha256
-    if closed is not None and closed.sha256 != sha256:
+    if closed is not None and closed.sha256 != session.sha256:
         raise SessionDamaged(path, "is not the file that the session was closed with: its SHA-256 differs")
-    if len({stroke.kind for stroke in session.strokes}) > 1:
-        raise CalibrationError(str(path), "mixes presses and drags; validate them as two sessions")
     # A fit of drags is read with the strokes that it predicts.
     used = None if session.strokes[0].kind == "drag" else fit or current(path.parent, FITS)
     brush = None if used is None else BrushFit.read(used)
-    return FittedSession(session.recording, sha256, session.strokes, session.calibration, session.store, brush)
+    return FittedSession(session.recording, session.sha256, session.strokes, session.calibration, session.store, brush)
 
 
 def one_source(sessions: Sequence[FittedSession]) -> Source:

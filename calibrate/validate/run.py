@@ -109,7 +109,6 @@ BRUSH_LEFT_OUT = ModelInfo(
     basis=HELD_OUT,
 )
 
-
 Mark = tuple[Outline, float]
 """The outline of a press, and the distance of its origin from the zero-touch point, mm."""
 
