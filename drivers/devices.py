@@ -90,7 +90,6 @@ class ForceSample:
 class Identity:
     """The device that answered: in the header of every recording, so that each number can be traced to its source."""
 
-    device: str
     model: str
     firmware: str
     simulated: bool

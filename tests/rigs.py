@@ -278,7 +278,7 @@ class SceneCamera:
 
     async def connect(self) -> Identity:
         height, width = (await self.fresh(Stamp(0))).image.shape[:2]
-        return Identity("camera", f"{self._table.source} {width}x{height}", "", True)
+        return Identity(f"{self._table.source} {width}x{height}", "", True)
 
     async def fresh(self, after: Stamp) -> Frame:
         began_ns, period_ns = self._clock.now_ns(), round(1e9 / self._rig.config.view.fps)

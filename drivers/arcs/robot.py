@@ -81,7 +81,7 @@ class AuboArcs:
         firmware = f"interface {version}"
         if self._table.rtde_port is not None:
             firmware += f", telemetry by {self._telemetry.source}"
-        return Identity(DEVICE, f"{model} ({box})", firmware, box == LOOPBACK_CONTROL_BOX)
+        return Identity(f"{model} ({box})", firmware, box == LOOPBACK_CONTROL_BOX)
 
     async def enable(self) -> None:
         """Check the mode, set the tool, power on, release the brakes; moves nothing.

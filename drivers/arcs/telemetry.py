@@ -34,7 +34,7 @@ from brushloop.drivers.arcs.wire import DEVICE, FrameDecoder, encode_short, in_t
 from brushloop.drivers.devices import Pose, PoseSample, Stamp
 from brushloop.drivers.errors import DeviceError, DeviceTimeout, NotConnected, ProtocolViolation, Stale
 from brushloop.drivers.geometry import from_wire
-from brushloop.drivers.host import Clock
+from brushloop.drivers.host import Clock, alongside
 
 STREAM = "robot telemetry"
 SET_RECIPE = 100
@@ -247,7 +247,7 @@ class Telemetry:
         self._clock = clock
         self._notice = on_notice
         self._latest: PoseSample | None = None
-        self._task: asyncio.Task[None] | None = None
+        self._running = contextlib.AsyncExitStack()
         self._stream: RtdeStream | None = None
         self._seen: list[Pose] | None = None
         self.lag = LagMeter(clock)
@@ -268,14 +268,11 @@ class Telemetry:
                 await self._take_pushed(self._stream)
             except DeviceError as error:
                 await self._fall_back(error)
-        self._task = asyncio.create_task(self._run(), name="robot telemetry")
+        await self._running.enter_async_context(alongside(self._run(), "robot telemetry"))
 
     async def stop(self) -> None:
         """End telemetry; the newest pose stays and grows stale."""
-        task, self._task = self._task, None
-        if task is not None:
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
+        await self._running.aclose()
         await self._drop_stream()
 
     def latest(self) -> PoseSample:

@@ -20,8 +20,8 @@ import asyncio
 import contextlib
 import json
 import re
-import secrets
 import struct
+import uuid
 from collections.abc import AsyncGenerator, Mapping
 from typing import Any, Literal
 
@@ -200,12 +200,6 @@ SDK_INTERFACE_VERSION = "0.24.0"
 FACTORY_LOGIN_TOKEN = "3353545435353664345433434443435463466335333566235443434253142434333426365553"
 
 
-def request_id() -> str:
-    """An id of the vendor client's shape: 8-4-4 characters."""
-    raw = secrets.token_hex(8)
-    return f"{raw[:8]}-{raw[8:12]}-{raw[12:]}"
-
-
 def encode_request(ident: str, method: str, params: Mapping[str, object] | None) -> bytes:
     """Compact JSON with sorted keys; `params` is left out where there are none, as the vendor's client does."""
     body: dict[str, object] = {"id": ident, "jsonrpc": "2.0", "method": method}
@@ -288,7 +282,7 @@ class RpcConnection:
         if self._framing == "bare":
             self._last_id += 1
             return await self._exchange(self._last_id, method, encode_bare_request(self._last_id, method, params))
-        ident = request_id()
+        ident = str(uuid.uuid4())[:18]  # of the shape of the vendor client's ids: 8-4-4 characters
         return await self._exchange(ident, method, encode(encode_request(ident, method, params)))
 
     async def close(self) -> None:

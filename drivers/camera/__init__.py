@@ -181,7 +181,7 @@ class OpenCvCamera:
             raise
         height, width = frame.image.shape
         locked = "".join(f", {name} {value:g}" for name, value in self._settings.items())
-        return Identity(DEVICE, f"{self._table.source} {width}x{height}{locked}", "", self._simulated)
+        return Identity(f"{self._table.source} {width}x{height}{locked}", "", self._simulated)
 
     async def fresh(self, after: Stamp) -> Frame:
         """The first valid frame exposed after `after.host_ns`, never an older buffered one.

@@ -206,7 +206,7 @@ class SriM8123:
         # The board has no identification. No real board can be on a virtual bus or on the loopback rig's bus.
         interface, channel = self._table.interface, self._table.channel
         simulated = interface == "virtual" or (interface, channel) == ("socketcand", LOOPBACK_CHANNEL)
-        return Identity(DEVICE, f"SRI M8123B2 on {interface} {channel}", "", simulated)
+        return Identity(f"SRI M8123B2 on {interface} {channel}", "", simulated)
 
     def latest(self) -> ForceSample:
         """The newest sample; never blocks. Raises `Stale`, `Stuck`, `ConnectionLost`, `NotConnected`."""

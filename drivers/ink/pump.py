@@ -122,7 +122,7 @@ class ModbusPump(InkDevice):
             await self._halt()
         self._connected = True
         # A pump cannot say whether it is the loopback rig's.
-        return Identity(DEVICE, f"Modbus RTU pump, unit {self._unit}", "", False)
+        return Identity(f"Modbus RTU pump, unit {self._unit}", "", False)
 
     async def _give(self, volume_ml: float) -> None:
         """Pump for as long as `volume_ml` takes, then stop.

@@ -118,7 +118,7 @@ class InkStation(InkDevice):
             answer = await self._ask("identify", attempts=CONNECT_ATTEMPTS)
             match answer.split(" "):
                 case [model, version, firmware, ("real" | "loopback") as kind] if (model, version) == (MODEL, PROTOCOL):
-                    return Identity(DEVICE, MODEL, firmware, kind == "loopback")
+                    return Identity(MODEL, firmware, kind == "loopback")
                 case _:
                     raise ProtocolViolation(
                         DEVICE,

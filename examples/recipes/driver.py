@@ -33,7 +33,7 @@ class SyringePump(InkDevice):
 
     async def connect(self) -> Identity:
         self._streams = await asyncio.open_connection(*self._address)
-        return Identity("ink", await self._ask("WHO"), "", simulated=False)
+        return Identity(await self._ask("WHO"), "", simulated=False)
 
     async def _give(self, volume_ml: float) -> None:
         if (answer := await self._ask(f"DOSE {volume_ml:.3f}")) != "OK":

@@ -188,7 +188,7 @@ def test_the_ending_is_printed_after_the_screen_too(
 
 # An arm that no longer sends its pose: every screen says so after a second, long before a call times out
 
-WHO = Identity("robot", "aubo_i5", "", True)
+WHO = Identity("aubo_i5", "", True)
 
 
 class HandClock:

@@ -150,10 +150,7 @@ def test_a_session_goes_on_only_with_the_rig_that_it_was_begun_on(lab: Lab, monk
         with pytest.raises(NeedsOperator, match=said):
             lab.run()
     with monkeypatch.context() as patch:
-        patch.setattr(
-            "brushloop.drivers.arcs.robot.Identity",
-            lambda device, _model, *rest: Identity(device, "another arm", *rest),
-        )
+        patch.setattr("brushloop.drivers.arcs.robot.Identity", lambda _model, *rest: Identity("another arm", *rest))
         with pytest.raises(ConfigError, match="was begun on"):
             lab.run(armed=True)
     lab.edit_rig(f"port = {lab.rig.arcs.port}", "port = 1")

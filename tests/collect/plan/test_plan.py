@@ -187,7 +187,7 @@ def test_a_self_check_takes_a_patch_before_the_first_stroke(tmp_path: Path) -> N
 
 # A press is believed where the brush was seen at its depth
 
-NOBODY = Identity("robot", "made up", "", True)
+NOBODY = Identity("made up", "", True)
 
 
 class MadeUpRobot:

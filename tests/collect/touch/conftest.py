@@ -67,7 +67,7 @@ class Bench:
         config = load_rig(self.folder / "rig.toml")
         self.limits = limits_of(config)
         devices: Any = self
-        identity = Identity("bench", "world without wires", "", True)
+        identity = Identity("world without wires", "", True)
         self.rig = Rig(config, devices, devices, devices, identity, identity, force=devices)
         self.effector = BenchHands(self)
         self.tap = BenchTap(self)
