@@ -67,43 +67,36 @@ class RoundAssembler:
     """Turns frames into wrenches; incomplete and implausible rounds are dropped and counted."""
 
     def __init__(self) -> None:
-        self._values: list[float] = []
+        self._frames: list[bytes] = []
+        """Of the present round, in their order."""
         self._began_s: float | None = None
         self._last_place = -1
-        self._spoiled = True  # until a round begins; joining in mid-round is not a fault
         self.torn = 0
         self.refused = 0
 
     def feed(self, can_id: int, data: bytes, at_s: float) -> Wrench | None:
         """Take a frame received at `at_s`; return the wrench that it completes, else None."""
         place = can_id - FIRST_ID
-        if not 0 <= place < 3:
+        if not 0 <= place < 3 or (self._began_s is None and place > 0):  # joining in mid-round is not a fault
             return None
-        late = self._began_s is not None and not abs(at_s - self._began_s) <= ROUND_S
-        if place == 0 or place <= self._last_place or late:  # a new round, even if its first frame was lost
-            if self._values:
-                self._tear()
-            self._began_s, self._spoiled = at_s, False
+        late = self._began_s is None or not abs(at_s - self._began_s) <= ROUND_S
+        if place <= self._last_place or late:  # a new round, even if its first frame was lost
+            self.torn += bool(self._frames)
+            self._frames, self._began_s = [], at_s
+        self._frames.append(data)
         self._last_place = place
-        if self._spoiled:
-            return None
-        if len(self._values) != 2 * place or len(data) != _PAIR.size:
-            self._tear()
-            self._spoiled = True
-            return None
-        self._values += _PAIR.unpack(data)
         if place < 2:
             return None
-        wrench, self._values = tuple(self._values), []
+        frames, self._frames = self._frames, []
+        if [len(frame) for frame in frames] != [_PAIR.size] * 3:
+            self.torn += 1
+            return None
+        wrench = tuple(value for frame in frames for value in _PAIR.unpack(frame))
         # Written so that NaN fails the check.
         if not all(abs(value) <= limit for value, limit in zip(wrench, MEASURABLE, strict=True)):
             self.refused += 1
             return None
         return wrench
-
-    def _tear(self) -> None:
-        self.torn += 1
-        self._values = []
 
 
 DEVICE = "force"

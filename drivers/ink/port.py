@@ -12,7 +12,6 @@ import math
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections import deque
 from collections.abc import AsyncGenerator, Callable
 from typing import Annotated, Any, TypeVar
 
@@ -73,7 +72,8 @@ class InkDevice(Device, ABC):
     def __init__(self, name: str, table: InkTable, clock: Clock, *, smallest_ml: float) -> None:
         self._name, self._table, self._clock = name, table, clock
         self._smallest_ml = smallest_ml
-        self._taken: deque[tuple[int, float]] = deque()
+        self._taken: list[tuple[int, float]] = []
+        """Times and volumes of the doses of the last minute."""
         self._dosed_ml = 0.0
 
     @abstractmethod
@@ -92,8 +92,7 @@ class InkDevice(Device, ABC):
         now_ns, most_ml, a_minute_ml = self._clock.now_ns(), self._table.dose_ml, self._table.max_per_minute_ml
         if not math.isfinite(volume_ml) or not self._smallest_ml * (1 - 1e-9) <= volume_ml <= most_ml:
             raise LimitExceeded(self._name, "dose", volume_ml, self._smallest_ml, most_ml, "ml")
-        while self._taken and now_ns - self._taken[0][0] >= MINUTE_NS:
-            self._taken.popleft()
+        self._taken = [(at_ns, ml) for at_ns, ml in self._taken if now_ns - at_ns < MINUTE_NS]
         within_ml = volume_ml + sum(ml for _, ml in self._taken)
         if within_ml > a_minute_ml * (1 + 1e-9):
             raise LimitExceeded(self._name, "dose per minute", within_ml, 0.0, a_minute_ml, "ml")
