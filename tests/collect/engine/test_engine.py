@@ -13,6 +13,7 @@ from brushloop.collect.errors import CollectAborted, ConfigError, NeedsOperator,
 from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.devices import Identity
 from brushloop.drivers.errors import DeviceError
+from brushloop.drivers.sim.scene import Scene
 from brushloop.sessions.events import CaptureResult
 from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.recording import Recording
@@ -146,7 +147,8 @@ def test_who_resumes_on_a_screen_is_asked_before_anything_moves(lab: Lab) -> Non
 def test_a_session_goes_on_only_with_the_rig_that_it_was_begun_on(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     folder, pressed, config = begun(lab), lab.presses, lab.rig.config
     for view, said in ((replace(SMALL_VIEW, width_px=640, height_px=480), "640 x 480 px"), (ELSEWHERE, r"3\.\d mm")):
-        lab.rig.reconfigure(replace(config, view=view))
+        lab.rig.config = lab.rig.world.config = replace(config, view=view)
+        lab.rig.scene = Scene(lab.rig.world)
         with pytest.raises(NeedsOperator, match=said):
             lab.run()
     with monkeypatch.context() as patch:
