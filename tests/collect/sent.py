@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -66,7 +65,3 @@ def not_sent(config: RigConfig, planned: StepMoves, sent: Sequence[Pose]) -> lis
     over_sheet = over_sheet_move(config)
     fixed: list[Segment] = [part for part in planned.segments if not isinstance(part, Region) and part != over_sheet]
     return [pose for pose, _ in StepMoves(fixed).poses if not any(same(pose, one) for one in sent)]
-
-
-def lowest_mm(poses: Iterable[Pose]) -> float:
-    return min((pose.z_mm for pose in poses), default=math.inf)

@@ -9,8 +9,8 @@ import json
 import socket
 import struct
 import sys
-from collections.abc import AsyncIterator, Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import AsyncIterator, Iterable, Iterator
+from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +26,7 @@ from brushloop.collect.engine import CollectRequest
 from brushloop.collect.engine.live import BACKLOG, HOST, LiveView
 from brushloop.collect.errors import ConfigError
 from brushloop.drivers.devices import Frame, Stamp
+from brushloop.drivers.host import alongside
 from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.messages import image_message, pose_message
@@ -40,16 +41,15 @@ pytest.importorskip("foxglove", reason="needs the extra [live]")
 aiohttp = pytest.importorskip("aiohttp", reason="a viewer is made with it")
 
 
-def pose(t_ns: int) -> Outgoing:
-    return Outgoing(Topic.TCP, t_ns, t_ns, 0, pose_message(t_ns, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0)))
-
-
 def wrench(t_ns: int) -> Outgoing:
     return Outgoing(Topic.WRENCH, t_ns, t_ns, 0, Wrench(fx_n=0.0, fy_n=0.0, fz_n=1.5, mx_nm=0.0, my_nm=0.0, mz_nm=0.0))
 
 
-def frame(t_ns: int = 0, gray: int = 200) -> Frame:
-    return Frame(Stamp(t_ns), t_ns, np.full((1536, 2048), gray, np.uint8))
+@pytest.fixture
+def live() -> Iterator[LiveView]:
+    live = LiveView(port=0)
+    yield live
+    live.close()
 
 
 @dataclass
@@ -58,46 +58,27 @@ class Viewer:
 
     socket: Any
     """An `aiohttp.ClientWebSocketResponse`."""
+    channels: dict[int, dict[str, Any]] = field(default_factory=dict)
+    """What was advertised, and is subscribed to."""
 
-    async def next(self) -> dict[str, Any] | bytes | None:
-        """A JSON message, or the bytes of a binary one; None once the server has hung up."""
+    async def next(self) -> tuple[dict[str, Any], int, bytes] | None:
+        """(channel, log time in ns, message) that comes next; None where it is word of another kind."""
         message = await self.socket.receive(PATIENCE_S)
         if message.type is aiohttp.WSMsgType.BINARY:
-            return message.data
-        if message.type is not aiohttp.WSMsgType.TEXT:
-            return None
+            number, log_ns = struct.unpack_from("<IQ", message.data, 1)
+            return self.channels[number], log_ns, message.data[13:]
         told = json.loads(message.data)
+        if told["op"] == "advertise":
+            self.channels |= {channel["id"]: channel for channel in told["channels"]}
+            await self._subscribe(channel["id"] for channel in told["channels"])
         if told["op"] == "status" and told["message"].startswith("Unknown channel"):
             # foxglove-sdk advertises a channel a moment before it can be subscribed to.
-            await self.ask_for(int(told["message"].split()[-1]))
-        return told
+            await self._subscribe([int(told["message"].split()[-1])])
+        return None
 
-    async def ask_for(self, channel: int) -> None:
-        await self.socket.send_json({"op": "subscribe", "subscriptions": [{"id": channel, "channelId": channel}]})
-
-    async def subscribe(self) -> dict[str, Any]:
-        """To the next channel that is advertised; returns it."""
-        while True:
-            message = await self.next()
-            if isinstance(message, dict) and message["op"] == "advertise":
-                [channel] = message["channels"]
-                await self.ask_for(channel["id"])
-                return channel
-
-    async def data(self) -> tuple[int, int, bytes]:
-        """(channel, log time in ns, message) of the next message."""
-        while True:
-            message = await self.next()
-            if isinstance(message, bytes) and message[0] == 1:
-                number, log_ns = struct.unpack_from("<IQ", message, 1)
-                return number, log_ns, message[13:]
-
-
-@pytest.fixture
-def live() -> Iterator[LiveView]:
-    live = LiveView(port=0)
-    yield live
-    live.close()
+    async def _subscribe(self, numbers: Iterable[int]) -> None:
+        subscriptions = [{"id": number, "channelId": number} for number in numbers]
+        await self.socket.send_json({"op": "subscribe", "subscriptions": subscriptions})
 
 
 @contextlib.asynccontextmanager
@@ -109,48 +90,40 @@ async def watching(port: int) -> AsyncIterator[Viewer]:
         yield Viewer(socket)
 
 
-@contextlib.asynccontextmanager
-async def again_and_again(offer: Callable[[], None]) -> AsyncIterator[None]:
-    """Offer as a robot would: a subscription takes effect at some time between two messages."""
+async def test_a_viewer_sees_what_is_recorded_but_stills_and_small_jpegs_of_what_the_camera_sees(
+    live: LiveView,
+) -> None:
+    pose = Outgoing(Topic.TCP, 7, 7, 0, pose_message(7, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0)))
+    frame = Frame(Stamp(5), 5, np.full((1536, 2048), 200, np.uint8))
 
-    async def work() -> None:
+    async def offered_again_and_again() -> None:
+        """As by a robot: a subscription takes effect at some time between two messages."""
         while True:
-            offer()
+            live.offer(Outgoing(Topic.STILL, 7, 7, 0, image_message(7, b"", "png")))
+            live.offer(pose)
+            live.offer(wrench(7))
+            live.frame(frame)
             await asyncio.sleep(0.02)
 
-    working = asyncio.create_task(work())
-    yield
-    working.cancel()
+    seen: dict[str, tuple[dict[str, Any], int, bytes]] = {}
+    async with watching(live.port) as viewer, alongside(offered_again_and_again(), "offers"):
+        while len(seen) < 3:
+            if (message := await viewer.next()) is not None:
+                seen[message[0]["topic"]] = message
+        assert {channel["topic"] for channel in viewer.channels.values()} == {Topic.TCP, Topic.WRENCH, Topic.PREVIEW}
 
-
-@pytest.mark.parametrize("outgoing", [pose(7), wrench(7)], ids=["protobuf", "json"])
-async def test_a_viewer_sees_what_is_recorded_but_stills_with_its_topic_schema_and_time(
-    live: LiveView, outgoing: Outgoing
-) -> None:
-    live.offer(Outgoing(Topic.STILL, 7, 7, 0, image_message(7, b"", "png")))
-    async with watching(live.port) as viewer, again_and_again(lambda: live.offer(outgoing)):
-        channel = await viewer.subscribe()
-        number, log_ns, data = await viewer.data()
-    assert (channel["topic"], number, log_ns) == (outgoing.topic, channel["id"], 7)
-    if outgoing.topic is Topic.TCP:
-        assert channel["schemaName"] == "foxglove.PoseInFrame"
-        described = build_file_descriptor_set(PoseInFrame).SerializeToString()
-        assert base64.b64decode(channel["schema"]) == described
-        assert PoseInFrame.FromString(data) == outgoing.message
-    else:
-        assert channel["schemaName"] == "brushloop.Wrench"
-        assert json.loads(channel["schema"]) == Wrench.model_json_schema()
-        assert Wrench.model_validate_json(data) == outgoing.message
-
-
-async def test_frames_are_shown_as_small_jpegs(live: LiveView) -> None:
-    async with watching(live.port) as viewer, again_and_again(lambda: live.frame(frame(5))):
-        channel = await viewer.subscribe()
-        _, log_ns, data = await viewer.data()
-    assert (channel["topic"], log_ns) == (Topic.PREVIEW, 5)
+    channel, log_ns, data = seen[Topic.TCP]
+    assert (channel["schemaName"], log_ns) == ("foxglove.PoseInFrame", 7)
+    assert base64.b64decode(channel["schema"]) == build_file_descriptor_set(PoseInFrame).SerializeToString()
+    assert PoseInFrame.FromString(data) == pose.message
+    channel, log_ns, data = seen[Topic.WRENCH]
+    assert (channel["schemaName"], log_ns) == ("brushloop.Wrench", 7)
+    assert json.loads(channel["schema"]) == Wrench.model_json_schema()
+    assert Wrench.model_validate_json(data) == wrench(7).message
+    _, log_ns, data = seen[Topic.PREVIEW]
     shown = CompressedImage.FromString(data)
     image = cv2.imdecode(np.frombuffer(shown.data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    assert shown.format == "jpeg"
+    assert (log_ns, shown.format) == (5, "jpeg")
     assert image is not None
     assert image.shape == (768, 1024)
     assert abs(float(image.mean()) - 200.0) < 2.0
@@ -159,7 +132,8 @@ async def test_frames_are_shown_as_small_jpegs(live: LiveView) -> None:
 async def test_nobody_waits_for_a_viewer_that_does_not_read(live: LiveView) -> None:
     live.offer(wrench(0))
     async with watching(live.port) as viewer:
-        await viewer.subscribe()
+        while not viewer.channels:
+            await viewer.next()
         for t_ns in range(40 * BACKLOG):
             live.offer(wrench(t_ns))
         live.close()  # whoever waits for this viewer waits for ever

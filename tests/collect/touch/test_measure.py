@@ -25,7 +25,7 @@ from brushloop.collect.walk import check_poses, moves_of, step_poses
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import MotionFailed
 from brushloop.sessions.events import ZeroTouchResult
-from tests.collect.sent import lowest_mm, not_checked, not_sent
+from tests.collect.sent import not_checked, not_sent
 
 if TYPE_CHECKING:
     from conftest import Bench, MakeBench
@@ -231,7 +231,9 @@ async def test_no_touch_leaves_what_was_checked(
         assert all(here.z_mm >= config.motion.safe_z_mm for here, _ in beside), "it was lifted before it travelled"
     assert not not_checked(config, bench.sent, planned.segments)
     assert not not_sent(config, planned, bench.sent)
-    assert lowest_mm(bench.sent) > 120.0 - config.touch.travel_mm - 2.1  # what a lean of 1 deg over 116 mm may be
+    assert (
+        min(pose.z_mm for pose in bench.sent) > 120.0 - config.touch.travel_mm - 2.1
+    )  # what a lean of 1 deg over 116 mm may be
 
 
 async def test_the_self_check_presses_as_deep_as_was_checked(make_bench: MakeBench) -> None:
@@ -243,7 +245,7 @@ async def test_the_self_check_presses_as_deep_as_was_checked(make_bench: MakeBen
     planned = moves_of(config, plane, CHECK, patches)
     assert not not_checked(config, sent, planned.segments)
     assert not not_sent(config, planned, sent)
-    assert lowest_mm(sent) == 120.0 - config.self_check.depth_mm
+    assert min(pose.z_mm for pose in sent) == 120.0 - config.self_check.depth_mm
 
 
 def test_a_touch_that_the_operator_asks_for_by_key_is_checked_before_it(make_bench: MakeBench) -> None:

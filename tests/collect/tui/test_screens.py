@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from textual.geometry import Region
 from textual.widget import Widget
@@ -18,7 +17,6 @@ from textual.widgets import Static
 
 from brushloop.collect.engine.control import State
 from brushloop.collect.operator import Choice, Prompt
-from brushloop.collect.tui.capture_screen import COLOURS, over_photograph
 from brushloop.collect.tui.pictures import CellPicture, look_for_pixels, picture_widget
 from brushloop.collect.tui.run_screen import RunScreen
 from brushloop.collect.tui.widgets import AskScreen
@@ -94,14 +92,6 @@ PROMPT = Prompt(
     "x",
     number=7,
 )
-
-
-def test_an_overlay_has_the_edge_of_the_prediction() -> None:
-    predicted = np.zeros((128, 128), bool)
-    predicted[50:70, 40:80] = True
-    edge = (over_photograph(np.full((500, 500), 255, np.uint8), predicted) == COLOURS["predicted only"]).all(axis=-1)
-    assert 0 < edge.mean() < 0.05
-    assert not edge[:140].any()
 
 
 async def test_a_key_answers_the_question_that_is_shown_and_the_next_one_comes() -> None:
