@@ -118,11 +118,8 @@ def moves_of(
 
 
 def touch_of(config: RigConfig, step: ZeroTouchStep) -> TouchConfig:
-    """How and where a ZERO_TOUCH step touches. Raises ValueError for too few points for its method."""
-    if step.method is None:
-        return config.touch
-    # The operator may measure even where the taught height is configured.
-    return TouchConfig.model_validate(config.touch.model_dump() | {"method": step.method})
+    """How and where a ZERO_TOUCH step touches. The operator may measure even where the taught height is configured."""
+    return config.touch if step.method is None else config.touch.model_copy(update={"method": step.method})
 
 
 def _touches(config: RigConfig, step: ZeroTouchStep, dips: int) -> StepMoves:
@@ -230,11 +227,10 @@ PlannedPose = tuple[Pose, float, str]
 
 def check_protocol(rig_path: Path, protocol_path: Path, rig: RigConfig, protocol: ProtocolConfig) -> None:
     """Raise `ConfigError` with file, field and range for the first problem."""
-    first_round = [stroke for stroke in protocol.planned() if stroke.repeat == 1]  # the others repeat it
-    sheet = sheet_of(rig, protocol)
+    strokes, sheet = protocol.planned(), sheet_of(rig, protocol)
     _check_sheet(rig_path, protocol_path, rig, protocol, sheet)
-    _check_brush(protocol_path, rig.brush, first_round, sheet.patch(0))
-    _check_touch_point(rig_path, rig.paper, first_round, sheet)
+    _check_brush(protocol_path, rig.brush, strokes, sheet.patch(0))
+    _check_touch_point(rig_path, rig.paper, strokes, sheet)
     check_poses(rig_path, rig, all_poses(rig, protocol, PaperPlane(rig.paper.touch_z_mm)))
 
 

@@ -153,7 +153,7 @@ class _DesignConfig(StrokesConfig):
     def press(self, condition: Condition, repeat: int) -> Planned:
         """The press of a condition in round `repeat`, counted from 1."""
         name = f"H{condition.depth_mm:g}-a{condition.tilt_deg:g}-r{repeat:02d}"
-        return Planned(name, condition, repeat, dwell_s=self.dwell_s)
+        return Planned(name, condition, dwell_s=self.dwell_s)
 
 
 class GridConfig(_DesignConfig, RoundsConfig):
@@ -256,7 +256,7 @@ class ListConfig(_TableConfig):
             if row.stroke_id is not None:
                 name = row.stroke_id + (ending if repeat > 1 else "")
             dwell_s = self.dwell_s if row.dwell_s is None else row.dwell_s
-            strokes.append(Planned(name, Condition(row.depth_mm, row.tilt_deg), repeat, dwell_s=dwell_s))
+            strokes.append(Planned(name, Condition(row.depth_mm, row.tilt_deg), dwell_s=dwell_s))
         return strokes
 
 
@@ -295,7 +295,6 @@ class ReplayConfig(_TableConfig):
             Planned(
                 f"{row.stroke_id}~{repeat}",
                 Condition(row.depth_mm, row.tilt_deg),
-                repeat,
                 dwell_s=self.dwell_s,
                 again_of=row.stroke_id,
             )
@@ -382,5 +381,5 @@ class WriteConfig(RoundsConfig):
             drawn = Drawn([list(stroke.points) for stroke in figure.strokes], self.speed_mm_s)
             points = itertools.chain.from_iterable(drawn.strokes)
             _, _, depth_mm, tilt_deg, _ = max(points, key=lambda point: point[2])
-            strokes.append(Planned(f"{figure.name}-r{repeat:02d}", Condition(depth_mm, tilt_deg), repeat, drawn=drawn))
+            strokes.append(Planned(f"{figure.name}-r{repeat:02d}", Condition(depth_mm, tilt_deg), drawn=drawn))
         return strokes

@@ -159,8 +159,6 @@ class Planned:
     stroke_id: str
     condition: Condition
     """What is commanded; of a figure, at its deepest point."""
-    repeat: int
-    """Round, from 1."""
     index: int = 0
     """Number in the plan, which is part of the keys of its steps."""
     dwell_s: float = 0.0

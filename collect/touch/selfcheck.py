@@ -65,10 +65,8 @@ def partners(sheet: Sheet, patch: Patch, used: Set[int]) -> tuple[Patch, ...]:
         itertools.product(along_row, along_column),
         key=lambda pair: -abs(pair[0].anchor_mm[0] - x_mm) * abs(pair[1].anchor_mm[1] - y_mm),
     )
-    for pair in pairs:
-        if _second_best(np.array([corner.anchor_mm for corner in (patch, *pair)])) >= UNEVEN:
-            return pair
-    return ()
+    wide = (pair for pair in pairs if _second_best(np.array([corner.anchor_mm for corner in (patch, *pair)])) >= UNEVEN)
+    return next(wide, ())
 
 
 def triangle_on(patches: Sequence[Patch]) -> Triangle:
@@ -170,9 +168,8 @@ def judge(commanded_mm: Floats, found_mm: Floats, config: SelfCheckConfig) -> Se
 
 def _linear(commanded_mm: Floats, found_mm: Floats) -> Floats:
     """(2, 2): the linear part of the affine map from one triangle to the other."""
-    (ax, ay), (bx, by) = commanded_mm[1:] - commanded_mm[0]
-    inverse = np.array([[by, -ay], [-bx, ax]], np.float64) / (ax * by - ay * bx)
-    return np.asarray((inverse @ (found_mm[1:] - found_mm[0])).T, np.float64)
+    edges_mm, found_edges_mm = commanded_mm[1:] - commanded_mm[0], found_mm[1:] - found_mm[0]
+    return np.asarray(np.linalg.solve(edges_mm, found_edges_mm), np.float64).T
 
 
 def _second_best(commanded_mm: Floats) -> float:

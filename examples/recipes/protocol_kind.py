@@ -30,4 +30,4 @@ class StairsConfig(RoundsConfig):
         """The presses of round `repeat`, counted from 1, in order; with a seed they are shuffled afterwards."""
         step_mm = (self.to_mm - self.from_mm) / (self.count - 1)
         depths_mm = [self.from_mm + step_mm * number for number in range(self.count)]
-        return [Planned(f"H{depth_mm:g}-r{repeat:02d}", Condition(depth_mm, 0.0), repeat) for depth_mm in depths_mm]
+        return [Planned(f"H{depth_mm:g}-r{repeat:02d}", Condition(depth_mm, 0.0)) for depth_mm in depths_mm]
