@@ -40,32 +40,26 @@ async def test_an_arm_that_is_not_on_automatic_is_neither_set_nor_powered(
     assert cabinet.cabinet.tcp_offset == [0.0] * 6
 
 
-async def test_what_is_configured_is_set_in_the_wires_units_and_nothing_moves(make_arm: MakeArm, cabinet: Cabinet):
-    before = cabinet.tool
-    await enabled(make_arm, payload_kg=0.4, payload_cog_mm=(0.0, 1.0, 60.0), collision_level=8)
-    box = cabinet.cabinet
-    assert box.payload == [0.4, [0.0, 0.001, 0.06], [0.0] * 3, [0.0] * 6]
-    assert (box.collision_level, box.tcp_offset) == (8, [0.0, 0.0, 0.18, 0.0, 0.0, 0.0])
-    assert box.power.mode == RobotMode.RUNNING
-    assert box.world.tool() == before
+async def test_what_is_configured_is_set_in_the_wires_units_and_a_brush_askew_on_its_flange_is_pressed_upright(
+    make_arm: MakeArm, cabinet: Cabinet
+):
+    box, before = cabinet.cabinet, cabinet.tool
+    turn = {"tcp_offset_mm": (4.0, -7.0, 180.0), "tcp_rotation_deg": (2.0, -1.5, 0.0)}
+    arm = await enabled(make_arm, **turn, payload_kg=0.4, payload_cog_mm=(0.0, 1.0, 60.0), collision_level=8)
+    assert (box.payload, box.collision_level) == ([0.4, [0.0, 0.001, 0.06], [0.0] * 3, [0.0] * 6], 8)
+    assert box.tcp_offset == pytest.approx([0.004, -0.007, 0.18, math.radians(2.0), math.radians(-1.5), 0.0])
+    assert (box.power.mode, box.world.tool()) == (RobotMode.RUNNING, before), "nothing has moved"
+    await arm.move(NEAR, **QUICK)
+    joints = box.motion.joints(box.now_s())
+    flange = from_wire(box.fk({"q": [*joints]})[0])
+    assert distance(flange, NEAR)[0] < 0.1
+    assert lean(pose_of(forward(joints)))[0] == pytest.approx(2.5, abs=0.05)
 
 
 async def test_reduced_mode_and_a_cabinet_without_operational_modes_are_allowed(make_arm: MakeArm, cabinet: Cabinet):
     cabinet.cabinet.operational_mode = "Disabled"
     cabinet.cabinet.power.safety = SafetyMode.REDUCED
     await (await enabled(make_arm)).move(NEAR, **QUICK)
-
-
-async def test_a_brush_that_is_not_square_to_the_flange_is_pressed_upright(make_arm: MakeArm, cabinet: Cabinet):
-    turn = {"tcp_offset_mm": (4.0, -7.0, 180.0), "tcp_rotation_deg": (2.0, -1.5, 0.0)}
-    arm = await enabled(make_arm, **turn)
-    expected = [0.004, -0.007, 0.18, math.radians(2.0), math.radians(-1.5), 0.0]
-    assert cabinet.cabinet.tcp_offset == pytest.approx(expected)
-    await arm.move(NEAR, **QUICK)
-    joints = cabinet.cabinet.motion.joints(cabinet.cabinet.now_s())
-    flange = from_wire(cabinet.cabinet.fk({"q": [*joints]})[0])
-    assert distance(flange, NEAR)[0] < 0.1
-    assert lean(pose_of(forward(joints)))[0] == pytest.approx(2.5, abs=0.05)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import math
 import re
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -16,8 +15,8 @@ from typing import Any
 import pytest
 
 from brushloop.drivers.arcs.controller import survey
-from brushloop.drivers.arcs.wire import Framing, RpcConnection, answer_in
-from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation, RpcError
+from brushloop.drivers.arcs.wire import RpcConnection, answer_in
+from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation
 from brushloop.drivers.sim.faults import Device, Fault
 from brushloop.drivers.sim.rig import HOST
 from tests.drivers.arcs.conftest import Cabinet
@@ -94,37 +93,6 @@ async def test_closing_wakes_the_caller_that_still_waits(cabinet: Cabinet, clien
     await client.close()
     with pytest.raises(NotConnected, match="closed while waiting"):
         await waiting
-
-
-STOP_LINE, MOVE_LINE = "rob1.MotionControl.stopLine", "rob1.MotionControl.moveLine"
-PACE = {"a": 1.0, "v": 1.0, "blend_radius": 0.0, "duration": 0.0}
-NONSENSE: list[tuple[str, dict[str, object], int]] = [
-    ("Nonsense", {}, -32601),
-    (STOP_LINE, {"acc": "fast", "acc_rot": 1.0}, -32602),
-    (MOVE_LINE, {"pose": [1], **PACE}, -32602),
-    ("rob1.RobotAlgorithm.forwardKinematics", {"q": [math.inf] * 6}, -32602),
-]
-
-
-@pytest.mark.parametrize("framing", ["sof", "bare"])
-async def test_the_loopback_controller_answers_nonsense_with_the_codes_of_json_rpc(cabinet: Cabinet, framing: Framing):
-    connection = RpcConnection(HOST, cabinet.port, framing=framing)
-    await connection.open()
-    for method, params, code in NONSENSE:
-        with pytest.raises(RpcError, match=re.escape(f"{method}: controller answered error {code}")) as caught:
-            await connection.call(method, params)
-        assert caught.value.code == code
-    assert await connection.call("getRobotNames") == ["rob1"]
-    await connection.close()
-
-
-@pytest.mark.parametrize(("sent", "answer"), [(b"[1]", b"-32600"), (b"SOF\x00\x00\x09__login__", b"SUCCEED")])
-async def test_what_is_no_request_gets_an_error_and_a_frame_may_be_short(cabinet: Cabinet, sent: bytes, answer: bytes):
-    reader, writer = await asyncio.open_connection(HOST, cabinet.port)
-    writer.write(sent)
-    assert answer in await reader.read(4096)
-    writer.close()
-    await writer.wait_closed()
 
 
 async def test_a_cabinet_that_does_not_answer_the_login_is_asked_all_the_same(cabinet: Cabinet) -> None:
