@@ -275,16 +275,6 @@ def test_joining_in_mid_round_is_no_fault_and_each_round_without_one_frame_is_dr
     assert parts.torn == 6
 
 
-@pytest.mark.parametrize("bad", [math.nan, -math.inf, -1000.5])
-@pytest.mark.parametrize("axis", range(6))
-def test_what_no_sensor_can_measure_is_refused(axis: int, bad: float):
-    values, parts = list(WRENCH), RoundAssembler()
-    values[axis] = bad
-    assert feed(parts, values) == []
-    assert (parts.torn, parts.refused) == (0, 1)
-    assert feed(parts, WRENCH) == [WRENCH]
-
-
 def test_with_frames_lost_or_late_at_random_every_wrench_is_of_one_round(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sri_m8123, "ROUND_S", 0.005)
     rng = random.Random(22)

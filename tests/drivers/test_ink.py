@@ -33,8 +33,9 @@ from tests.waiting import until
 
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No reply is too late while one is being made, and a silence is over at once."""
+    """No reply is too late while one is being made, a silence ends at once, and a busy machine may hold a dose up."""
     monkeypatch.setattr(port_module, "time", PatientLine.clock)
+    monkeypatch.setattr(pump_module, "MAX_OVERRUN_S", math.inf)
     monkeypatch.setattr(station_module, "CONNECT_ATTEMPTS", 2)
 
 

@@ -7,10 +7,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from brushloop.drivers.sim.config import CORNERS
 from brushloop.drivers.sim.lab import UnknownLab
 from brushloop.drivers.sim.lab_facts import draw, in_picture
 from brushloop.drivers.sim.rig import ControlServer
@@ -37,19 +35,6 @@ def test_a_seed_is_one_lab_and_one_that_could_be(seed: int):
     assert not in_picture(facts.config, [facts.park_mm])
     assert min(table.sheet_mm) > 150.0
     assert max(abs(v) for v in table.slope_deg) <= 1.0
-
-
-async def test_the_hand_brings_the_true_tip_to_the_thing():
-    lab, off_mm = lab_of(4), list[float]()
-    for index in range(12):
-        await lab.bring("pin", index)
-        off_mm += np.subtract(lab.world.tool().position_mm, lab.facts.pin_mm).tolist()
-    for name in CORNERS:
-        await lab.bring("board-corner", 0, name)
-        off_mm += np.subtract(lab.world.tool().position_mm, lab.facts.config.table.corner("board", name)).tolist()
-    assert 0.2 < float(np.std(off_mm)) < 0.4
-    assert max(map(abs, off_mm)) < 0.8
-    assert lab.world.presses == []
 
 
 def test_the_cabinet_begins_with_the_tool_and_the_payload_that_somebody_left_in_it():

@@ -23,7 +23,6 @@ from brushloop.drivers.sim.brush.spec import PAPER, load_brush
 from brushloop.drivers.sim.config import SimConfig, Table
 from brushloop.drivers.sim.rig import rig_toml
 from brushloop.drivers.sim.world import INK_PER_PRESS, Press, World, bent_toward
-from tests.command import brushloop
 
 PRESSED = (
     (3986.908, 3129.639, 3100.391),
@@ -137,14 +136,6 @@ def test_the_rig_toml_of_the_paper_s_brush_says_where_its_marks_begin() -> None:
     quality = tomllib.loads(rig_toml(SimConfig(brush=paper.brush, head=paper.quality)))["quality"]
     assert quality == {"head_mm": paper.quality.head_mm, "misplaced_mm": paper.quality.misplaced_mm}
     assert "quality" not in tomllib.loads(rig_toml(SimConfig()))
-
-
-def test_the_rig_is_served_with_the_brush_and_records_its_name(tmp_path: Path) -> None:
-    path = written(tmp_path, 'name = "our goat-hair brush"\n[brush]\nradius_mm = 5.0\nlength_mm = 45.0\n')
-    rig = tmp_path / "rig.toml"
-    assert brushloop("sim", "--brush", path, "--write-rig", rig, "--idle-exit", "0.1").returncode == 0
-    brush = tomllib.loads(rig.read_text())["brush"]
-    assert (brush["name"], brush["radius_mm"], brush["length_mm"]) == ("our goat-hair brush", 5.0, 45.0)
 
 
 TABLE = Table()
