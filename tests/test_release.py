@@ -50,12 +50,6 @@ def brushloop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "clean" / "bin" / "brushloop"
 
 
-COMPLETIONS = [
-    ("bash", {"COMP_WORDS": "brushloop sess", "COMP_CWORD": "1"}, "sessions"),
-    ("zsh", {"_TYPER_COMPLETE_ARGS": "brushloop sessions ex"}, "export"),
-]
-
-
 @pytest.fixture
 def command() -> Path:
     """The command beside this Python."""
@@ -65,11 +59,9 @@ def command() -> Path:
     return path
 
 
-@pytest.mark.parametrize(("shell", "typed", "completed"), COMPLETIONS, ids=["bash", "zsh"])
-def test_a_shell_is_given_what_completes_a_command(
-    command: Path, tmp_path: Path, shell: str, typed: dict[str, str], completed: str
-) -> None:
-    assert completed in run(command, cwd=tmp_path, _BRUSHLOOP_COMPLETE=f"complete_{shell}", **typed)
+def test_a_shell_is_given_what_completes_a_command(command: Path, tmp_path: Path) -> None:
+    typed = {"COMP_WORDS": "brushloop sess", "COMP_CWORD": "1"}
+    assert "sessions" in run(command, cwd=tmp_path, _BRUSHLOOP_COMPLETE="complete_bash", **typed)
 
 
 FOLDERS = ("calibrate", "collect", "drivers", "model", "sessions", "twin")
@@ -100,7 +92,6 @@ def test_a_project_with_folders_of_our_names_works_beside_an_editable_installati
     project = another_project(tmp_path)
     assert "1 passed" in run(sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", project, cwd=project)
     assert run(sys.executable, "-m", "brushloop", "--version", cwd=project) == "brushloop 0.1.0\n"
-    assert "collect" in run(command, "--help", cwd=project)
 
 
 @pytest.mark.soak  # builds, installs, and takes as long as `make demo`
@@ -173,9 +164,3 @@ def test_what_is_locked_is_what_the_project_asks_for(extra: str) -> None:
     asked = PROJECT["optional-dependencies"][extra] if extra else PROJECT["dependencies"]
     for requirement in map(Requirement, asked):
         assert requirement.specifier.contains(every[canonicalize_name(requirement.name)]), requirement
-
-
-def test_what_is_installed_here_is_what_is_locked() -> None:
-    for name, version in {**locked("run.lock"), **locked("dev.lock")}.items():
-        if name not in {"setuptools", "pyaubo-sdk"}:  # not needed or not offered for every Python
-            assert metadata.version(name) == version, name
