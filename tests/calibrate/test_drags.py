@@ -89,7 +89,6 @@ def test_dragged_strokes_are_fitted_and_written(session: Path, fitted: tuple[Pat
     assert model.leash_mm + 6.0 * model.leash_per_mm > 1.0
     assert fit.parameters["half_mm"].low is not None
     assert fit.parameters["settle_mm"].low is None  # each depth is constant along its path
-    assert fit_command(session)[0] == path, "equal inputs give an equal file"
 
 
 def test_another_session_is_predicted_stroke_by_stroke(session: Path, fitted: tuple[Path, str], tmp_path: Path) -> None:
@@ -110,7 +109,9 @@ def test_another_session_is_predicted_stroke_by_stroke(session: Path, fitted: tu
 def test_a_known_brush_is_adapted_to_few_strokes(session: Path, fitted: tuple[Path, str]) -> None:
     before = DragArtefact.read(fitted[0])
     options = ("--prior", str(fitted[0]), "--strokes")
-    adapted = DragArtefact.read(fit_command(session, *options, "2")[0])
+    first, again = (fit_command(session, *options, "2")[0] for _ in range(2))
+    assert first == again, "equal inputs give an equal file"
+    adapted = DragArtefact.read(first)
     assert (adapted.prior, len(adapted.fitted_strokes)) == (before.digest, 2)
     assert adapted.parameters["settle_mm"] == before.parameters["settle_mm"]
     assert adapted.refitted[:2] == ("half_mm", "half_per_mm")
@@ -158,8 +159,6 @@ def page(defect: str) -> np.ndarray:
         case "cut":
             image[:, LEFT + 370 : LEFT + 390] = 185
             image[TOP - 25 : TOP + 25, LEFT + 390 :] = 30
-        case _:
-            pass
     return image
 
 
@@ -269,7 +268,7 @@ def repeated(conditions: int, repeats: int, mm_up: list[int] | None = None, flaw
 
 
 def test_lag_and_width_are_found_again() -> None:
-    values = fit_values(drawings(arcs(12, 1)))
+    values = fit_values(drawings(arcs(12, 1)).every(2))
     model, half_mm = model_of(values), values["half_mm"]
     for depth in (4.0, 8.0):
         assert model.leash_mm + model.leash_per_mm * depth == pytest.approx(3.0 + 0.5 * depth, rel=0.15)

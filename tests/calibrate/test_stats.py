@@ -60,9 +60,6 @@ def test_a_paired_test_counts_every_flip_of_whole_conditions() -> None:
     assert (found.n, found.groups, found.p) == (40, 4, pytest.approx(2 / 16))
     assert found.interval is not None
     assert found.interval[1] - found.interval[0] > 1.0
-
-
-def test_equal_scores_do_not_differ_and_none_give_no_test() -> None:
     same = paired(np.ones(20), np.ones(20), np.arange(20))
     assert same is not None
     assert same.p == 1.0

@@ -220,19 +220,14 @@ TRUE = brush_of(half_mm_2=-0.1, leash_mm=1.2, across_mm=0.6)
 """The brush that writes: thinner, farther behind and farther to the left than the one that the plan knows."""
 
 
-def plan_of() -> Plan:
+@pytest.fixture(scope="module")
+def plan() -> Plan:
     by = PlannedBy(footprint=KNOWN.values)
     strokes = first_lead([LINE], KNOWN, by.reach, SIDE_MM, 5.0)
     strokes = lead([KNOWN], strokes, WANTED, SIDE_MM, by.reach)
     median = tuple((x, y, 2.0) for x, y in LINE.points.tolist())
-    figure = Figure(
-        name="bar",
-        source="test",
-        commanded=as_points(strokes),
-        wanted=WANTED,
-        simulated=WANTED,
-        medians=(median,),
-    )
+    seen = {"wanted": WANTED, "simulated": WANTED}
+    figure = Figure(name="bar", source="test", commanded=as_points(strokes), medians=(median,), **seen)
     return Plan(model="footprint", planned_by=by, cell_mm=SIDE_MM, software="test", figures=(figure,))
 
 
@@ -245,11 +240,6 @@ def session(plan: Plan, name: str = "bar", ink: np.ndarray | None = None) -> Wri
     figure = plan.figures[0].model_copy(update={"name": name})
     character = Character(figure, {f"{name}-r01": as_ink(seen)})
     return WritingComparison(opened("s", Path("s.mcap"), calibration=CALIBRATION), plan, [character])
-
-
-@pytest.fixture(scope="module")
-def plan() -> Plan:
-    return plan_of()
 
 
 @pytest.fixture(scope="module")
@@ -281,6 +271,8 @@ def test_after_a_round_that_does_not_help_the_best_one_is_kept(plan: Plan, after
     assert len(figure.rounds) == 2
     # Once settled it stays, whatever the next round shows.
     assert learned(session(last, ink=WANTED)).figures[0].settled
+    with pytest.raises(CalibrationError, match="shows no 'bar'"):
+        learned(session(plan, "other"))
 
 
 def test_the_report_lists_rounds_and_what_each_phase_lost(after: Plan, tmp_path: Path) -> None:
@@ -289,11 +281,6 @@ def test_the_report_lists_rounds_and_what_each_phase_lost(after: Plan, tmp_path:
     assert "bar: wrong pixels (missing or too much) by phase of the strokes" in page
     assert "<th>phase</th><th>round 1</th><th>these writings</th>" in page
     assert "<td>initiation, hidden tip</td>" in page
-
-
-def test_a_character_that_was_not_captured_teaches_nothing(plan: Plan) -> None:
-    with pytest.raises(CalibrationError, match="shows no 'bar'"):
-        learned(session(plan, "other"))
 
 
 def test_what_is_lost_is_listed_by_phase(plan: Plan) -> None:

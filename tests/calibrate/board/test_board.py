@@ -243,13 +243,10 @@ def test_a_misnamed_corner_is_dropped_and_corners_on_no_plane_are_refused(seen) 
         flat(pixels + np.random.default_rng(1).normal(0, 4, pixels.shape), paper)
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [({"dictionary": "DICT_NONE"}, "not one of OpenCV's"), ({"marker_mm": 20.0}, "must be less than")],
-)
-def test_a_board_that_cannot_be_is_refused(change: dict[str, object], words: str) -> None:
-    with pytest.raises(ValidationError, match=words):
-        BoardSpec.model_validate(SPEC.model_dump() | change)
+def test_a_board_that_cannot_be_is_refused() -> None:
+    for change, words in (({"dictionary": "DICT_NONE"}, "not one of OpenCV's"), ({"marker_mm": 20.0}, "must be less")):
+        with pytest.raises(ValidationError, match=words):
+            BoardSpec.model_validate(SPEC.model_dump() | change)
 
 
 def printed(board: Board) -> np.ndarray:

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -72,105 +68,54 @@ def test_a_recording_that_is_not_the_one_its_journal_closed_is_damaged(session: 
         open_session(folder)
 
 
-needs_dask = pytest.mark.skipif(find_spec("distributed") is None, reason="needs the extra [cluster]")
-"""Looked for and not imported: every worker collects this file."""
-
-
-@dataclass(frozen=True)
-class Cluster:
-    address: str
-    workers: list[subprocess.Popen[bytes]]
-
-
-@contextmanager
-def cluster_of_two(folder: Path) -> Iterator[Cluster]:
-    scheduler_file = folder / "scheduler.json"
-    started: list[subprocess.Popen[bytes]] = []
-
-    def start(*words: str) -> subprocess.Popen[bytes]:
-        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        started.append(subprocess.Popen([sys.executable, "-m", *words], cwd=folder, **quiet))
-        return started[-1]
-
-    try:
-        here = ("--host", "127.0.0.1", "--no-dashboard")
-        start("distributed.cli.dask_scheduler", "--port", "0", "--scheduler-file", str(scheduler_file), *here)
-        wait_until(lambda: scheduler_file.is_file() and scheduler_file.read_text(), "the scheduler to listen")
-        address = json.loads(scheduler_file.read_text())["address"]
-        words = ("distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny", *here)
-        workers = [start(*words), start(*words)]
-        there = f"from distributed import Client; Client({address!r}).wait_for_workers(2)"
-        subprocess.run([sys.executable, "-c", there], check=True, timeout=PATIENCE_S)
-        yield Cluster(address, workers)
-    finally:
-        for process in reversed(started):
-            process.kill()
-            process.wait()
-
-
-@pytest.fixture(scope="module")
-def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    """For all tests here, in their order: the last of them kills a worker."""
-    with cluster_of_two(tmp_path_factory.mktemp("cluster")) as made:
-        yield made
-
-
-def refused_by(address: str, setting: str) -> str:
-    """Why a cluster cannot be used, from a process of its own: the client leaves a thread behind."""
-    program = (
-        f"import brushloop.calibrate.work as work; work.{setting}\n"
-        "from brushloop.calibrate.errors import CalibrationError\n"
-        f"try:\n    with work.cluster({address!r}):\n        pass\n"
-        "except CalibrationError as error:\n    print(error)\n"
-    )
-    command = [sys.executable, "-c", program]
-    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=PATIENCE_S).stdout
-
-
-@needs_dask
-@pytest.mark.xdist_group("cluster")
-def test_no_scheduler_there_is_one_clear_line() -> None:
-    said = refused_by("tcp://127.0.0.1:9", "CONNECT_S = 5.0")
-    assert said.count("\n") == 1
-    assert "tcp://127.0.0.1:9: no Dask scheduler there" in said
-
-
-@needs_dask
-@pytest.mark.xdist_group("cluster")
-def test_a_worker_with_other_software_is_refused(cluster: Cluster) -> None:
-    said = refused_by(cluster.address, "VERSION = 'of tomorrow'")
-    assert "has brushloop" in said
-    assert "(work of tomorrow) is needed there" in said
-
-
-@needs_dask
-@pytest.mark.xdist_group("cluster")
-def test_jobs_come_back_whole_and_alike_though_a_worker_dies(cluster: Cluster, session: Path, tmp_path: Path) -> None:
-    program = f"""
-import os, signal
+CLUSTER = """
+import os, signal, sys
 from pathlib import Path
+from distributed import LocalCluster
+from brushloop.calibrate import work
+from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.presses import prepare_job
-from brushloop.calibrate.work import Store, cluster, threads
 from brushloop.sessions.recording import Recording
-captures = list(Recording(Path({str(session)!r})).captures()) * 3
-jobs = [(str(k), (one, None)) for k, one in enumerate(captures)]
-def plain(results):
-    return {{name: {{part: array.tolist() for part, array in arrays.items()}} for name, arrays in results}}
-there = {{}}
-with cluster({cluster.address!r}) as pool:
-    for name, press in pool.finished(prepare_job, iter(jobs), Store(Path({str(tmp_path)!r}, "there"))):
-        there[name] = press
-        if len(there) == 5:
-            os.kill({cluster.workers[0].pid}, signal.SIGKILL)
-with threads(1) as pool:
-    here = dict(pool.finished(prepare_job, iter(jobs), Store(Path({str(tmp_path)!r}, "here"))))
-print(len(there), plain(there.items()) == plain(here.items()))
+
+def refused(address):
+    try:
+        with work.cluster(address):
+            pass
+    except CalibrationError as error:
+        return str(error)
+
+def done(pool, folder, by=None):
+    results = {}
+    for name, arrays in pool.finished(prepare_job, iter(jobs), work.Store(Path(folder))):
+        results[name] = {part: array.tolist() for part, array in arrays.items()}
+        if len(results) == 5 and by is not None:
+            os.kill(by, signal.SIGKILL)
+    return results
+
+session, here, there = sys.argv[1:]
+jobs = [(str(k), (one, None)) for k, one in enumerate(list(Recording(Path(session)).captures()) * 2)]
+with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+    address, worker = cluster.scheduler_address, cluster.workers[0].pid
+    with work.cluster(address) as pool, work.threads(1) as alone:
+        results = done(pool, there, by=worker)
+        print(len(results), results == done(alone, here))
+    work.VERSION, work.CONNECT_S = "of tomorrow", 2.0
+    print(refused(address))
+    print(refused("tcp://127.0.0.1:9"))
 """
-    ran = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=PATIENCE_S
-    )
-    assert ran.stdout == "33 True\n", ran.stderr
-    assert cluster.workers[0].wait(10.0) != 0
+
+
+@pytest.mark.skipif(find_spec("distributed") is None, reason="needs the extra [cluster]")
+def test_a_cluster_does_the_same_though_a_worker_dies_and_what_cannot_be_used_is_one_line(
+    session: Path, tmp_path: Path
+) -> None:
+    command = [sys.executable, "-c", CLUSTER, session, tmp_path / "here", tmp_path / "there"]
+    ran = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
+    jobs, other_software, nobody = ran.stdout.splitlines()
+    assert jobs == "22 True", ran.stderr
+    assert "has brushloop" in other_software
+    assert "(work of tomorrow) is needed there" in other_software
+    assert "tcp://127.0.0.1:9: no Dask scheduler there" in nobody
 
 
 def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

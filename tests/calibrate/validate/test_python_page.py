@@ -20,13 +20,10 @@ from tests.blocks import ROOT, blocks_of
 from tests.calibrate.validate.conftest import MakeSession
 
 
-def run_python(code: str) -> str:
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-
-
 def test_the_import_loads_nothing_heavy() -> None:
     heavy = ("torch", "cv2", "textual", "numpy", "typing", "pydantic")
-    assert run_python(f"import sys, brushloop; print([name for name in {heavy} if name in sys.modules])") == "[]\n"
+    code = f"import sys, brushloop; print([name for name in {heavy} if name in sys.modules])"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True) == "[]\n"
 
 
 def test_every_name_of_the_door_is_there_and_no_other() -> None:
