@@ -16,6 +16,7 @@ from brushloop.collect.commission.visit import Notebook, Step, Taught, Visit, ch
 from brushloop.collect.errors import NotAccepted
 from brushloop.collect.operator import Choice, Prompt
 from brushloop.collect.rig.check import brush_shorter_than_tool, deepest_press
+from brushloop.collect.rig.devices import identified
 from brushloop.collect.rig.paper import PaperPlane
 from brushloop.drivers.devices import ForceSample
 from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL, ForceTable, SriM8123
@@ -85,8 +86,7 @@ class BrushStep(Step):
     async def _primed(self, visit: Visit, config: InkTable) -> None:
         visit.working(f"asking {config.port} who it is")
         device = config.device(visit.clock)
-        try:
-            identity = await device.connect()
+        async with identified(device) as identity:
             level = await device.level()
             gauge = "no gauge" if level is None else f"well {level:.0%} full"
             visit.say(f"{identity.model} {identity.firmware}: {gauge}")
@@ -96,8 +96,6 @@ class BrushStep(Step):
                 level = await device.level()
                 if level is not None:
                     visit.say(f"well {level:.0%} full")
-        finally:
-            await device.close()
 
 
 LOOPBACK_STALE_MS = 1000.0
@@ -159,9 +157,8 @@ class ForceStep(Step):
     async def _pushed(self, visit: Visit) -> None:
         samples = list[ForceSample]()
         sensor = SriM8123(ForceTable.model_validate(visit.notebook.table("force.")), visit.clock)
-        try:
-            visit.working("listening to the sensor; let nothing touch the brush")
-            identity = await sensor.connect()
+        visit.working("listening to the sensor; let nothing touch the brush")
+        async with identified(sensor) as identity:
             await sensor.bias(REST_S)
             sensor.listen(samples.append)
             await asyncio.sleep(REST_S)
@@ -175,9 +172,6 @@ class ForceStep(Step):
             await visit.brought("push-sensor 0", how)
             await asyncio.sleep(REST_S)
             force_n = strongest(samples)
-        finally:
-            sensor.listen(None)
-            await sensor.close()
         axis = judged_push(force_n, noise_n)
         how = f"a finger pushed the tip with {float(np.linalg.norm(force_n)):.1f} N"
         if axis[2] > 0.0:

@@ -22,6 +22,7 @@ from brushloop.collect.commission.visit import NO, YES, Notebook, Step, Taught, 
 from brushloop.collect.errors import NotAccepted
 from brushloop.collect.operator import Prompt
 from brushloop.collect.photograph.frames import gray
+from brushloop.collect.rig.devices import identified
 from brushloop.drivers.camera import CameraTable, Locked, OpenCvCamera, found_settings
 from brushloop.drivers.devices import Stamp
 from brushloop.drivers.errors import DeviceError
@@ -108,7 +109,7 @@ class CameraStep(Step):
         while over_sheet != YES.key:
             source = str(await visit.ask(question))
             visit.working(f"waiting for a picture of {source}")
-            async with opened(source, visit.clock) as camera:
+            async with opened(visit, source) as camera:
                 picture = await still(camera, visit.clock)
             view = await _board_in(visit, picture, source, lying=False)
             corners, (height, width) = 0 if view is None else len(view.ids), picture.shape
@@ -214,22 +215,20 @@ def board_of(notebook: Notebook) -> BoardSpec:
 
 
 @contextlib.asynccontextmanager
-async def opened(source: str, clock: Clock, locked: Locked | None = None) -> AsyncGenerator[OpenCvCamera]:
-    """A connected camera, closed at the end. Raises `DeviceError`, also for a setting that the camera does not keep."""
-    camera = OpenCvCamera(
-        CameraTable(kind="opencv", source=source, latency_ms=LATE_MS, locked=locked or Locked()), clock
-    )
-    await camera.connect()
-    try:
+async def opened(visit: Visit, source: str) -> AsyncGenerator[OpenCvCamera]:
+    """A connected camera, its settings locked as far as they were taught.
+
+    Raises `DeviceError`, also for a setting that the camera does not keep.
+    """
+    locked = Locked.model_validate(visit.notebook.table("camera.locked."))
+    camera = OpenCvCamera(CameraTable(kind="opencv", source=source, latency_ms=LATE_MS, locked=locked), visit.clock)
+    async with identified(camera):
         yield camera
-    finally:
-        await camera.close()
 
 
 def taught_camera(visit: Visit) -> AbstractAsyncContextManager[OpenCvCamera]:
-    """The camera that was taught, with its settings locked."""
-    locked = Locked.model_validate(visit.notebook.table("camera.locked."))
-    return opened(visit.notebook.get("camera.source"), visit.clock, locked)
+    """The camera that was taught."""
+    return opened(visit, visit.notebook.get("camera.source"))
 
 
 async def still(camera: OpenCvCamera, clock: Clock) -> Gray:

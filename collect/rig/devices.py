@@ -67,6 +67,15 @@ def sole_driver(host: str, port: int) -> Generator[None]:
 
 
 @contextlib.asynccontextmanager
+async def identified(device: Device) -> AsyncGenerator[Identity]:
+    """Who a device is, which is connected within the block, and closed in any case. Raises `DeviceError`."""
+    try:
+        yield await device.connect()
+    finally:
+        await device.close()
+
+
+@contextlib.asynccontextmanager
 async def connected(config: RigConfig, clock: Clock, on_notice: Callable[[str], None]) -> AsyncGenerator[Rig]:
     """Connect camera, force sensor, ink device, then the robot; on the way out always stop the arm first.
 
@@ -78,13 +87,8 @@ async def connected(config: RigConfig, clock: Clock, on_notice: Callable[[str], 
     ink = None if config.ink.device is None else config.ink.device.device(clock)
     async with contextlib.AsyncExitStack() as stack:
         stack.enter_context(sole_driver(config.robot.host, config.robot.port))
-
-        async def identity(device: Device) -> Identity:
-            stack.push_async_callback(device.close)
-            return await device.connect()
-
-        camera_is = await identity(camera)
-        force_is = None if force is None else await identity(force)
-        ink_is = None if ink is None else await identity(ink)
-        robot_is = await identity(robot)
+        camera_is = await stack.enter_async_context(identified(camera))
+        force_is = None if force is None else await stack.enter_async_context(identified(force))
+        ink_is = None if ink is None else await stack.enter_async_context(identified(ink))
+        robot_is = await stack.enter_async_context(identified(robot))
         yield Rig(config, clock, robot, camera, robot_is, camera_is, force, ink, force_is, ink_is)

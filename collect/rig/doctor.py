@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import getpass
 import importlib.metadata
 import json
@@ -29,7 +28,7 @@ from rich.text import Text
 from brushloop.calibrate.board.pix2len import see_board
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.rig.config import PREFIX, RigConfig
-from brushloop.collect.rig.devices import make_robot
+from brushloop.collect.rig.devices import identified, make_robot
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, RobotMode, survey
 from brushloop.drivers.arcs.settings import ArcsTable
 from brushloop.drivers.arcs.telemetry import rtde_answers
@@ -89,9 +88,7 @@ async def examine(config: RigConfig, clock: Clock) -> list[Finding]:
 async def _asked(finding: Finding, device: Device, look: Callable[[], Awaitable[None]]) -> Finding:
     """Connect a device, note who it is, and `look` at it; an error of the device is noted."""
     try:
-        async with contextlib.AsyncExitStack() as stack:
-            stack.push_async_callback(device.close)
-            identity = await device.connect()
+        async with identified(device) as identity:
             await look()
         finding.answers, finding.identity, finding.firmware = True, identity.model, identity.firmware
         finding.notes += ", simulated" if identity.simulated else ""
