@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import Annotated
+
+from pydantic import BaseModel, Field, model_validator
 
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import LimitExceeded
@@ -17,26 +19,39 @@ ALONG_DEG = 1.0
 """Angle from the tool axis up to which a line counts as along it."""
 
 
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """A box for the tip in the base frame, a tilt cone, and caps on speed and acceleration."""
+TURN_DEG_S = 45.0
+"""Fastest turn of the tool: a short line with a large turn would otherwise whip the wrist round."""
+Finite = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 
-    x_mm: tuple[float, float]
-    y_mm: tuple[float, float]
-    z_mm: tuple[float, float]
+
+class Limits(BaseModel, frozen=True, extra="forbid"):
+    """The table `[robot.limits]` of `rig.toml`: the region that the tip must never leave, in the robot's base frame.
+
+    A box, a cone for the tilt, and caps on speed and acceleration.
+    """
+
+    x_mm: tuple[Finite, Finite]
+    y_mm: tuple[Finite, Finite]
+    z_mm: tuple[Finite, Finite]
     """The lower end is the floor: the deepest press allowed below the paper, and never the table."""
-    tilt_deg: float
-    speed_mm_s: float
-    acc_mm_s2: float
-    turn_deg_s: float = 45.0
-    """Fastest turn of the tool: a short line with a large turn would otherwise whip the wrist round."""
+    tilt_deg: Annotated[float, Field(gt=0.0, le=30.0)] = 15.0
+    speed_mm_s: Annotated[float, Field(gt=0.0, le=500.0)] = 250.0
+    acc_mm_s2: Annotated[float, Field(gt=0.0, le=5000.0)] = 1000.0
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Limits:
+        for name in ("x_mm", "y_mm", "z_mm"):
+            low, high = getattr(self, name)
+            if low >= high:
+                raise ValueError(f"{name} = [{low}, {high}]: the first must be less than the second")
+        return self
 
     def turn_capped(self, start: Pose, target: Pose, speed_mm_s: float) -> float:
         """The speed along the line at which the tool turns no faster than allowed, in mm/s."""
         travel_mm, turn_deg = distance(start, target)
         if travel_mm < 1.0 or turn_deg < 0.1:
             return speed_mm_s  # in place, ARCS reads mm/s as thousandths of rad/s, which is slow
-        return max(min(speed_mm_s, self.turn_deg_s * travel_mm / turn_deg), 0.1)
+        return max(min(speed_mm_s, TURN_DEG_S * travel_mm / turn_deg), 0.1)
 
     def check_start(self, device: str, here: Pose) -> None:
         """Raise `LimitExceeded` if the arm stands outside the box or the cone: no line from there is known to be safe.

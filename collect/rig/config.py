@@ -16,11 +16,12 @@ from pydantic import Field, ValidationError, model_validator
 from brushloop.calibrate.board.lens import Lens, read_lens
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.collect.errors import ConfigError
-from brushloop.collect.rig.config_file import Config, Finite, PaperSide, Positive, Range, place, read_toml, refusal
+from brushloop.collect.rig.config_file import Config, Finite, PaperSide, Positive, place, read_toml, refusal
 from brushloop.drivers.arcs.settings import ArcsTable
 from brushloop.drivers.camera import CameraTable
 from brushloop.drivers.force.sri_m8123 import ForceTable
 from brushloop.drivers.ink import AnyInkTable
+from brushloop.drivers.limits import Limits
 from brushloop.sessions.errors import InputError
 
 PREFIX, DELIMITER = "BRUSHLOOP_", "__"
@@ -34,30 +35,10 @@ Length = Annotated[float, Field(gt=0.0, le=100.0)]
 Area = Annotated[float, Field(gt=0.0, le=1e6)]
 
 
-class LimitsConfig(Config):
-    """The region that the brush tip must never leave, in the robot's base frame."""
-
-    x_mm: Range
-    y_mm: Range
-    z_mm: Range
-    """The lower end is the floor: paper height minus the deepest press."""
-    tilt_deg: Annotated[float, Field(gt=0.0, le=30.0)] = 15.0
-    speed_mm_s: Annotated[float, Field(gt=0.0, le=500.0)] = 250.0
-    acc_mm_s2: Annotated[float, Field(gt=0.0, le=5000.0)] = 1000.0
-
-    @model_validator(mode="after")
-    def _ordered(self) -> LimitsConfig:
-        for name in ("x_mm", "y_mm", "z_mm"):
-            low, high = getattr(self, name)
-            if low >= high:
-                raise ValueError(f"{name} = [{low}, {high}]: the first must be less than the second")
-        return self
-
-
 class RobotConfig(ArcsTable, frozen=True):
     """The arm, and where it may go."""
 
-    limits: LimitsConfig
+    limits: Limits
 
     @property
     def on_this_machine(self) -> bool:

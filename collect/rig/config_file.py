@@ -22,7 +22,6 @@ MOST = 1e6
 """Largest number accepted: a length of a kilometre is a typing error."""
 Positive = Annotated[float, Field(gt=0.0, le=MOST, allow_inf_nan=False)]
 Finite = Annotated[float, Field(ge=-MOST, le=MOST, allow_inf_nan=False)]
-Range = tuple[Finite, Finite]
 PaperSide = Annotated[float, Field(ge=2.0, le=2000.0, allow_inf_nan=False)]
 """Width or height of a sheet or a patch in mm: at most a million patches fit on a sheet."""
 

@@ -43,9 +43,9 @@ class Rig:
 
 def limits_of(config: RigConfig) -> Limits:
     """The limits of `rig.toml`; the floor is never lower than the deepest press that the brush bears."""
-    box = config.robot.limits
-    floor = max(box.z_mm[0], config.paper.touch_z_mm - config.brush.max_depth_mm)
-    return Limits(box.x_mm, box.y_mm, (floor, box.z_mm[1]), box.tilt_deg, box.speed_mm_s, box.acc_mm_s2)
+    floor_mm, ceiling_mm = config.robot.limits.z_mm
+    floor_mm = max(floor_mm, config.paper.touch_z_mm - config.brush.max_depth_mm)
+    return config.robot.limits.model_copy(update={"z_mm": (floor_mm, ceiling_mm)})
 
 
 def make_robot(config: RigConfig, clock: Clock, on_notice: Callable[[str], None]) -> AuboArcs:

@@ -19,8 +19,8 @@ from brushloop.drivers.arcs.wire import DEVICE, Framing, numbers
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import DeviceTimeout, MotionError, ProtocolViolation, SettingsChanged
 from brushloop.drivers.geometry import angles, distance, from_wire
+from brushloop.drivers.limits import Finite
 
-Finite = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Turn = Annotated[float, Field(ge=-180.0, le=180.0)]
 
 

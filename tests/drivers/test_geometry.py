@@ -100,7 +100,7 @@ def test_on_the_way_both_distances_are_shared_out(a: Pose, b: Pose, s: float):
 
 # ---------------------------------------------------------------- the limits
 
-LIMITS = Limits((200.0, 640.0), (-260.0, 260.0), (95.0, 400.0), tilt_deg=15.0, speed_mm_s=250.0, acc_mm_s2=1000.0)
+LIMITS = Limits(x_mm=(200.0, 640.0), y_mm=(-260.0, 260.0), z_mm=(95.0, 400.0))
 INSIDE: dict[str, float] = {"x": 400.0, "y": 0.0, "z": 200.0, "tilt": 5.0, "speed": 100.0, "acceleration": 500.0}
 RANGES = {
     "x": (200.0, 640.0),

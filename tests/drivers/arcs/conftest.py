@@ -21,7 +21,7 @@ from brushloop.drivers.sim.world import SimClock, World
 from tests.simulated_time import LoopClock, SimulatedTimeLoop
 
 RATE = 20.0
-LIMITS = Limits((-2000.0, 2000.0), (-260.0, 260.0), (95.0, 400.0), tilt_deg=15.0, speed_mm_s=250.0, acc_mm_s2=1000.0)
+LIMITS = Limits(x_mm=(-2000.0, 2000.0), y_mm=(-260.0, 260.0), z_mm=(95.0, 400.0))
 MakeArm = Callable[..., AuboArcs]
 NEAR = brush_pose(260.0, -220.0, 250.0)
 QUICK = {"speed_mm_s": 200.0, "acc_mm_s2": 800.0}
