@@ -11,7 +11,6 @@ import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 from brushloop.calibrate.artefact import FITS, current
 from brushloop.calibrate.commands import CalibrateRequest, FitRequest, show_work
@@ -20,7 +19,7 @@ from brushloop.collect.engine.control import FINAL
 from brushloop.collect.engine.engine import Engine, engine_for
 from brushloop.collect.engine.live import LiveView
 from brushloop.collect.engine.open_or_resume import Opening
-from brushloop.collect.engine.snapshot import REFRESH_S, eta_text, no_pose_text
+from brushloop.collect.engine.snapshot import REFRESH_S, Snapshot, eta_text, no_pose_text
 from brushloop.collect.errors import StrokesLeftOut
 from brushloop.collect.operator import stop_signals
 from brushloop.collect.protocols.config import load_protocol
@@ -33,13 +32,6 @@ PRESSES = frozenset({"grid", "few-strokes", "list"})
 """Protocols whose recording can be analysed by itself; after others, no single next command exists."""
 
 
-class Collected(NamedTuple):
-    """A finished session, and how many strokes it left out."""
-
-    folder: Path
-    left_out: int
-
-
 def run(request: CollectRequest) -> None:
     """Do what `brushloop collect` asks. Raises the error that ended the run, and `StrokesLeftOut`.
 
@@ -50,7 +42,7 @@ def run(request: CollectRequest) -> None:
             in_the_air = replace(_settled(request), out=Path(folder), new=False, sheet=None, guided=False)
             _run(Opening.load(in_the_air))
         say("dry run done; nothing was kept")
-    elif left_out := collect(request).left_out:
+    elif left_out := collect(request).given_up:
         raise StrokesLeftOut(left_out)
 
 
@@ -60,17 +52,19 @@ def _settled(request: CollectRequest) -> CollectRequest:
     return replace(request, on_screen=screen, guided=request.guided and screen)
 
 
-def collect(request: CollectRequest) -> Collected:
-    """Run to the end and print where the recording lies and what comes next. Raises the error that ended the run."""
+def collect(request: CollectRequest) -> Snapshot:
+    """Run to the end and print where the recording lies and what comes next; return how it ended.
+
+    Raises the error that ended the run.
+    """
     opening = Opening.load(_settled(request))
     with contextlib.ExitStack() as stack:
         if request.live:
             live = stack.enter_context(contextlib.closing(LiveView(request.live_port)))
             opening = replace(opening, live=live)
         now = _run(opening).snapshot()
-    folder = Path(now.folder)
-    say(*ending(folder, opening.protocol.kind))
-    return Collected(folder, now.given_up)
+    say(*ending(Path(now.folder), opening.protocol.kind))
+    return now
 
 
 def collect_session(
@@ -82,7 +76,7 @@ def collect_session(
     resumed. Raises `ConfigError`, `CollectAborted`, `SessionError` and what the devices raise.
     """
     request = CollectRequest(Path(config), Path(protocol), Path(out), sheet=sheet, armed=armed, on_screen=False)
-    return collect(request).folder
+    return Path(collect(request).folder)
 
 
 def ending(folder: Path, kind: str) -> list[str]:
@@ -182,8 +176,8 @@ def finished_session(root: Path, config: Path, protocol: Path) -> Path | None:
     return max(sessions, key=lambda path: (path / f"{path.name}.mcap").stat().st_mtime_ns, default=None)
 
 
-def collected(request: CollectRequest) -> Collected:
-    """Collect a session, or go on with it. Raises `ConfigError` and what ended the collection."""
+def collected(request: CollectRequest) -> Snapshot:
+    """Collect a session, or go on with it; return how it ended. Raises `ConfigError` and what ended the collection."""
     say(f"$ brushloop collect --config {request.config} --protocol {request.protocol} --out {request.out}")
     return collect(request)
 
@@ -193,7 +187,7 @@ def collected_session(request: CollectRequest) -> Path:
 
     Raises `ConfigError` and what ended the collection.
     """
-    session = finished_session(request.out, request.config, request.protocol) or collected(request).folder
+    session = finished_session(request.out, request.config, request.protocol) or Path(collected(request).folder)
     calibrated(session)
     return session
 

@@ -149,7 +149,8 @@ class Demo:
             return
         sheet = 1 if earlier else None
         request = CollectRequest(self._started().config, self._protocol, self._sessions, sheet=sheet, on_screen=False)
-        self._session, self._left_out = collected(request)
+        ended = collected(request)
+        self._session, self._left_out = Path(ended.folder), ended.given_up
 
     def _fit(self) -> None:
         calibrated(self._session)

@@ -189,17 +189,11 @@ def check_rig(config: RigConfig) -> list[Check]:
 
 
 def _tool_and_sheet(config: RigConfig) -> Iterator[Check]:
-    robot, brush, camera, board, force = config.robot, config.brush, config.camera, config.board, config.force
+    robot, brush, board, force = config.robot, config.brush, config.board, config.force
     yield tool_length(robot.tcp_offset_mm)
     yield brush_square(robot.tcp_rotation_deg)
     yield brush_shorter_than_tool(robot.tcp_offset_mm, brush.length_mm)
     yield deepest_press(brush.max_depth_mm, brush.length_mm)
-    if robot.payload_kg:
-        yield within("payload", robot.payload_kg, 0.05, 5.0, "kg", "Weigh holder, brush and sensor.")
-    set_to_px = (camera.locked.width, camera.locked.height)
-    if camera.optics is not None and set_to_px not in ((None, None), camera.optics.size_px):
-        value, allowed = ("{} x {} px".format(*size_px) for size_px in (camera.optics.size_px, set_to_px))
-        yield Check("lens", "contradicts", f"calibrated at {value}", allowed, "Calibrate it at camera.locked's size.")
     measure = _metres(board.square_mm) or "Measure ten squares of the print with calipers and divide by ten."
     yield within("square of the board", board.square_mm, 3.0, 60.0, "mm", measure)
     # Corners must be seen on all sides of the sheet.
@@ -210,11 +204,6 @@ def _tool_and_sheet(config: RigConfig) -> Iterator[Check]:
     if force is not None:
         remedy = "A soft brush pushes with less than 3 N when it is pressed flat: force.max_n."
         yield within("force ceiling", force.max_n, 0.2, 30.0, "N", remedy)
-    if force is not None and config.touch.method == "force":
-        axis = config.touch.force.push_axis
-        off_deg = math.degrees(math.acos(min(abs(axis[2]) / math.hypot(*axis), 1.0)))
-        remedy = "The paper pushes along the tool: brushloop rig teach force finds axis and sign by a push."
-        yield within("push axis", off_deg, 0.0, 20.0, "deg", remedy)
 
 
 def _metres(length: float) -> str:

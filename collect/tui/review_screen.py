@@ -204,7 +204,6 @@ class ReviewScreen(Screen[None]):
         super().__init__()
         self._review, self._finish, self._at_work = review, finish, at_work
         self._capture: ReviewCapture | None = None
-        self._alike: dict[Condition, str] = {}
         self._title, self._words = Bar("title"), Line("words")
         self._options = Rows("captures")
         self._photo, self._binary = picture_widget("review-photo"), picture_widget("review-binary")
@@ -283,7 +282,6 @@ class ReviewScreen(Screen[None]):
         except SessionError as error:
             self.notify(plain(str(error)), severity="error")
             return
-        self._alike.pop(capture.press.condition, None)
         at = self._options.highlighted or 0
         self._capture = self._review.captures[at]
         self._list(at)
@@ -300,18 +298,15 @@ class ReviewScreen(Screen[None]):
     @work(exclusive=True, group="look")
     async def _load(self, capture: ReviewCapture) -> None:
         """Show its pictures, then how alike the presses of its condition are; both are made off the screen's loop."""
-        condition = capture.press.condition
         try:
             pictures = await asyncio.to_thread(self._review.pictures, capture)
             self._photo.show(pictures.photo)
             self._binary.show(binary_picture(pictures.binary))
-            if condition not in self._alike:
-                self._alike[condition] = await asyncio.to_thread(self._review.repeatability, condition)
-                self._show_words(self._capture or capture)
+            self._show_words(capture, await asyncio.to_thread(self._review.repeatability, capture.press.condition))
         except SessionError as error:
             self._words.show(trouble(error))
 
-    def _show_words(self, capture: ReviewCapture) -> None:
+    def _show_words(self, capture: ReviewCapture, alike: str = "...") -> None:
         result, press, folder = capture.result, capture.press, self._review.folder
         why = "  marked bad" if capture.marked_bad else ""
         if not result.kept:
@@ -320,9 +315,8 @@ class ReviewScreen(Screen[None]):
         lines = [
             Content.assemble((press.stroke_id, "bold"), f"  {condition_text(press.condition)}", (why, "bold")),
             labelled("MCAP", f"{file}  still {result.still}"),
+            labelled("Repeats", alike),
         ]
-        if (alike := self._alike.get(press.condition)) is not None:
-            lines.append(labelled("Repeats", alike))
         if capture.unlike:
             lines.append(labelled("Waited", Content.styled(f"! {capture.unlike}", "bold $text-warning")))
         elif press.dip_to_touch_s is not None:

@@ -181,7 +181,7 @@ def test_the_ending_is_printed_after_the_screen_too(
     monkeypatch.setattr("brushloop.collect.tui.app.run_app", lambda app: (app.engine.start(), wait_for_end(app.engine)))
     rig, protocol = lab.folder / "rig.toml", lab.folder / "protocol.toml"
     done = collect(CollectRequest(rig, protocol, lab.sessions, on_screen=True))
-    assert done == (lab.session, 0)
+    assert (done.folder, done.given_up) == (str(lab.session), 0)
     assert capsys.readouterr().out.splitlines() == ending(lab.session, "grid")
     assert (lab.session / f"{lab.session.name}.mcap").is_file()
 

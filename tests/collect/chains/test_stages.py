@@ -29,10 +29,11 @@ from brushloop.collect.chains.loop import SETTINGS as FILE
 from brushloop.collect.chains.loop import Settings, begun_with, check_recovered, keep_settings, run_loop
 from brushloop.collect.chains.writing import FOOTPRINT, Writing
 from brushloop.collect.engine import CollectRequest
+from brushloop.collect.engine.snapshot import Snapshot
 from brushloop.collect.errors import ConfigError, StrokesLeftOut
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import load_rig
-from brushloop.collect.start import Collected, finished_session
+from brushloop.collect.start import finished_session
 from brushloop.drivers.loopback import simulate
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import rig_toml
@@ -56,10 +57,11 @@ class Chain:
         self.left_out = 0
         self.validate_fails = False
 
-    def collected(self, request: CollectRequest) -> Collected:
+    def collected(self, request: CollectRequest) -> Snapshot:
         self.ran.append("collect")
         number = 1 + len(list(request.out.glob("*")))
-        return Collected(finished(request.config, request.protocol, request.out, number), self.left_out)
+        session = finished(request.config, request.protocol, request.out, number)
+        return Snapshot(folder=str(session), given_up=self.left_out)
 
     def validated(self, request: ValidateRequest, _progress: object) -> ValidationOutput:
         self.ran.append("validate")
