@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from brushloop.calibrate.commands import PathOrCommand, command
+from brushloop.calibrate.files import check_target
 from brushloop.collect.engine import PROTOCOL_FILE, RIG_FILE, CollectRequest, Rig
 from brushloop.sessions.terminal import say
 
@@ -62,7 +63,6 @@ def plan(
     """Walk through a protocol without moving the arm: limits, sheets, dips, ink, time, and a picture of the sheets."""
     import asyncio
 
-    from brushloop.calibrate.files import check_target
     from brushloop.collect.plan import draw_plan, make_plan, plan_table
     from brushloop.collect.protocols.config import load_protocol
     from brushloop.collect.rig.config import load_rig
@@ -96,7 +96,6 @@ def doctor(
     from brushloop.collect.rig.config import load_rig
 
     if report is not None:
-        from brushloop.calibrate.files import check_target
         from brushloop.collect.commission.arm import ADDRESS, write_first_report
         from brushloop.collect.commission.visit import Notebook
 
@@ -169,7 +168,6 @@ def show(
     picture: Annotated[Path | None, typer.Option(help="Draw it from above: .png, .svg, .pdf or .jpg.")] = None,
 ) -> None:
     """Show a rig: its box of limits and every place that the tip goes to. Asks no device."""
-    from brushloop.calibrate.files import check_target
     from brushloop.collect.rig.check import draw_rig, rig_table
     from brushloop.collect.rig.config import load_rig
 

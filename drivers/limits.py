@@ -21,7 +21,9 @@ ALONG_DEG = 1.0
 
 TURN_DEG_S = 45.0
 """Fastest turn of the tool: a short line with a large turn would otherwise whip the wrist round."""
-Finite = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+MOST = 1e6
+"""Largest number accepted: a length of a kilometre is a typing error."""
+Finite = Annotated[float, Field(ge=-MOST, le=MOST, allow_inf_nan=False)]
 
 
 class Limits(BaseModel, frozen=True, extra="forbid"):

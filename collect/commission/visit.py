@@ -30,9 +30,10 @@ from brushloop.collect.errors import ConfigError, NotAccepted, StepError
 from brushloop.collect.operator import Asker, Choice, Prompt
 from brushloop.collect.rig.check import Check, unmeasured
 from brushloop.collect.rig.config import RigConfig, rig_from
-from brushloop.collect.rig.config_file import Config, Finite, read_text, refusal
+from brushloop.collect.rig.config_file import Config, read_text, refusal
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.host import Clock
+from brushloop.drivers.limits import Finite
 from brushloop.sessions.disk import fsync_folder, number, sync
 
 MAX_BYTES = 1024 * 1024

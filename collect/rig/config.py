@@ -16,12 +16,12 @@ from pydantic import Field, ValidationError, model_validator
 from brushloop.calibrate.board.lens import Lens, read_lens
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.collect.errors import ConfigError
-from brushloop.collect.rig.config_file import Config, Finite, PaperSide, Positive, place, read_toml, refusal
+from brushloop.collect.rig.config_file import Config, PaperSide, Positive, place, read_toml, refusal
 from brushloop.drivers.arcs.settings import ArcsTable
 from brushloop.drivers.camera import CameraTable
 from brushloop.drivers.force.sri_m8123 import ForceTable
 from brushloop.drivers.ink import AnyInkTable
-from brushloop.drivers.limits import Limits
+from brushloop.drivers.limits import Finite, Limits
 from brushloop.sessions.errors import InputError
 
 PREFIX, DELIMITER = "BRUSHLOOP_", "__"

@@ -12,16 +12,14 @@ from typing import TYPE_CHECKING, Annotated, Any, cast, get_args
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from brushloop.collect.errors import ConfigError
+from brushloop.drivers.limits import MOST
 from brushloop.sessions.disk import read_bounded
 from brushloop.sessions.errors import InputError
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
-MOST = 1e6
-"""Largest number accepted: a length of a kilometre is a typing error."""
 Positive = Annotated[float, Field(gt=0.0, le=MOST, allow_inf_nan=False)]
-Finite = Annotated[float, Field(ge=-MOST, le=MOST, allow_inf_nan=False)]
 PaperSide = Annotated[float, Field(ge=2.0, le=2000.0, allow_inf_nan=False)]
 """Width or height of a sheet or a patch in mm: at most a million patches fit on a sheet."""
 
