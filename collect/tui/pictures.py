@@ -6,15 +6,15 @@ A braille cell has eight dots and two colours. Its ground has the colour of most
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterator
 from functools import lru_cache
 from itertools import groupby
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from rich.segment import Segment
+from rich.segment import Segment, Segments
 from rich.style import Style
 from textual.containers import Container
-from textual.geometry import Region, Size
-from textual.strip import Strip
+from textual.geometry import Size
 from textual.widget import Widget
 
 if TYPE_CHECKING:
@@ -57,12 +57,12 @@ def braille(image: NDArray[np.uint8], size: Size) -> NDArray[np.uint8]:
     return np.concatenate((dots[..., None], dot_colour, ground), axis=2).astype(np.uint8)
 
 
-def strip_of(line: NDArray[np.uint8]) -> Strip:
-    """One line of cells as text."""
-    segments: list[Segment] = []
-    for colours, cells in groupby(line.tolist(), lambda cell: tuple(cell[1:])):
-        segments.append(Segment("".join(chr(EMPTY + cell[0]) for cell in cells), _style(colours)))
-    return Strip(segments, len(line))
+def text_of(lines: NDArray[np.uint8]) -> Iterator[Segment]:
+    """Lines of cells as text."""
+    for line in lines.tolist():
+        for colours, cells in groupby(line, lambda cell: tuple(cell[1:])):
+            yield Segment("".join(chr(EMPTY + cell[0]) for cell in cells), _style(colours))
+        yield Segment.line()
 
 
 @lru_cache(maxsize=4096)
@@ -80,34 +80,18 @@ class CellPicture(Widget):
     def __init__(self, id: str | None = None) -> None:  # noqa: A002 - textual's name
         super().__init__(id=id)
         self._image: NDArray[np.uint8] | None = None
-        self._cells: NDArray[np.uint8] | None = None
-        self._made_for: Size | None = None
 
     def show(self, image: NDArray[np.uint8] | None) -> None:
-        """Draw the lines of this picture that changed; nothing where it is the same object."""
-        if image is self._image:
-            return
-        self._image, before = image, self._cells
-        self._fit()
-        if before is None or self._cells is None or before.shape != self._cells.shape:
+        """Draw this picture, unless it is the same object."""
+        if image is not self._image:
+            self._image = image
             self.refresh()
-            return
-        for y in (before != self._cells).any(axis=(1, 2)).nonzero()[0].tolist():
-            self.refresh(Region(0, y, self.size.width, 1))
 
-    def render_line(self, y: int) -> Strip:
-        """Draw one line of cells."""
-        if self._made_for != self.size:
-            self._fit()
-        width, ground = self.size.width, self.rich_style
-        if self._cells is None or y >= len(self._cells):
-            return Strip.blank(width, ground)
-        return strip_of(self._cells[y]).extend_cell_length(width, ground)
-
-    def _fit(self) -> None:
-        self._made_for = self.size
-        drawn = self._image is not None and self._image.size and self.size.area
-        self._cells = braille(self._image, self.size) if drawn and self._image is not None else None
+    def render(self) -> Segments:
+        """The picture in the size of its place."""
+        if self._image is None or not self._image.size or not self.size.area:
+            return Segments(())
+        return Segments(text_of(braille(self._image, self.size)))
 
 
 class PixelPicture(Container):
