@@ -31,7 +31,7 @@ STEPS = (
     LimitsStep(),
     ProofStep(),
 )
-AGAIN, AFRESH = Choice("a", "try this step again, where it was"), Choice("f", "teach this step from its beginning")
+AGAIN = Choice("a", "try this step again, where it was")
 STOPPED = "stopped; the same command resumes from there"
 REFUSED = (NotAccepted, DeviceError, InputError, StepError, ConfigError)
 
@@ -89,9 +89,7 @@ class Wizard:
             except REFUSED as error:
                 unhelpful = isinstance(error, DeviceError) and not error.remedy
                 visit.say(describe(error), *(["Check power, cable and address."] if unhelpful else []), tone="trouble")
-                how = choice_of("How do you want to go on?", (AGAIN, AFRESH), AGAIN.key)
-                if await visit.ask(how, back=False) == AFRESH.key:
-                    visit.teach_afresh(step)
+                await visit.ask(choice_of("How do you want to go on?", (AGAIN,), AGAIN.key), back=False)
         except LeftOff:
             raise CollectAborted(STOPPED) from None
         except WentBack:

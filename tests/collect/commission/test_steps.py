@@ -294,10 +294,8 @@ async def test_back_asks_the_question_before_and_no_other(
     [
         (("a", "n"), [GIVE, INK]),
         ((BACK, "/dev/ttyUSB1", "n"), [LINE, GIVE, INK]),
-        (("f", "5"), [R, L]),
-        (("f", BACK, "n"), [R, GIVE, INK]),
     ],
-    ids=["again", "the question before", "the step afresh", "not afresh after all"],
+    ids=["again", "the question before"],
 )
 async def test_a_step_that_was_refused_goes_on_where_the_person_wants(
     after: tuple[str, ...], asked: list[str], tmp_path: Path, station: AsyncMock
