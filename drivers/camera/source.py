@@ -265,12 +265,10 @@ def is_patched(picture: Picture, before: Picture | None) -> bool:
 
     A white end is not compared: glare has no noise.
     """
-    import numpy as np
-
     if isinstance(picture, bytes) or before is None or isinstance(before, bytes) or picture.shape != before.shape:
         return False
     end = picture[-PATCH_PX:]
-    return int(end.min()) < WHITE and np.array_equal(end, before[-PATCH_PX:])
+    return int(end.min()) < WHITE and is_repeated(end, before[-PATCH_PX:])
 
 
 def is_repeated(picture: Picture, before: Picture | None) -> bool:
@@ -278,8 +276,6 @@ def is_repeated(picture: Picture, before: Picture | None) -> bool:
 
     The headers of a JPEG, which may contain the time, are not compared.
     """
-    import numpy as np
-
-    if isinstance(picture, bytes) and isinstance(before, bytes):
-        return picture.partition(SCAN)[2] == before.partition(SCAN)[2]
-    return before is not None and np.array_equal(np.asarray(picture), np.asarray(before))
+    if isinstance(picture, bytes):
+        return isinstance(before, bytes) and picture.partition(SCAN)[2] == before.partition(SCAN)[2]
+    return not isinstance(before, bytes | None) and picture.shape == before.shape and bool((picture == before).all())

@@ -286,8 +286,12 @@ class SriM8123:
             name = f"{self._table.interface} {self._table.channel}"
             self._loss = (f"cannot open {name}: {error}", "Check the adapter and that its interface is up.")
             return
+
+        def command(data: bytes) -> None:
+            bus.send(can.Message(arbitration_id=COMMAND_ID, is_extended_id=False, data=data), timeout=1.0)
+
         try:
-            self._command(bus, START)
+            command(START)
             quiet_s = -math.inf  # until the board streams
             while self._loss is None and not self._closing.is_set():
                 if (message := bus.recv(RECEIVE_S)) is not None:
@@ -302,7 +306,7 @@ class SriM8123:
             self._lose_bus(f"failed: {error}")
         finally:
             with contextlib.suppress(can.CanError, OSError):
-                self._command(bus, STOP)
+                command(STOP)
             bus.shutdown()
             if not self._closing.is_set() and self._loss is None:
                 self._loss = ("the reader failed", "Connect again.")
@@ -316,11 +320,6 @@ class SriM8123:
         logging.getLogger("can").setLevel(logging.ERROR)
         gateway: dict[str, Any] = {} if table.host is None else {"host": table.host, "port": table.port}
         return can.Bus(table.channel, table.interface, ignore_config=True, bitrate=table.bitrate, **gateway)
-
-    def _command(self, bus: can.BusABC, data: bytes) -> None:
-        import can
-
-        bus.send(can.Message(arbitration_id=COMMAND_ID, is_extended_id=False, data=data), timeout=1.0)
 
     def _take(self, message: can.Message) -> None:
         if message.is_error_frame:
