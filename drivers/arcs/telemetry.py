@@ -30,7 +30,7 @@ import numpy as np
 from brushloop.drivers.arcs.controller import Controller
 from brushloop.drivers.arcs.motion import arrived
 from brushloop.drivers.arcs.settings import ArcsTable
-from brushloop.drivers.arcs.wire import DEVICE, FrameDecoder, encode_short, in_time, numbers
+from brushloop.drivers.arcs.wire import DEVICE, Decoder, encode_short, in_time, numbers
 from brushloop.drivers.devices import Pose, PoseSample, Stamp
 from brushloop.drivers.errors import DeviceError, DeviceTimeout, NotConnected, ProtocolViolation, Stale
 from brushloop.drivers.geometry import from_wire
@@ -110,7 +110,7 @@ class RtdeStream:
         self.port = port
         self.offered: dict[str, int] = {}
         """Names in the greeting that can be subscribed to, with their ids."""
-        self._decoder = FrameDecoder()
+        self._decoder = Decoder()
         self._stream: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
         self._segments: Sequence[str] = ()
 

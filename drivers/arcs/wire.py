@@ -15,7 +15,6 @@ on a reply that comes in small pieces, and could not tell a reply that is cut of
 
 from __future__ import annotations
 
-import abc
 import asyncio
 import contextlib
 import json
@@ -41,7 +40,7 @@ MAGIC = b"SOF"
 HEADERS = {0x01: struct.Struct(">4xI"), 0x00: struct.Struct(">4xH")}
 """The length behind magic and flag, by the flag."""
 PING = b"__ping__\0"
-"""Keep-alive of the maker's RTDE client: it may come between two frames, and is passed over."""
+"""Keep-alive of the maker's RTDE client, passed over between two payloads."""
 MAX_BYTES = 1024 * 1024
 """Far above any reply of a controller; a hostile length must not make the host allocate gigabytes."""
 
@@ -56,16 +55,26 @@ def encode(payload: bytes) -> bytes:
     return MAGIC + struct.pack(">BI", 0x01, len(payload)) + payload
 
 
-class _Decoder(abc.ABC):
-    """Turns a byte stream, split at any point, into what `_next` finds at its beginning."""
+_BETWEEN = re.compile(rb"(?:[ \t\r\n]|%b)*+" % PING)
+"""What may come between two payloads."""
+_TOKEN = re.compile(rb'[{}\[\]]|"(?:[^"\\]|\\.)*+("?)', re.DOTALL)
+"""A bracket or a string, whose end is the group: empty if it has not arrived."""
+
+
+class Decoder:
+    """Turns a byte stream, split at any point, into its payloads: those of SOF frames, and bare JSON documents."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
+        self._at = 0
+        """Up to where a document at the beginning of the buffer has been searched for its end."""
+        self._open = 0
+        """Number of its brackets before `_at` that are not closed."""
 
     def feed(self, data: bytes) -> list[bytes]:
         """What `data` completes, in order.
 
-        Raises `ProtocolViolation` for bytes outside the format: neither this `data` nor anything after it can be
+        Raises `ProtocolViolation` for bytes outside both formats: neither this `data` nor anything after it can be
         trusted, and the connection must be ended.
         """
         self._buffer += data
@@ -75,26 +84,20 @@ class _Decoder(abc.ABC):
             del self._buffer[: span.stop]
         return payloads
 
-    @abc.abstractmethod
     def _next(self) -> slice | None:
-        """Where the first whole item in the buffer lies; None while it is incomplete. Raises `ProtocolViolation`."""
-
-
-def _violation(what: str) -> ProtocolViolation:
-    return ProtocolViolation(DEVICE, "decode", what)
-
-
-class FrameDecoder(_Decoder):
-    """Turns a byte stream, split at any point, into the payloads of SOF frames."""
-
-    def _next(self) -> slice | None:
+        """Where the first whole payload in the buffer lies; None while it is incomplete."""
         buffer = self._buffer
-        while buffer.startswith(PING):
-            del buffer[: len(PING)]
-        if PING.startswith(bytes(buffer[: len(PING)])):
-            return None
+        if self._open == 0:
+            if (between := _BETWEEN.match(buffer)) is not None:
+                del buffer[: between.end()]
+            if PING.startswith(bytes(buffer[: len(PING)])):
+                return None
+        return self._document() if buffer[0] in b"{[" else self._frame()
+
+    def _frame(self) -> slice | None:
+        buffer = self._buffer
         if not MAGIC.startswith(bytes(buffer[:3])):
-            raise _violation(f"expected SOF, got {bytes(buffer[:8])!r}")
+            raise _violation(f"expected SOF or JSON, got {bytes(buffer[:8])!r}")
         if len(buffer) < 4:
             return None
         if buffer[3] not in HEADERS:
@@ -108,34 +111,13 @@ class FrameDecoder(_Decoder):
         end = header.size + size
         return slice(header.size, end) if len(buffer) >= end else None
 
-
-_TOKEN = re.compile(rb'[{}\[\]]|"(?:[^"\\]|\\.)*+("?)', re.DOTALL)
-"""A bracket or a string, whose end is the group: empty if it has not arrived."""
-
-
-class BareDecoder(_Decoder):
-    """Turns a byte stream, split at any point, into JSON documents by their brackets."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._at = 0
-        self._open = 0
-        """Number of brackets before `_at` that are not closed."""
-
-    def _next(self) -> slice | None:
-        if self._open == 0:
-            del self._buffer[: len(self._buffer) - len(self._buffer.lstrip(b" \t\r\n"))]
-            if self._buffer and self._buffer[0] not in b"{[":
-                raise _violation(f"expected JSON, got {bytes(self._buffer[:8])!r}")
-        end = self._scan()
+    def _document(self) -> slice | None:
+        end = self._end_of_document()
         if (end or len(self._buffer)) > MAX_BYTES:
             raise _violation(f"document exceeds {MAX_BYTES} bytes")
-        if end is None:
-            return None
-        self._at = 0
-        return slice(end)
+        return None if end is None else slice(end)
 
-    def _scan(self) -> int | None:
+    def _end_of_document(self) -> int | None:
         """Continue where the last piece ended; return the end of the document, or None if it has not arrived."""
         buffer = self._buffer
         while (token := _TOKEN.search(buffer, self._at)) is not None:
@@ -148,9 +130,14 @@ class BareDecoder(_Decoder):
             elif byte in b"}]":
                 self._open -= 1
                 if self._open == 0:
-                    return self._at
+                    end, self._at = self._at, 0
+                    return end
         self._at = len(buffer)
         return None
+
+
+def _violation(what: str) -> ProtocolViolation:
+    return ProtocolViolation(DEVICE, "decode", what)
 
 
 NUMBERS = TypeAdapter(list[FiniteFloat])
@@ -246,7 +233,7 @@ class RpcConnection:
         self._last_id = 0
         self._lock = asyncio.Lock()
         self._stream: Stream | None = None
-        self._decoder: FrameDecoder | BareDecoder = FrameDecoder()
+        self._decoder = Decoder()
         self._lost: str | None = None
         """Why nothing more is read from the connection."""
 
@@ -268,7 +255,7 @@ class RpcConnection:
         try:
             async with in_time(DEVICE, "connect", self._timeout_s, f"answer from {self.host}:{self.port}"):
                 self._stream = await asyncio.open_connection(self.host, self.port)
-            self._decoder = BareDecoder() if self._framing == "bare" else FrameDecoder()
+            self._decoder = Decoder()
             if login and self._framing == "sof":
                 token = f"__login__\naubo\n{FACTORY_LOGIN_TOKEN}\n{SDK_INTERFACE_VERSION}\n"
                 await self._exchange("", "login", encode(token.encode()))

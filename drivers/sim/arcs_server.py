@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Any, cast
 
 from brushloop.drivers.arcs.telemetry import SET_RECIPE, decode_message, encode_sample
-from brushloop.drivers.arcs.wire import PING, BareDecoder, FrameDecoder, encode, parameters
+from brushloop.drivers.arcs.wire import PING, Decoder, encode, parameters
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.geometry import to_wire
@@ -85,7 +85,7 @@ class ArcsServer(LoopbackServer):
         """Answer requests in order. The motion queue continues after the client disconnects, as a cabinet's would."""
         data = await reader.read(65536)
         bare = data[:1] in (b"{", b"[", b" ", b"\t", b"\r", b"\n")
-        decoder = BareDecoder() if bare else FrameDecoder()
+        decoder = Decoder()
         while data:
             for payload in decoder.feed(data):
                 request = request_of(payload)
@@ -164,7 +164,7 @@ class RtdeServer(LoopbackServer):
         """Greet the client, then serve its topics until it disconnects."""
         hello = {"protocol": "rtde", "version": 1, "input": {"set_recipe": SET_RECIPE}, "output": OUTPUTS}
         writer.write(json.dumps(hello, separators=(",", ":")).encode() + b"\n\n")
-        decoder = FrameDecoder()
+        decoder = Decoder()
         pushes: dict[int, asyncio.Task[None]] = {}
         try:
             while data := await reader.read(65536):

@@ -20,8 +20,7 @@ from brushloop.drivers.arcs.telemetry import RtdeStream, decode_message, encode_
 from brushloop.drivers.arcs.wire import (
     FACTORY_LOGIN_TOKEN,
     PING,
-    BareDecoder,
-    FrameDecoder,
+    Decoder,
     answer_in,
     encode,
     encode_bare_request,
@@ -108,7 +107,7 @@ PUBLISHED: list[tuple[bytes, bytes]] = [
     (ROUND, bytes.fromhex("0291 0000803f 000000c0  0292 00006040 0000803e  0293 000000bf 0000003e")),
     (COMMAND_ID.to_bytes(2) + sri_m8123.START + sri_m8123.STOP, bytes.fromhex("0080 02 00")),
     (
-        b"".join(FrameDecoder().feed(bytes.fromhex("53 4f 46 01 00 00 00 02 4f 4b") + b"SOF\x00\x00\x05hello")),
+        b"".join(Decoder().feed(bytes.fromhex("53 4f 46 01 00 00 00 02 4f 4b") + b"SOF\x00\x00\x05hello")),
         b"OKhello",
     ),
 ]
@@ -243,7 +242,6 @@ def test_no_tag_is_decoded():
             decode_message(payload)
 
 
-Decoder = type[FrameDecoder | BareDecoder]
 SOF = [encode(reply) for reply in REPLIES] + [
     encode_short(b"SUCCEED"),
     encode(b""),
@@ -251,15 +249,12 @@ SOF = [encode(reply) for reply in REPLIES] + [
     PING + encode_sample(0, [[0.1] * 6, "Running"]) + PING + PING + encode_sample(0, []),
     PING[:5],
 ]
-STREAMS: dict[str, tuple[Decoder, list[bytes]]] = {
-    "SOF": (FrameDecoder, SOF),
-    "bare": (BareDecoder, [*REPLIES, b" \r\n".join(REPLIES[:2]), b"[]"]),
-}
+BARE = [*REPLIES, b" \r\n".join(REPLIES[:2]), b"[]"]
 
 
-def decoded(new: Decoder, chunks: Iterable[bytes]) -> tuple[list[bytes], bool]:
+def decoded(chunks: Iterable[bytes]) -> tuple[list[bytes], bool]:
     """What a decoder hands over until it refuses, and whether it did. Any error but the right one is raised."""
-    decoder, payloads = new(), list[bytes]()
+    decoder, payloads = Decoder(), list[bytes]()
     for chunk in chunks:
         try:
             payloads += decoder.feed(chunk)
@@ -268,14 +263,14 @@ def decoded(new: Decoder, chunks: Iterable[bytes]) -> tuple[list[bytes], bool]:
     return payloads, False
 
 
-@pytest.mark.parametrize(("new", "valid"), STREAMS.values(), ids=STREAMS.keys())
+@pytest.mark.parametrize("valid", [SOF, BARE, [SOF[0] + BARE[0] + PING + SOF[1]]], ids=["SOF", "bare", "both"])
 def test_any_stream_is_the_same_payloads_or_a_violation_wherever_it_is_cut(
-    new: Decoder, valid: list[bytes], monkeypatch: pytest.MonkeyPatch
+    valid: list[bytes], monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(wire, "MAX_BYTES", 150)  # so that a message can be too long
     rng, taken, count = random.Random(1), 0, 0
     for stream in hostile(valid, 5000):
-        *coarser, finest = (decoded(new, chunks) for chunks in pieces(stream, rng))
+        *coarser, finest = (decoded(chunks) for chunks in pieces(stream, rng))
         for payloads, refused in coarser:
             assert refused == finest[1], stream
             # a piece that holds a violation hands nothing over: what came before shows only in smaller pieces
@@ -284,28 +279,27 @@ def test_any_stream_is_the_same_payloads_or_a_violation_wherever_it_is_cut(
     assert 500 < taken < count - 500, "neither all sound nor all broken"
 
 
-@pytest.mark.parametrize("decoder", [FrameDecoder, BareDecoder])
 @pytest.mark.parametrize("stream", [b"X", b"GET / HTTP/1.0\r\n", b"SOF\x02\x00\x00\x00\x01x", b"1", b'{"a":1}}'])
-def test_bytes_that_belong_to_neither_framing_are_refused_at_once(decoder: Decoder, stream: bytes):
-    assert decoded(decoder, [stream])[1]
+def test_bytes_that_belong_to_neither_framing_are_refused_at_once(stream: bytes):
+    assert decoded([stream])[1]
 
 
-ENDLESS: dict[str, tuple[Decoder, bytes, bytes]] = {
-    "a length of 4 GB": (FrameDecoder, b"SOF\x01\xff\xff\xff\xff", b""),
-    "pings": (FrameDecoder, PING * 100_000 + b"SOF\x02", b""),
-    "arrays in arrays": (BareDecoder, b"[", b"[" * 300),
-    "a string": (BareDecoder, b'{"a":"', b"\\" * 300),
+ENDLESS: dict[str, tuple[bytes, bytes]] = {
+    "a length of 4 GB": (b"SOF\x01\xff\xff\xff\xff", b""),
+    "pings": (PING * 100_000 + b"SOF\x02", b""),
+    "arrays in arrays": (b"[", b"[" * 300),
+    "a string": (b'{"a":"', b"\\" * 300),
 }
 
 
-@pytest.mark.parametrize(("new", "head", "more"), ENDLESS.values(), ids=ENDLESS.keys())
+@pytest.mark.parametrize(("head", "more"), ENDLESS.values(), ids=ENDLESS.keys())
 def test_declared_lengths_and_endless_messages_take_bounded_memory(
-    new: Decoder, head: bytes, more: bytes, monkeypatch: pytest.MonkeyPatch
+    head: bytes, more: bytes, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(wire, "MAX_BYTES", 100_000)
     tracemalloc.start()
     try:
-        assert decoded(new, [head, *[more] * 2000])[1]
+        assert decoded([head, *[more] * 2000])[1]
         assert tracemalloc.get_traced_memory()[1] < 4_000_000
     finally:
         tracemalloc.stop()

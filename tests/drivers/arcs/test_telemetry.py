@@ -13,7 +13,7 @@ import pytest
 
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.arcs.telemetry import LagMeter, RtdeStream, encode_sample, encode_topic
-from brushloop.drivers.arcs.wire import PING, FrameDecoder, encode
+from brushloop.drivers.arcs.wire import PING, Decoder, encode
 from brushloop.drivers.devices import Pose, PoseSample, QueuedLine, Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, ProtocolViolation, Stale
 from brushloop.drivers.geometry import brush_pose, distance
@@ -36,7 +36,7 @@ MAKERS_TOPIC = (
 
 def test_a_topic_is_the_one_that_the_makers_client_sends_and_is_understood():
     names = ["R1_actual_q", "R1_actual_TCP_pose"]
-    [payload] = FrameDecoder().feed(encode_topic(0, names, 50.0))
+    [payload] = Decoder().feed(encode_topic(0, names, 50.0))
     command, topic = cbor2.loads(payload)
     assert [command, {**topic, "trigger": 0x41414141}] == cbor2.loads(MAKERS_TOPIC)
     assert type(topic["frequency"]) is float

@@ -10,7 +10,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
-from brushloop.drivers.arcs.wire import BareDecoder, FrameDecoder, Framing, encode, encode_bare_request, encode_request
+from brushloop.drivers.arcs.wire import Decoder, Framing, encode, encode_bare_request, encode_request
 from brushloop.drivers.sim.rig import HOST
 
 
@@ -47,7 +47,7 @@ class Archive:
                 writer.write(encode(reply) if sof else reply)
 
         async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            decoder = FrameDecoder() if sof else BareDecoder()
+            decoder = Decoder()
             while data := await reader.read(4096):
                 for payload in decoder.feed(data):
                     if payload.startswith(b"__login__"):
