@@ -99,11 +99,12 @@ def decode_message(payload: bytes) -> tuple[int, list[Any]]:
 
 CHANNEL = 0
 SEGMENTS = ("R1_actual_TCP_pose", "R1_actual_q")
+RATE_HZ = 100.0
 SILENCE_S = 0.5
 
 
 class RtdeStream:
-    """One subscription on a socket of its own."""
+    """One subscription to pose and joints, on a socket of its own."""
 
     def __init__(self, host: str, port: int) -> None:
         self.host = host
@@ -112,9 +113,8 @@ class RtdeStream:
         """Names in the greeting that can be subscribed to, with their ids."""
         self._decoder = Decoder()
         self._stream: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
-        self._segments: Sequence[str] = ()
 
-    async def open(self, segments: Sequence[str], frequency_hz: float) -> None:
+    async def open(self) -> None:
         """Connect, read the greeting, subscribe. Raises `ConnectionLost`, `DeviceTimeout`, `ProtocolViolation`."""
         try:
             async with in_time(STREAM, "connect", SILENCE_S, f"greeting from {self.host}:{self.port}"):
@@ -123,10 +123,9 @@ class RtdeStream:
         except asyncio.LimitOverrunError:
             raise ProtocolViolation(STREAM, "connect", "a greeting without an end") from None
         self.offered = outputs_of(greeting)
-        if missing := set(segments) - set(self.offered):
+        if missing := set(SEGMENTS) - set(self.offered):
             raise ProtocolViolation(STREAM, "subscribe", f"the controller does not offer {sorted(missing)}")
-        self._segments = segments
-        self._stream[1].write(encode_topic(CHANNEL, segments, frequency_hz))
+        self._stream[1].write(encode_topic(CHANNEL, SEGMENTS, RATE_HZ))
 
     async def samples(self) -> list[list[Any]]:
         """The samples that have piled up, at least one, oldest first; each has a value for each segment.
@@ -145,8 +144,8 @@ class RtdeStream:
                 messages = [decode_message(payload) for payload in self._decoder.feed(data)]
                 samples += [values for head, values in messages if head == CHANNEL]
         for values in samples:
-            if len(values) != len(self._segments):
-                raise ProtocolViolation(STREAM, "read", f"{len(values)} values for {len(self._segments)} segments")
+            if len(values) != len(SEGMENTS):
+                raise ProtocolViolation(STREAM, "read", f"{len(values)} values for {len(SEGMENTS)} segments")
         return samples
 
     async def close(self) -> None:
@@ -164,7 +163,7 @@ async def rtde_answers(host: str, port: int) -> dict[str, Any]:
     stream = RtdeStream(host, port)
     answers: dict[str, Any] = {}
     try:
-        await stream.open(SEGMENTS, RATE_HZ)
+        await stream.open()
         answers["sample"] = (await stream.samples())[-1]
     except DeviceError as error:
         answers["refused"] = str(error)
@@ -231,7 +230,6 @@ class LagMeter:
         return max(0.0, round(1e3 * float(lags_s[best]), 1)) if misfit_mm[best] <= MISFIT_SHARE * extent_mm else None
 
 
-RATE_HZ = 100.0
 STALE_MS = 500.0
 MOST_SILENCES = 3
 """Consecutive silences, of half a second each: a busy machine may cause one or two."""
@@ -264,7 +262,7 @@ class Telemetry:
         if self._table.rtde_port is not None:
             self._stream = RtdeStream(self._table.host, self._table.rtde_port)
             try:
-                await self._stream.open(SEGMENTS, RATE_HZ)
+                await self._stream.open()
                 await self._take_pushed(self._stream)
             except DeviceError as error:
                 await self._fall_back(error)

@@ -164,11 +164,11 @@ async def greeted(said: bytes) -> object:
 async def streamed(data: bytes) -> object:
     stream = RtdeStream("127.0.0.1", 1)
     reader = asyncio.StreamReader()
-    stream._segments, stream._stream = ("R1_actual_TCP_pose",), (reader, None)  # type: ignore[assignment]
+    stream._stream = reader, None  # type: ignore[assignment]
     reader.feed_data(data)
     reader.feed_eof()
     samples = await stream.samples()
-    assert all(len(values) == 1 for values in samples)
+    assert all(len(values) == 2 for values in samples)
     return samples
 
 
@@ -204,7 +204,7 @@ def refusal_of(unit: int, code: int) -> bytes:
 REFUSAL = refusal_of(1, 4)
 FRAMES = [START, REFUSAL, pump.write_register(1, 1, 6000), refusal_of(2, 1), REFUSAL + START, START + REFUSAL]
 VALUES: list[list[Any]] = [
-    [0, POSE],
+    [0, POSE, POSE],
     [0, "Running", True, None, 5, -(2**63), 1.5e300, {"a": [1, {"b": "c"}]}],
     [100, {"chanel": 0, "frequency": 50.0, "segments": ["R1_actual_q"], "to_server": False, "trigger": 0}],
     [2**64 - 1, math.nan, math.inf, "é" * 20],

@@ -11,6 +11,7 @@ from typing import Any
 import cbor2
 import pytest
 
+from brushloop.drivers.arcs import telemetry
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.arcs.telemetry import LagMeter, RtdeStream, encode_sample, encode_topic
 from brushloop.drivers.arcs.wire import PING, Decoder, encode
@@ -24,8 +25,7 @@ from tests.drivers.arcs.conftest import NEAR, QUICK, Cabinet, MakeArm
 from tests.drivers.failing import SetClock, mute
 from tests.waiting import until
 
-GREETING = b'{"protocol":"rtde","version":1,"input":{"set_recipe":100},"output":{"R1_actual_TCP_pose":1021}}\n\n'
-POSE = ["R1_actual_TCP_pose"]
+GREETING = b'{"protocol":"rtde","version":1,"output":{"R1_actual_TCP_pose":1021,"R1_actual_q":1006}}\n\n'
 
 
 MAKERS_TOPIC = (
@@ -64,7 +64,7 @@ async def newest(*said: bytes) -> list[Any]:
     async with await asyncio.start_server(serve, HOST, 0) as server:
         stream = RtdeStream(HOST, server.sockets[0].getsockname()[1])
         try:
-            await stream.open(POSE, 50.0)
+            await stream.open()
             return (await stream.samples())[-1]
         finally:
             await stream.close()
@@ -94,15 +94,15 @@ async def test_what_is_no_telemetry_is_distinguished(said: list[bytes], error: t
 @pytest.mark.parametrize(
     ("frames", "sample"),
     [
-        (encode_sample(0, [[1, 2]]), [1, 2]),
-        (encode(b"[0,[1,2]]"), [1, 2]),
-        (PING + encode_sample(0, [[1, 2]]), [1, 2]),
-        (b"".join(encode_sample(0, [k]) for k in range(100)), 99),
+        (encode_sample(0, [[1, 2], 3]), [[1, 2], 3]),
+        (encode(b"[0,[1,2],3]"), [[1, 2], 3]),
+        (PING + encode_sample(0, [1, 2]), [1, 2]),
+        (b"".join(encode_sample(0, [k, k]) for k in range(100)), [99, 99]),
     ],
     ids=["CBOR", "JSON", "after a ping", "a backlog"],
 )
 async def test_the_newest_sample_is_handed_over(frames: bytes, sample: object):
-    assert await newest(GREETING, frames) == [sample]
+    assert await newest(GREETING, frames) == sample
 
 
 @pytest.fixture
@@ -208,10 +208,12 @@ async def test_where_both_ways_are_silent_the_pose_goes_stale(rtde: RtdeServer, 
 
 
 async def test_where_the_arm_rested_between_two_pushes_is_reported_where_time_runs_fast(
-    rtde: RtdeServer, cabinet: Cabinet
+    rtde: RtdeServer, cabinet: Cabinet, monkeypatch: pytest.MonkeyPatch
 ):
+    monkeypatch.setattr(telemetry, "SEGMENTS", ("R1_actual_TCP_pose", "timestamp"))
+    monkeypatch.setattr(telemetry, "RATE_HZ", 10.0)
     stream = RtdeStream(HOST, rtde.port)
-    await stream.open(["R1_actual_TCP_pose", "timestamp"], 10.0)
+    await stream.open()
     await stream.samples()
     motion, now_s = cabinet.cabinet.world.motion, cabinet.cabinet.now_s()
     # The flange moves for a second of the arm's time, which is half of what lies between two pushes.
