@@ -22,7 +22,7 @@ from brushloop.drivers.devices import Pose, PoseSample, QueuedLine
 from brushloop.drivers.errors import LimitExceeded, MotionError, NotConnected
 from brushloop.drivers.geometry import distance
 from brushloop.drivers.host import HostClock
-from tests.contract.asking import ACC_MM_S2, LIFT_MM, SLOW_MM_S, SPEED_MM_S, Enabled, raised
+from tests.contract.conftest import ACC_MM_S2, LIFT_MM, SLOW_MM_S, SPEED_MM_S, Enabled, raised
 
 GENTLY = {"speed_mm_s": SPEED_MM_S, "acc_mm_s2": ACC_MM_S2}
 SLOWLY = {"speed_mm_s": SLOW_MM_S, "acc_mm_s2": ACC_MM_S2}

@@ -17,8 +17,7 @@ from unittest.mock import AsyncMock, Mock
 
 import pytest
 
-from tests.contract import asking
-from tests.contract.conftest import RIG, pytest_collection_modifyitems, pytest_configure
+from tests.contract import conftest
 from tests.waiting import PATIENCE_S, wait_until
 
 ROOT = Path(__file__).parents[2]
@@ -87,10 +86,10 @@ def answered(monkeypatch: pytest.MonkeyPatch, answer: str, *, asked: bool = True
     """What a person's answer comes to, of an arm that nobody has to connect to; `asked` on a terminal."""
     terminal = Mock(spec=io.StringIO, **{"isatty.return_value": asked, "readline.return_value": f"{answer}\n"})
     monkeypatch.setattr(sys, "stdin", terminal)
-    monkeypatch.setattr(asking, "_look", AsyncMock(return_value=(None, None, None)))
-    monkeypatch.setattr(asking, "_announcement", Mock(return_value=""))
-    monkeypatch.setattr(asking, "sole_driver", lambda _host, _port: contextlib.nullcontext())
-    return asking.permission_refused(Mock(), Mock(), 1)
+    monkeypatch.setattr(conftest, "_look", AsyncMock(return_value=(None, None, None)))
+    monkeypatch.setattr(conftest, "_announcement", Mock(return_value=""))
+    monkeypatch.setattr(conftest, "sole_driver", lambda _host, _port: contextlib.nullcontext())
+    return conftest.permission_refused(Mock(), Mock(), 1)
 
 
 @pytest.mark.parametrize(
@@ -104,11 +103,11 @@ def test_only_a_yes_on_a_terminal_lets_it_move(monkeypatch: pytest.MonkeyPatch, 
 
 
 def test_a_refusal_skips_what_moves_and_nothing_else(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("tests.contract.conftest.permission_refused", lambda *_: "no")
+    monkeypatch.setattr(conftest, "permission_refused", lambda *_: "no")
     config = Mock(stash=pytest.Stash(), option=Mock(collectonly=False))
-    config.stash[RIG] = Mock()
+    config.stash[conftest.RIG] = Mock()
     moving, still = Mock(), Mock(**{"get_closest_marker.return_value": None})
-    pytest_collection_modifyitems(config, [moving, still])
+    conftest.pytest_collection_modifyitems(config, [moving, still])
     assert [mark.args[0].name for mark in moving.add_marker.call_args_list] == ["skip"]
     assert not still.add_marker.called
 
@@ -122,4 +121,4 @@ def test_a_rig_that_cannot_be_used_is_a_usage_error(tmp_path: Path, toml: str, p
     config = Mock(spec=pytest.Config, stash=pytest.Stash(), option=Mock(numprocesses=processes))
     config.getoption.return_value = path
     with pytest.raises(pytest.UsageError, match=re.escape(expected)):
-        pytest_configure(config)
+        conftest.pytest_configure(config)
