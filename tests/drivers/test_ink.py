@@ -23,7 +23,7 @@ from brushloop.drivers.host import Clock, HostClock
 from brushloop.drivers.ink import port as port_module
 from brushloop.drivers.ink import pump as pump_module
 from brushloop.drivers.ink import station as station_module
-from brushloop.drivers.ink.port import DoseLost, InkRefused
+from brushloop.drivers.ink.port import InkRefused
 from brushloop.drivers.ink.pump import ModbusPump, ModbusPumpConfig
 from brushloop.drivers.ink.simulator import PtyLine, PumpFirmware, StationFirmware
 from brushloop.drivers.ink.station import InkStation, InkStationConfig, seal
@@ -211,23 +211,6 @@ async def test_the_limit_per_minute_slides_and_counts_what_was_not_confirmed(
         await station.dose(2.0)
     assert well.well.ml == 13.5
     await station.close()
-
-
-async def test_a_well_is_filled_up_to_its_level_and_a_dose_that_does_not_arrive_is_told(
-    well: StationFirmware, station: InkStation, monkeypatch: pytest.MonkeyPatch
-):
-    well.well.ml = 0.4 * well.well.capacity_ml
-    filled = await station.replenish()
-    assert filled.level is not None
-    assert filled.level >= 0.5
-    assert filled.dosed_ml == pytest.approx(well.well.ml - 0.4 * well.well.capacity_ml)
-    assert await station.replenish() == filled, "it is full"
-    well.well.ml = 1.0
-    monkeypatch.setattr(well.well, "add", lambda _volume_ml: None)  # the tube has come off
-    with pytest.raises(DoseLost, match="Look at the tube"):
-        await station.replenish()
-    well.well.ml = 19.0  # somebody poured
-    assert (await station.replenish()).dosed_ml == filled.dosed_ml + 2.0, "the lost dose was given as well"
 
 
 # ---------------------------------------------------------------- the pump

@@ -33,7 +33,6 @@ from brushloop.drivers.force import sri_m8123
 from brushloop.drivers.force.sri_m8123 import COMMAND_ID, RoundAssembler, Wrench, encode_round
 from brushloop.drivers.ink import pump, station
 from brushloop.drivers.ink.port import crc16
-from brushloop.drivers.ink.simulator import PumpFirmware, StationFirmware
 
 DOC = Path(__file__).parents[2] / "docs" / "ink-station.md"
 POSE = [0.4, -0.13, 0.2, 3.14, 0.0, 1.57]
@@ -172,14 +171,6 @@ async def streamed(data: bytes) -> object:
     return samples
 
 
-async def obeyed(data: bytes) -> object:
-    for firmware in (StationFirmware(), PumpFirmware()):
-        buffer = bytearray(data)
-        while (request := firmware.take(buffer)) is not None:
-            firmware.answer(request)
-    return True
-
-
 async def joined(data: bytes) -> object:
     """The wrenches in a row of frames, each an id of two bytes and what it holds; then a sound round."""
     parts = RoundAssembler()
@@ -220,7 +211,6 @@ READERS: dict[str, tuple[Read, list[bytes], int]] = {
     "a greeting": (greeted, [GREETING, b'{"protocol":"rtde","output":{}}\n\n'], 8000),
     "a stream of pushes": (streamed, [encode_short(PUSHES[0]) * 3, encode_short(PUSHES[4])], 2000),
     "rounds of the force board": (joined, [ROUND * 3], 2000),
-    "a request to an instrument": (obeyed, LINES + FRAMES, 1000),
 }
 
 

@@ -29,7 +29,7 @@ ABOVE, LOW = brush_pose(300.0, -200.0, 200.0), brush_pose(300.0, -200.0, 130.0)
 ELSEWHERE = brush_pose(340.0, -180.0, 100.0, tilt_deg=10.0)
 
 
-@pytest.mark.parametrize("mode", ["Manual", "Sideways", 7, None])
+@pytest.mark.parametrize("mode", ["Manual", None])
 async def test_an_arm_that_is_not_on_automatic_is_neither_set_nor_powered(
     make_arm: MakeArm, cabinet: Cabinet, mode: object
 ):

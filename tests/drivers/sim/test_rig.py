@@ -165,24 +165,6 @@ async def test_a_person_ends_a_stop_that_was_asked_for_and_the_state_tells(ask: 
     assert (await ask("state"))["safety_mode"] == "Normal"
 
 
-async def test_what_is_no_request_gets_one_line_and_the_next_is_answered(ask: Ask, path: Path):
-    requests = {
-        b"hello": "not JSON",
-        b'{"do": "explode"}': "not a request",
-        b'{"do": "clear", "nth": 1}': "not a request",
-        b'{"do": "add", "fault": {}}': "Field required",
-        b'{"do": "hand", "act": "mend"}': "there is no person here",
-    }
-    reader, writer = await asyncio.open_unix_connection(str(path))
-    for request, words in requests.items():
-        writer.write(request + b"\n")
-        answer = json.loads(await reader.readline())
-        assert (answer["ok"], answer["error"].isprintable()) == (False, True)
-        assert words in answer["error"]
-    writer.close()
-    await writer.wait_closed()
-
-
 async def test_only_its_owner_can_open_it_and_no_other_file_or_rig_is_pushed_aside(rig: LoopbackRig, path: Path):
     async def refused(at: Path, words: str) -> None:
         with pytest.raises(RigRefused, match=words):
