@@ -6,16 +6,13 @@ Time passes only while every task waits, and then jumps to the next timer.
 from __future__ import annotations
 
 import asyncio
+import itertools
 import selectors
 from collections.abc import Callable
 from typing import Any, TypeVar
 
 STEP_S = 1e-6
 """Time that passes at least between two looks at what is ready, so that a wait for the next moment ends."""
-LATENCY_S = 2e-4
-"""The same where there are sockets: a call over a network takes a few of these."""
-SETTLE_SHARE = 0.05
-"""Share of a jump that is really waited for where there are sockets: a busy system may deliver a little later."""
 
 _R = TypeVar("_R")
 
@@ -57,34 +54,23 @@ class _Jumping(selectors.SelectSelector):
             if self._stands_still():
                 return []
             ready = super().select(None if timeout is None else 0.0)
-        step_s = STEP_S
-        if len(self.get_map()) > 1:  # the first is the loop's own
-            step_s = LATENCY_S
-            if not ready and timeout:
-                ready = super().select(SETTLE_SHARE * timeout)
-        self._time.pass_s(step_s if ready or timeout is None else max(timeout, step_s))
+        self._time.pass_s(STEP_S if ready or timeout is None else max(timeout, STEP_S))
         return ready
 
 
-class SimulatedTimeLoop(asyncio.SelectorEventLoop):
-    """For tests without threads and other processes, which are not waited for."""
+class MemoryLoop(asyncio.SelectorEventLoop):
+    """Servers and their clients in this loop are connected in memory, and what a thread of an executor would do is done
+    at once in the thread of the loop. Other threads and processes are not waited for."""
 
     def __init__(self, time: SimulatedTime | None = None, stands_still: Callable[[], bool] = lambda: False) -> None:
         """`stands_still` is asked whenever every task waits; where it is so no time passes, and the loop is to stop."""
-        self._simulated = time or SimulatedTime()
-        super().__init__(_Jumping(self._simulated, stands_still))
+        self.simulated = time or SimulatedTime()
+        super().__init__(_Jumping(self.simulated, stands_still))
+        self._servers: dict[tuple[str, int], MemoryServer] = {}
+        self._free_ports = itertools.count(50_000)
 
     def time(self) -> float:
-        return self._simulated.now_s
-
-
-class MemoryLoop(SimulatedTimeLoop):
-    """Servers and their clients in this loop are connected in memory, and what a thread of an executor would do is done
-    at once in the thread of the loop."""
-
-    def __init__(self, time: SimulatedTime | None = None, stands_still: Callable[[], bool] = lambda: False) -> None:
-        super().__init__(time, stands_still)
-        self._servers: dict[tuple[str, int], MemoryServer] = {}
+        return self.simulated.now_s
 
     def run_in_executor(self, executor: object, func: Callable[..., _R], *args: Any) -> asyncio.Future[_R]:  # type: ignore[override]
         future: asyncio.Future[_R] = self.create_future()
@@ -95,8 +81,9 @@ class MemoryLoop(SimulatedTimeLoop):
         return future
 
     async def create_server(self, protocol_factory: Any, host: Any = None, port: Any = None, **_: Any) -> Any:  # type: ignore[override]
-        server = MemoryServer(self._servers, host, port, protocol_factory)
-        assert self._servers.setdefault((host, port), server) is server, f"{host}:{port} is in use"
+        address = host, port or next(self._free_ports)
+        server = MemoryServer(self._servers, address, protocol_factory)
+        assert self._servers.setdefault(address, server) is server, f"{address} is in use"
         return server
 
     async def create_connection(self, protocol_factory: Any, host: Any = None, port: Any = None, **_: Any) -> Any:  # type: ignore[override]
@@ -113,11 +100,17 @@ class MemoryLoop(SimulatedTimeLoop):
 class MemoryServer:
     """As much of an `asyncio.Server`, and of its socket, as a server of the loopback rig uses."""
 
-    def __init__(self, servers: dict[tuple[str, int], MemoryServer], host: str, port: int, factory: Any) -> None:
+    def __init__(self, servers: dict[tuple[str, int], MemoryServer], address: tuple[str, int], factory: Any) -> None:
         self.protocol_factory = factory
         self.sockets = [self]
         self._servers = servers
-        self._address = host, port
+        self._address = address
+
+    async def __aenter__(self) -> MemoryServer:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.close()
 
     def getsockname(self) -> tuple[str, int]:
         return self._address

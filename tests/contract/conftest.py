@@ -28,7 +28,7 @@ from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import HOST, rig_toml
 from brushloop.drivers.sim.world import SimClock, World
-from tests.simulated_time import SimulatedTimeLoop
+from tests.simulated_time import MemoryLoop
 
 RATE = 5.0
 LOOPBACK = ("bare", "sof, RTDE")
@@ -138,7 +138,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 def pytest_asyncio_loop_factories(config: pytest.Config) -> dict[str, Callable[[], asyncio.AbstractEventLoop]]:
     """Nobody waits for the loopback controller: its time is simulated."""
-    return {"real": asyncio.new_event_loop} if RIG in config.stash else {"simulated": SimulatedTimeLoop}
+    return {"real": asyncio.new_event_loop} if RIG in config.stash else {"simulated": MemoryLoop}
 
 
 @pytest.hookimpl(trylast=True)

@@ -18,7 +18,7 @@ from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import HOST
 from brushloop.drivers.sim.world import SimClock, World
-from tests.simulated_time import LoopClock, SimulatedTimeLoop
+from tests.simulated_time import LoopClock, MemoryLoop
 
 RATE = 20.0
 LIMITS = Limits(x_mm=(-2000.0, 2000.0), y_mm=(-260.0, 260.0), z_mm=(95.0, 400.0))
@@ -28,7 +28,7 @@ QUICK = {"speed_mm_s": 200.0, "acc_mm_s2": 800.0}
 
 
 def pytest_asyncio_loop_factories() -> dict[str, Callable[[], asyncio.AbstractEventLoop]]:
-    return {"simulated": SimulatedTimeLoop}
+    return {"simulated": MemoryLoop}
 
 
 class Cabinet(ArcsServer):

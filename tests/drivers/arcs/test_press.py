@@ -163,10 +163,15 @@ async def test_lines_that_a_dead_process_left_held_are_dropped_and_do_not_hold_u
     await other.move(TOP, speed_mm_s=100.0, acc_mm_s2=ACC)
 
 
+def does_not_hold(cabinet: Cabinet) -> None:
+    cabinet.answers(STOP_MOVE, 0)
+    cabinet.before_each(LINE, lambda _: asyncio.get_running_loop().simulated.pass_s(0.01))  # as a line over a network
+
+
 @pytest.mark.parametrize(
     ("tamper", "error", "words"),
     [
-        (lambda c: c.answers(STOP_MOVE, 0), MotionFailed, "does not hold its path|holds . of 3"),
+        (does_not_hold, MotionFailed, "does not hold its path|holds . of 3"),
         (lambda c: c.refuses_lines(0, lambda line: line["duration"]), MotionFailed, "holds 2 of 3 lines"),
         (lambda c: c.refuses_lines(2, lambda line: line["duration"]), MotionRefused, "QUEUE_FULL"),
     ],
