@@ -152,30 +152,6 @@ EXCLUSIVE = {OperatorRequest.RETAKE, OperatorRequest.SKIP}
 """Of these, only the last that was made counts."""
 
 
-class OperatorRequests:
-    """Requests that wait until they can be carried out. Any thread may make them."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self.open: tuple[OperatorRequest, ...] = ()
-        """Requests that are still pending."""
-
-    def toggle(self, request: OperatorRequest) -> None:
-        """Make or withdraw a request."""
-        with self._lock:
-            kept = set(self.open) - (EXCLUSIVE if request in EXCLUSIVE else {request})
-            if request not in self.open:
-                kept.add(request)
-            self.open = tuple(each for each in OperatorRequest if each in kept)
-
-    def take(self, request: OperatorRequest) -> bool:
-        """Remove a request that is about to be carried out; False if it was not made."""
-        with self._lock:
-            made = request in self.open
-            self.open = tuple(each for each in self.open if each is not request)
-            return made
-
-
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 

@@ -39,10 +39,10 @@ async def decide(
     `NeedsOperator` if the screen went away: the step stays open, and is done and asked about again on resume.
     """
     stroke_id = press.stroke_id
-    if run.requests.take(OperatorRequest.RETAKE):
+    if run.control.take(OperatorRequest.RETAKE):
         run.progress.log(f"{stroke_id}: is pressed again, as the operator requested")
         return False, True
-    if run.requests.take(OperatorRequest.SKIP):
+    if run.control.take(OperatorRequest.SKIP):
         run.progress.log(f"{stroke_id}: is left out, as the operator requested")
         return False, False
     if verdict is None or verdict.passed:

@@ -1,4 +1,4 @@
-"""The state of a run, and the pause, park and stop requests that any thread may make."""
+"""The state of a run, and the requests that any thread may make: to pause, park or stop, and what the operator asks."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import asyncio
 import threading
 from collections.abc import Callable
 from enum import StrEnum
+
+from brushloop.collect.operator import EXCLUSIVE, OperatorRequest
 
 
 class State(StrEnum):
@@ -57,11 +59,27 @@ class RunControl:
         """Whether the run is to end before the next step."""
         self.closing = False
         """Whether everything is collected and the arm parked; the run then ends by itself."""
+        self.requests: tuple[OperatorRequest, ...] = ()
+        """Requests of the operator that are still pending."""
 
     @property
     def state(self) -> State:
         """What the run is doing."""
         return self._state
+
+    def toggle(self, request: OperatorRequest) -> None:
+        """Make or withdraw a request of the operator; from any thread."""
+        with self._lock:
+            replaced = EXCLUSIVE if request in EXCLUSIVE else {request}
+            kept = tuple(each for each in self.requests if each not in replaced)
+            self.requests = kept if request in self.requests else (*kept, request)
+
+    def take(self, request: OperatorRequest) -> bool:
+        """Remove a request that is about to be carried out; False if it was not made."""
+        with self._lock:
+            made = request in self.requests
+            self.requests = tuple(each for each in self.requests if each is not request)
+            return made
 
     def entered(self, task: asyncio.Task[None]) -> None:
         """Note that this event loop runs `task` until the end; cancel it if a stop was requested before."""

@@ -121,7 +121,7 @@ class Engine:
             trace_n=self._run.telemetry.trace_n(),
             force_ceiling_n=None if self._rig_config.force is None else self._rig_config.force.max_n,
             picture=self._run.telemetry.picture,
-            requests=self._run.requests.open,
+            requests=self._run.control.requests,
             no_pose_s=no_pose_s,
         )
 
@@ -135,7 +135,7 @@ class Engine:
 
     def request(self, request: OperatorRequest) -> None:
         """Make or withdraw a request; requests are carried out between steps. From any thread."""
-        self._run.requests.toggle(request)
+        self._run.control.toggle(request)
 
     def park(self) -> None:
         """End the run after this step with the arm lifted and parked; no more questions are asked. From any thread."""

@@ -24,7 +24,7 @@ from brushloop.collect.engine.open_or_resume import Opening
 from brushloop.collect.engine.snapshot import Progress
 from brushloop.collect.errors import ConfigError, ForceTooHigh, StepError, describe
 from brushloop.collect.motion import Procedures
-from brushloop.collect.operator import Asker, OperatorRequests
+from brushloop.collect.operator import Asker
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import Rig
 from brushloop.collect.rig.paper import Patch, Sheet
@@ -232,7 +232,6 @@ class RunContext:
     progress: Progress
     asker: Asker
     control: RunControl = field(default_factory=RunControl)
-    requests: OperatorRequests = field(default_factory=OperatorRequests)
     telemetry: Telemetry = field(default_factory=Telemetry)
     """Gets every force."""
     rig: Rig = field(init=False)

@@ -137,9 +137,9 @@ class Run(RunContext):
             await self.rig.robot.confirm()
         except MotionError:
             await self._retreat()  # somebody moved the arm during a pause or a question, or with another client
-        if isinstance(step, steps.DipStep) and self.requests.take(OperatorRequest.NEW_SHEET):
+        if isinstance(step, steps.DipStep) and self.control.take(OperatorRequest.NEW_SHEET):
             await self._new_sheet()
-        if isinstance(step, steps.DipStep) and self.requests.take(OperatorRequest.JOG):
+        if isinstance(step, steps.DipStep) and self.control.take(OperatorRequest.JOG):
             await self._touch_again(step)
         if self.control.park_wanted:
             await self._park()
@@ -237,7 +237,7 @@ class Run(RunContext):
             raise
         if not isinstance(result, DipResult):
             self.left_ink_ns = None
-        elif self.requests.take(OperatorRequest.SKIP):
+        elif self.control.take(OperatorRequest.SKIP):
             left_out = self.progress.planned(step.index).press()
             result = result.model_copy(update={"skipped": left_out})
             self.progress.log(f"{left_out.stroke_id}: is left out, as the operator requested")

@@ -14,7 +14,7 @@ from brushloop.collect.engine.policy import MAX_FAILURES, Action, decide
 from brushloop.collect.engine.run import Run
 from brushloop.collect.engine.snapshot import Mark
 from brushloop.collect.errors import ForceTooHigh, NeedsOperator, Parked, SheetFull, StepVoid, arm_at_fault
-from brushloop.collect.operator import Asker, Choice, OperatorRequest, OperatorRequests, Prompt
+from brushloop.collect.operator import Asker, Choice, OperatorRequest, Prompt
 from brushloop.collect.protocols.steps import CaptureStep, PressStep, Step, ZeroTouchStep
 from brushloop.drivers.errors import DeviceError, DeviceTimeout, LimitExceeded, MotionFailed, RobotNotSafe, Stuck
 from brushloop.sessions.events import BoardResult, Condition, Press, StepResult, ZeroTouchResult
@@ -122,15 +122,15 @@ def lab(lab: Lab) -> Lab:
 
 
 def test_a_request_made_twice_is_withdrawn_and_retake_and_skip_exclude_each_other() -> None:
-    requests = OperatorRequests()
-    requests.toggle(OperatorRequest.RETAKE)
-    requests.toggle(OperatorRequest.SKIP)
-    assert requests.open == (OperatorRequest.SKIP,)
-    requests.toggle(OperatorRequest.SKIP)
-    assert not requests.take(OperatorRequest.SKIP)
-    requests.toggle(OperatorRequest.JOG)
-    assert requests.take(OperatorRequest.JOG)
-    assert requests.open == ()
+    control = RunControl()
+    control.toggle(OperatorRequest.RETAKE)
+    control.toggle(OperatorRequest.SKIP)
+    assert control.requests == (OperatorRequest.SKIP,)
+    control.toggle(OperatorRequest.SKIP)
+    assert not control.take(OperatorRequest.SKIP)
+    control.toggle(OperatorRequest.JOG)
+    assert control.take(OperatorRequest.JOG)
+    assert control.requests == ()
 
 
 def test_the_operator_asks_for_a_new_sheet_and_for_another_take_of_the_first_stroke_on_it(lab: Lab) -> None:
