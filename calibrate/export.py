@@ -27,6 +27,7 @@ from brushloop.sessions.messages import PNG_START, encode_png
 from brushloop.sessions.records import Header, Stroke, Topic
 from brushloop.sessions.terminal import Progress, counted, unseen
 
+STROKE_COLUMNS = ("kind", "depth_mm", "reached_mm", "tilt_deg", "dip_to_touch_s", "heading_deg")
 PATCH_COLUMNS = ("cell_x_mm", "cell_y_mm", "cell_width_mm", "cell_height_mm")
 Row = dict[str, Any]
 
@@ -137,12 +138,7 @@ def _row(header: Header, stroke: Stroke) -> Row:
         "stroke_id": stroke.stroke_id,
         "session_id": header.session_id,
         "source": str(header.source),
-        "kind": stroke.kind,
-        "depth_mm": stroke.depth_mm,
-        "reached_mm": stroke.reached_mm,
-        "tilt_deg": stroke.tilt_deg,
-        "dip_to_touch_s": stroke.dip_to_touch_s,
-        "heading_deg": stroke.heading_deg,
+        **{name: getattr(stroke, name) for name in STROKE_COLUMNS},
         **_pair("anchor_{}_mm", stroke.anchor_mm),
         **_pair("anchor_{}_px", stroke.anchor_px),
         **_pair("px_per_mm_{}", stroke.px_per_mm),

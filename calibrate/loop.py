@@ -30,16 +30,7 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written
 from brushloop.calibrate.fit.command import BrushFit
 from brushloop.calibrate.presses import Press, Refused, read_presses, too_thin, uncommanded
-from brushloop.calibrate.report import (
-    Point,
-    Sealed,
-    about,
-    ink_uri,
-    overlay_uri,
-    render,
-    source_point,
-    write_files,
-)
+from brushloop.calibrate.report import Point, Sealed, about, ink_uri, overlay_uri, render, source_point, write_files
 from brushloop.calibrate.scores import MEASURES, Scores, Stat, scores_csv, similarities, statistics
 from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.calibrate.stats import Floats, Interval, Summary, is_near

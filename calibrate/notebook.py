@@ -17,13 +17,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from brushloop.calibrate.commands import (
-    AnalyseRequest,
-    CalibrateRequest,
-    FitRequest,
-    RecoverRequest,
-    ValidateRequest,
-)
+from brushloop.calibrate.commands import AnalyseRequest, CalibrateRequest, FitRequest, RecoverRequest, ValidateRequest
 from brushloop.calibrate.compare import MM_GRAY, brush_of, simulated
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.files import Written

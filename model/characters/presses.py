@@ -16,16 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.ndimage import gaussian_filter
 
-from brushloop.model.characters.plan import (
-    Floats,
-    Image,
-    Patch,
-    Reach,
-    StrokePath,
-    directions,
-    lengths_along,
-    tangents,
-)
+from brushloop.model.characters.plan import Floats, Image, Patch, Reach, StrokePath, directions, lengths_along, tangents
 from brushloop.model.raster import SIZE_PX, Images, coverage
 from brushloop.model.strokes import StrokeModel
 
