@@ -59,8 +59,8 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for k, (length, bend, depth) in enumerate(STROKES):
         path = commanded_path(length, bend, depth, depth)
         mark = brush.drag([Waypoint(*row) for row in path.tolist()], 0.0, 0.0, ink_load=1.0, press_seed=k)
-        photograph(folder / f"{k}.png", mark, (700, 900), (300, 350))
-        lines.append(f"{k}.png,{length},{bend},{depth},10.0,300,350")
+        photograph(folder / f"{k}.png", mark, (500, 620), (200, 250))
+        lines.append(f"{k}.png,{length},{bend},{depth},10.0,200,250")
     return imported(folder, lines, tmp_path_factory.mktemp("sessions") / "drags", "drag")
 
 
@@ -136,8 +136,12 @@ def test_an_edited_file_hostile_ink_and_presses_are_refused_with_one_line(
     assert "holds drags" in refused("recover", session)
 
 
-def test_the_ink_lies_where_the_command_put_it(session: Path) -> None:
-    drags = read_drags(session)
+@pytest.fixture(scope="module")
+def drags(session: Path) -> Drags:
+    return read_drags(session)
+
+
+def test_the_ink_lies_where_the_command_put_it(drags: Drags) -> None:
     straight = next(drag.ink for drag in drags.placed if drag.stroke.stroke_id == "0") > 0.5
     x, y = drags.grid[0][straight.any(axis=0)], drags.grid[1][straight.any(axis=1)]
     assert -12.0 < x.min() < 2.0
@@ -316,8 +320,8 @@ def test_the_commanded_path_is_the_curve_of_its_four_control_points() -> None:
     assert path[:, 2].max() == pytest.approx(0.8 * 18.0)
 
 
-def test_the_slope_of_width_against_depth_has_its_interval(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    drags, widths = read_drags(session), np.array([[1.0, 3.0], [2.0, 3.6], [3.0, 3.9], [4.0, 4.5]])
+def test_the_slope_of_width_against_depth_has_its_interval(drags: Drags, monkeypatch: pytest.MonkeyPatch) -> None:
+    widths = np.array([[1.0, 3.0], [2.0, 3.6], [3.0, 3.9], [4.0, 4.5]])
     monkeypatch.setattr(Drags, "widths", lambda _: widths)
     # by hand: 2.4 / 5, and 4.303 standard errors of sqrt(0.018 / 2 / 5) on either side
     assert "0.480 mm/mm (95 % 0.297 to 0.663), +2.55 mm at depth 0, r = 0.99, n = 4" in width_sentence(drags)

@@ -19,21 +19,13 @@ from brushloop.calibrate.compare import (
     similarity,
     simulated,
 )
-from brushloop.calibrate.loop import (
-    AGAIN,
-    ANOTHER,
-    SIMULATED,
-    Pair,
-    pair_up,
-    score_pairs,
-    statistics_of,
-)
+from brushloop.calibrate.loop import AGAIN, ANOTHER, SIMULATED, Pair, pair_up, score_pairs, statistics_of
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.scores import Scores, find_stat, similarities
 from brushloop.calibrate.validate.run import score_job
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.similarity import binary_scores, csim, ssim
-from brushloop.model.strokes import stroke_model, stroke_models
+from brushloop.model.strokes import stroke_models
 from brushloop.sessions.records import Condition, Stroke
 from tests.calibrate.given import blank_press, drawn_press, loop_record
 
@@ -204,8 +196,7 @@ def test_the_table_is_in_order_of_capture_and_its_groups_in_order_of_session_and
 # Presses made again: pairs by name, scored against the brush's own repeatability
 
 
-MODEL = stroke_model("ccd-bsm", Brush())
-STRICT = (Alignment.MM, Tone.BINARY)
+MODEL = MODELS["ccd-bsm"]
 
 
 def press(name: str, shown: tuple[float, float], asked: tuple[float, float], of: str | None = None) -> Press:
@@ -236,7 +227,7 @@ def test_a_press_made_again_as_it_was_beats_the_other_press_of_its_condition() -
     assert names == [("a-r01", "a-r01~1"), ("a-r02", "a-r02~1")]
     assert refused == {"b-r01": "was not pressed again"}
     scores = score_pairs(pairs, ORIGINALS)
-    csim = {what: scores.of_key(what, STRICT)[:, 0] for what in scores.models}
+    csim = {what: scores.of_key(what, MM)[:, 0] for what in scores.models}
     assert csim[AGAIN].min() == pytest.approx(1.0)
     assert csim[ANOTHER].max() < 0.98
     assert csim[SIMULATED].mean() > 0.99
@@ -251,7 +242,7 @@ def test_a_press_made_again_too_deep_fails_and_says_so() -> None:
     again = [press("a-r01~1", (18.0, 5.0), (18.0, 5.0), "a-r01")]
     scores = score_pairs(paired(ORIGINALS, again)[0], ORIGINALS)
     record = loop_record("grid", "ab", stats=tuple(statistics_of(scores)))
-    stat = find_stat(record.stats, AGAIN, STRICT)
+    stat = find_stat(record.stats, AGAIN, MM)
     assert stat is not None
     assert stat.csim.below_ceiling > 2.0
     assert record.answer.good is False

@@ -131,13 +131,6 @@ def test_the_shipped_generator_is_small_and_the_one_that_its_card_describes() ->
     assert 0.5 * file.report["mse"] < mse < 2.0 * file.report["mse"]
 
 
-@pytest.fixture
-def copy(tmp_path: Path) -> Path:
-    path = tmp_path / "generator.safetensors"
-    path.write_bytes(SHIPPED_GENERATOR.read_bytes())
-    return path
-
-
 def changed(path: Path, tensors: dict[str, np.ndarray] | None = None, **metadata: str) -> None:
     with safe_open(path, framework="np") as file:
         before = file.metadata()
@@ -164,8 +157,9 @@ HOSTILE: dict[str, tuple[Callable[[Path], Any], str]] = {
 
 
 @pytest.mark.parametrize("kind", HOSTILE)
-def test_what_is_no_generator_is_refused_in_one_line(copy: Path, kind: str) -> None:
-    damage, words = HOSTILE[kind]
+def test_what_is_no_generator_is_refused_in_one_line(tmp_path: Path, kind: str) -> None:
+    (damage, words), copy = HOSTILE[kind], tmp_path / "generator.safetensors"
+    copy.write_bytes(SHIPPED_GENERATOR.read_bytes())
     damage(copy)
     with pytest.raises(TrainError) as caught:
         read_generator(copy)

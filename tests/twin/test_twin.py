@@ -39,16 +39,7 @@ from brushloop.twin.run import (
     twin_toml,
     workers,
 )
-from brushloop.twin.search import (
-    Solution,
-    Target,
-    choose_individual,
-    fit_spread,
-    of_parts,
-    off,
-    search,
-    start,
-)
+from brushloop.twin.search import Solution, Target, choose_individual, fit_spread, of_parts, off, search, start
 from tests.command import refused, said
 from tests.photographed import imported_presses
 from tests.waiting import wait_until

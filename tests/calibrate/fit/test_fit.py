@@ -91,9 +91,11 @@ def test_sizes_of_marks_are_those_of_the_brush_with_intervals_that_narrow() -> N
     assert more.high - more.low < 0.7 * (here.high - here.low)
 
 
-def test_too_few_conditions_give_no_interval() -> None:
+def test_too_few_conditions_give_no_interval_and_one_no_held_out_scores(tmp_path: Path) -> None:
     assert sizes_of(presses(a_brush(), CONDITIONS[: FEWEST_CONDITIONS - 1] * 3)) == {}
     assert sizes_of(presses(a_brush(), [(h, 0.0) for h in range(11, 18)])) == {}, "one tilt shows no slope"
+    fitted = fit_press_session(FitRequest(imported_presses(tmp_path, CONDITIONS[:1])))
+    assert (fitted.held_out, fitted.sizes) == ([], {})
 
 
 def test_products_of_the_jacobian_are_those_of_the_whole_image() -> None:
@@ -221,9 +223,3 @@ def test_one_command_leads_from_photographs_to_the_report(session: Path) -> None
     assert "CCD-BSMG" in ran.output
     assert ran.output.splitlines()[-1] == f"Report: {session / 'validation' / 'report.html'}"
     assert Report.read(session / "validation" / "report.json").model(NAME) is not None
-
-
-def test_a_single_condition_gives_neither_intervals_nor_held_out_scores(tmp_path: Path) -> None:
-    fitted = fit_press_session(FitRequest(imported_presses(tmp_path, CONDITIONS[:1])))
-    assert fitted.held_out == []
-    assert fitted.sizes == {}

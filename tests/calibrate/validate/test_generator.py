@@ -21,12 +21,12 @@ from tests.command import refused, said
 
 # One word a line, as the file's owner would write it.
 TRAINING = """
-steps = 250
-training_images = 400
+steps = 120
+training_images = 200
 validation_images = 16
 batch = 32
-validate_every = 125
-picture_every = 250
+validate_every = 60
+picture_every = 120
 learning_rate = 0.01
 [target]
 px_mm = 1.0
@@ -78,7 +78,7 @@ def test_a_generator_is_tuned_on_the_presses_of_a_session(
     if placement == "zero-touch":
         (tmp_path / "train.toml").write_text(
             TRAINING.replace("PLACEMENT", placement)
-            .replace("steps = 250", "steps = 60")
+            .replace("steps = 120", "steps = 20")
             .replace("px_mm = 1.0", "px_mm = 1.4")
         )
         said("train", "--config", tmp_path / "train.toml", "--out", tmp_path / "made")
