@@ -79,7 +79,7 @@ def plan(
         draw_plan(rig, wanted, planned, picture)
         say(f"The sheets are drawn in {picture}")
     if ask:
-        poses = all_poses(rig, wanted, PaperPlane(rig.paper.touch_z_mm), every_patch=True)
+        poses = all_poses(rig, wanted, PaperPlane(rig.paper.touch_z_mm))
         say(f"The controller finds joints for all {asyncio.run(ask_reach(config, rig, poses))} poses.")
 
 

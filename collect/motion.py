@@ -75,13 +75,13 @@ def retreat_moves(config: RigConfig, here: Pose) -> list[Move]:
         moves.append(Move(here, motion.press_speed_mm_s))
     # Turn upright before travelling: turning along a long line would sweep the ferrule around.
     turned = brush_pose(*here.position_mm, heading_deg=config.paper.yaw_deg)
-    return [*moves, Move(turned, motion.travel_speed_mm_s), *park_moves(config)]
+    return [*moves, Move(turned, motion.travel_speed_mm_s), park_move(config)]
 
 
-def park_moves(config: RigConfig) -> list[Move]:
+def park_move(config: RigConfig) -> Move:
     """To the place where the arm waits, out of the camera's view."""
     parked = brush_pose(*config.motion.park_mm, heading_deg=config.paper.yaw_deg)
-    return [Move(parked, config.motion.travel_speed_mm_s)]
+    return Move(parked, config.motion.travel_speed_mm_s)
 
 
 def over_sheet_move(config: RigConfig) -> Move:
@@ -92,7 +92,7 @@ def over_sheet_move(config: RigConfig) -> Move:
 
 def photograph_moves(config: RigConfig) -> list[Move]:
     """Over the sheet, unless the arm is there, and out of the camera's view."""
-    return [over_sheet_move(config), *park_moves(config)]
+    return [over_sheet_move(config), park_move(config)]
 
 
 # Ink
@@ -252,7 +252,7 @@ class Procedures:
         self.target_mm: tuple[float, float, float] | None = None
         """Where the arm was last sent; for a press, its deepest point."""
         self._dips = 0
-        self.photographer = Photographer(rig, self.go, over_sheet_move(rig.config), *park_moves(rig.config))
+        self.photographer = Photographer(rig, self.go, over_sheet_move(rig.config), park_move(rig.config))
 
     async def go(self, *segments: Segment) -> None:
         """Make moves and follow paths one after the other, each when the arm rests after the one before."""
@@ -365,4 +365,4 @@ class Procedures:
 
     async def park(self) -> None:
         """Go out of the camera's view."""
-        await self.go(*park_moves(self._config))
+        await self.go(park_move(self._config))

@@ -13,7 +13,7 @@ from rich.console import Group
 from rich.table import Table
 
 from brushloop.calibrate.report import printable
-from brushloop.collect.motion import Move, Region, park_moves
+from brushloop.collect.motion import Move, Region, park_move
 from brushloop.collect.motion import Path as MotionPath
 from brushloop.collect.protocols.config import ProtocolConfig
 from brushloop.collect.protocols.steps import Drawn, DrawStep, PressStep
@@ -98,7 +98,7 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
     measured = config.touch.method != "taught" and config.touch.points_mm
     dips = 0
     sheets = 1
-    plane, here = PaperPlane(config.paper.touch_z_mm), park_moves(config)[-1].target
+    plane, here = PaperPlane(config.paper.touch_z_mm), park_move(config).target
     for walked in walk(config, protocol):
         step = walked.step
         kind, moves = str(step.kind), moves_of(config, plane, step, walked.patches, dips=dips)

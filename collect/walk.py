@@ -21,7 +21,7 @@ from brushloop.collect.motion import (
     inking_moves,
     mark_moves,
     over,
-    park_moves,
+    park_move,
     photograph_moves,
     press_moves,
     stroke_moves,
@@ -281,23 +281,21 @@ def check_poses(rig_path: Path, rig: RigConfig, poses: Iterable[PlannedPose]) ->
             raise ConfigError(rig_path, "robot.limits", what) from None
 
 
-def all_poses(
-    rig: RigConfig, protocol: ProtocolConfig, plane: PaperPlane, *, every_patch: bool = False
-) -> Iterator[PlannedPose]:
-    """Everything that the protocol can command over this plane, taught or measured by touch.
-
-    The box of the limits is convex, so what fits on the outermost patches fits on all. The arm's reach is not convex
-    and needs `every_patch`.
-    """
-    yield from ((move.target, move.speed_mm_s, "park") for move in park_moves(rig))
-    sheet = sheet_of(rig, protocol)
-    patches = [sheet.patch(i) for i in range(sheet.capacity)] if every_patch else sheet.corners
+def all_poses(rig: RigConfig, protocol: ProtocolConfig, plane: PaperPlane) -> Iterator[PlannedPose]:
+    """Everything that the protocol can command over this plane, taught or measured by touch, on every patch."""
+    parked, sheet = park_move(rig), sheet_of(rig, protocol)
+    yield parked.target, parked.speed_mm_s, "park"
     distinct: dict[object, Step] = {}
     for walked in walk(rig, protocol):
         distinct.setdefault((walked.step.kind, _moved(walked.step)), walked.step)
     for step in distinct.values():
-        for marked in _places(step, patches):
-            yield from step_poses(rig, plane, step, marked)
+        if step.kind not in MARKING:
+            yield from step_poses(rig, plane, step)
+            continue
+        for patch in map(sheet.patch, range(sheet.capacity)):
+            yield from step_poses(rig, plane, step, (patch,))
+            if isinstance(step, SelfCheckStep):  # it marks one patch, or three
+                yield from step_poses(rig, plane, step, (patch, patch, patch))
 
 
 def step_poses(rig: RigConfig, plane: PaperPlane, step: Step, patches: Sequence[Patch] = ()) -> Iterator[PlannedPose]:
@@ -320,17 +318,6 @@ def _moved(step: Step) -> object:
             return None
         case _:
             return replace(step, index=0)
-
-
-def _places(step: Step, patches: list[Patch]) -> Iterator[tuple[Patch, ...]]:
-    """The sets of patches that a step may mark; the self-check marks one patch, or three."""
-    if step.kind not in MARKING:
-        yield ()
-        return
-    for patch in patches:
-        yield (patch,)
-        if isinstance(step, SelfCheckStep):
-            yield (patch, patch, patch)
 
 
 async def ask_reach(rig_path: Path, config: RigConfig, poses: Iterable[PlannedPose]) -> int:

@@ -61,7 +61,11 @@ async def mark(context: StepContext, step: PressStep | DrawStep) -> PressResult:
             waits_s.append((sample.stamp.host_ns - left_ns) / 1e9)
             left_ns = None
 
-    await _make_ready(context)
+    await look_at_sheet(context)
+    if run.left_ink_ns is None or run.rig.clock.now_ns() - run.left_ink_ns > STALE_INK_S * 1e9:
+        # Resumed, paused, or the last press failed: the brush may have dried or lost its ink since its dip.
+        context.recorder.log("dip again before the press")
+        await fill_brush(context)
     context.recorder.listeners.append(touched)
     for number in range(len(step.drawn.strokes) if isinstance(step, DrawStep) else 1):
         if number > 0:
@@ -85,16 +89,6 @@ async def mark(context: StepContext, step: PressStep | DrawStep) -> PressResult:
         peak_force_n=None if run.rig.force is None else max(peaks_n),
         depths_mm=tuple(depths_mm) if isinstance(step, DrawStep) else (),
     )
-
-
-async def _make_ready(context: StepContext) -> None:
-    """Check that the sheet is blank, and fill the brush if its ink is old."""
-    await look_at_sheet(context)
-    run, left_ns = context.run, context.run.left_ink_ns
-    if left_ns is None or run.rig.clock.now_ns() - left_ns > STALE_INK_S * 1e9:
-        # Resumed, paused, or the last press failed: the brush may have dried or lost its ink since its dip.
-        context.recorder.log("dip again before the press")
-        await fill_brush(context)
 
 
 async def zero_touch(context: StepContext, step: ZeroTouchStep) -> ZeroTouchResult:

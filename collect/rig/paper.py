@@ -55,14 +55,6 @@ class Sheet:
         """Patches on the sheet."""
         return self.columns * self.rows
 
-    @property
-    def corners(self) -> list[Patch]:
-        """The outermost patches: poses within a convex box on these are within it on every patch."""
-        if not self.capacity:
-            return []
-        last_row = self.capacity - self.columns
-        return [self.patch(i) for i in sorted({0, self.columns - 1, last_row, self.capacity - 1})]
-
     def patch(self, index: int) -> Patch:
         """The patch with this number."""
         if not 0 <= index < self.capacity:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
 
-import numpy as np
 import pytest
 
 from brushloop.collect.engine.recorder import StepContext
@@ -120,16 +119,6 @@ def test_what_cannot_be_done_is_named_before_anything_is_connected(
     config = rig(tmp_path, text=changed)
     with pytest.raises(ConfigError, match=message):
         check_protocol(tmp_path / "rig.toml", tmp_path / "protocol.toml", config, protocol(tmp_path, text))
-
-
-def test_the_outermost_patches_stand_for_all(config: RigConfig) -> None:
-    wanted, plane = example("protocol.toml"), PaperPlane(120.0, 0.01, -0.02)
-    corners, everywhere = (
-        np.array([pose.position_mm for pose, _, _ in all_poses(config, wanted, plane, every_patch=every)])
-        for every in (False, True)
-    )
-    assert len(everywhere) > 8 * len(corners)
-    assert np.allclose((everywhere.min(axis=0), everywhere.max(axis=0)), (corners.min(axis=0), corners.max(axis=0)))
 
 
 def test_a_sheet_that_leans_is_checked_as_it_lies(tmp_path: Path, config: RigConfig) -> None:
@@ -345,6 +334,6 @@ def test_what_a_run_sends_the_plan_has_checked(lab: Lab, made: list[Made], text:
         assert not not_checked(config, one.sent, [*planned.segments, *again]), one.step
         if one not in last:  # after the last capture the arm does not set out for a dip
             assert not not_sent(config, planned, one.sent), one.step
-        checked = {rounded(pose) for pose, _, _ in all_poses(config, wanted, one.plane, every_patch=True)}
+        checked = {rounded(pose) for pose, _, _ in all_poses(config, wanted, one.plane)}
         assert {rounded(pose) for pose, _ in planned.poses} <= checked, one.step
     assert {one.step.kind for one in made} >= {StepKind.ZERO_TOUCH, StepKind.BOARD}
