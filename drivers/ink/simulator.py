@@ -141,10 +141,9 @@ class StationFirmware:
         """The reply; a repeated line is answered from memory, a damaged one not at all."""
         if request == self._memory[0]:
             return self._memory[1]
-        try:
-            number, command = unseal(request)
-        except ProtocolViolation:
+        if (sealed := unseal(request)) is None:
             return None  # the number that it carries cannot be trusted
+        number, command = sealed
         try:
             text = self._obey(command.split(" "))
         except ProtocolViolation:

@@ -7,7 +7,6 @@ twice.
 
 from __future__ import annotations
 
-import contextlib
 import re
 from typing import Annotated, Literal
 
@@ -32,16 +31,12 @@ def seal(number: int, text: str) -> bytes:
     return b"%b*%04X\n" % (body, crc16(body))
 
 
-def unseal(line: bytes) -> tuple[int, str]:
-    """(number, text) of a line, with or without its end. Raises `ProtocolViolation`."""
+def unseal(line: bytes) -> tuple[int, str] | None:
+    """(number, text) of a line, with or without its end; None if it is damaged."""
     match = _SEALED.fullmatch(line)
-    if match is None or len(line) > MAX_LINE_BYTES:
-        raise ProtocolViolation(DEVICE, "decode", f"not a line: {line[:48]!r}")
-    number, text, crc = match.groups()
-    body = line[: match.end(2)]
-    if int(crc, 16) != crc16(body):
-        raise ProtocolViolation(DEVICE, "decode", f"checksum of {line[:48]!r} is {crc16(body):04X}")
-    return int(number), text.decode("ascii")
+    if match is None or len(line) > MAX_LINE_BYTES or int(match[3], 16) != crc16(line[: match.end(2)]):
+        return None
+    return int(match[1]), match[2].decode("ascii")
 
 
 def find_reply(received: bytes, number: int) -> str | None:
@@ -50,11 +45,9 @@ def find_reply(received: bytes, number: int) -> str | None:
     Noise, echoes, damaged lines and replies to other requests are skipped: the sender repeats its request in time.
     """
     *lines, _ = received.split(b"\n")
-    for line in lines:
-        with contextlib.suppress(ProtocolViolation):
-            replied, text = unseal(line)
-            if replied == number and _REPLY.fullmatch(text):
-                return text
+    for sealed in map(unseal, lines):
+        if sealed is not None and sealed[0] == number and _REPLY.fullmatch(sealed[1]):
+            return sealed[1]
     return None
 
 
