@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import os
 import selectors
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -67,7 +68,8 @@ class MemoryLoop(asyncio.SelectorEventLoop):
         self.simulated = time or SimulatedTime()
         super().__init__(_Jumping(self.simulated, stands_still))
         self._servers: dict[tuple[str, int], MemoryServer] = {}
-        self._free_ports = itertools.count(50_000)
+        # Each process has its own ports: an arm at one address has one driver on a machine, even if it is in memory.
+        self._free_ports = itertools.count(10_000 + 4 * os.getpid() % 50_000)
 
     def time(self) -> float:
         return self.simulated.now_s
