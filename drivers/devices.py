@@ -100,7 +100,10 @@ class Device(Protocol):
     """What every device of a rig can do."""
 
     async def connect(self) -> Identity:
-        """Open the connections, once, and learn who answers; moves and powers nothing. Raises `DeviceError`."""
+        """Open the connections, once, and learn who answers; moves and powers nothing.
+
+        Raises `DeviceError`. After that too, `close` has to be called.
+        """
         ...
 
     async def close(self) -> None:

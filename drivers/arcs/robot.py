@@ -61,23 +61,16 @@ class AuboArcs:
         self._motion.on_pose = self._telemetry.lag.asked
 
     async def connect(self) -> Identity:
-        """Connect and identify; powers nothing, telemetry runs from here on. Raises `DeviceError`.
-
-        After a failure nothing is left open, and nothing was set on an arm that was not identified.
-        """
-        try:
-            await open_arcs(self._state)
-            version = await self._state.call("SystemInfo.getInterfaceVersionCode")
-            for controller in (self._stop, self._motion):
-                await controller.open()
-            self._motion.robot = self._state.robot = self._stop.robot = await self._state.first_robot()
-            self._connected = True
-            model = str(await self._state.ask("RobotConfig.getRobotType"))
-            box = str(await self._state.ask("RobotConfig.getControlBoxType"))
-            await self._telemetry.start()
-        except BaseException:
-            await self._hang_up()
-            raise
+        """Connect and identify; sets and powers nothing, telemetry runs from here on. Raises `DeviceError`."""
+        await open_arcs(self._state)
+        version = await self._state.call("SystemInfo.getInterfaceVersionCode")
+        for controller in (self._stop, self._motion):
+            await controller.open()
+        self._motion.robot = self._state.robot = self._stop.robot = await self._state.first_robot()
+        self._connected = True
+        model = str(await self._state.ask("RobotConfig.getRobotType"))
+        box = str(await self._state.ask("RobotConfig.getControlBoxType"))
+        await self._telemetry.start()
         firmware = f"interface {version}"
         if self._table.rtde_port is not None:
             firmware += f", telemetry by {self._telemetry.source}"

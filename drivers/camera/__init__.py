@@ -174,11 +174,7 @@ class OpenCvCamera:
     async def connect(self) -> Identity:
         """Start to grab, and wait for the first valid frame. Raises `ConnectionLost`, `DeviceError`, ..."""
         self._thread.start()
-        try:
-            frame = await self.fresh(Stamp(0))
-        except BaseException:
-            await self.close()
-            raise
+        frame = await self.fresh(Stamp(0))
         height, width = frame.image.shape
         locked = "".join(f", {name} {value:g}" for name, value in self._settings.items())
         return Identity(f"{self._table.source} {width}x{height}{locked}", "", self._simulated)

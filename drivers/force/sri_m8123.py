@@ -177,10 +177,7 @@ class SriM8123:
         self._thread = threading.Thread(target=self._run, name="force reader", daemon=True)
 
     async def connect(self) -> Identity:
-        """Open the bus, start the board, wait for its first complete round. Raises `ConnectionLost`, `DeviceTimeout`.
-
-        After a failure the board is stopped and nothing is left open.
-        """
+        """Open the bus, start the board, wait for its first whole round. Raises `ConnectionLost`, `DeviceTimeout`."""
         self._thread.start()
         try:
             async with asyncio.timeout(CONNECT_S):
@@ -188,14 +185,10 @@ class SriM8123:
                     self._require("connect")
                     await asyncio.sleep(RECEIVE_S)
         except TimeoutError:
-            await self.close()
             dropped = self.assembler
             what = f"no whole round in {CONNECT_S:g} s ({dropped.torn} torn, {dropped.refused} refused)"
             remedy = "Check power, wiring, termination and bit rate."
             raise DeviceTimeout(DEVICE, "connect", what, remedy=remedy) from None
-        except BaseException:
-            await self.close()
-            raise
         # The board has no identification. No real board can be on a virtual bus or on the loopback rig's bus.
         interface, channel = self._table.interface, self._table.channel
         simulated = interface == "virtual" or (interface, channel) == ("socketcand", LOOPBACK_CHANNEL)

@@ -12,7 +12,7 @@ import math
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import AsyncGenerator, Callable
+from collections.abc import Callable
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, Field
@@ -143,9 +143,8 @@ class SerialPort:
         self._turn = asyncio.Lock()
         self._closing = threading.Event()
 
-    @contextlib.asynccontextmanager
-    async def opening(self) -> AsyncGenerator[None]:
-        """Open the port for this process alone; an error within the block closes it. Raises `ConnectionLost`."""
+    async def open(self) -> None:
+        """Open the port for this process alone. Raises `ConnectionLost`."""
         import serial
 
         try:
@@ -155,11 +154,6 @@ class SerialPort:
         except (OSError, ValueError) as error:
             why = f"cannot open {self._path}: {error}"
             raise ConnectionLost(self._device, "connect", why, remedy=REPLUG) from None
-        try:
-            yield
-        except BaseException:
-            await self.close()
-            raise
 
     async def exchange(
         self,

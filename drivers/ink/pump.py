@@ -116,10 +116,10 @@ class ModbusPump(InkDevice):
         self._dips = 0
 
     async def connect(self) -> Identity:
-        """Open the port, check that the line does not echo, and stop the pump. `DeviceError` leaves the port closed."""
-        async with self._port.opening():
-            await self._refuse_echo()
-            await self._halt()
+        """Open the port, check that the line does not echo, and stop the pump. Raises `DeviceError`."""
+        await self._port.open()
+        await self._refuse_echo()
+        await self._halt()
         self._connected = True
         # A pump cannot say whether it is the loopback rig's.
         return Identity(f"Modbus RTU pump, unit {self._unit}", "", False)

@@ -106,19 +106,16 @@ class InkStation(InkDevice):
         self._number = 0
 
     async def connect(self) -> Identity:
-        """Open the port and learn who answers; moves nothing. Raises `DeviceError`; nothing is left open then."""
-        async with self._port.opening():
-            answer = await self._ask("identify", attempts=CONNECT_ATTEMPTS)
-            match answer.split(" "):
-                case [model, version, firmware, ("real" | "loopback") as kind] if (model, version) == (MODEL, PROTOCOL):
-                    return Identity(MODEL, firmware, kind == "loopback")
-                case _:
-                    raise ProtocolViolation(
-                        DEVICE,
-                        "connect",
-                        f"identifies as {answer!r}, expected {MODEL} with protocol {PROTOCOL}",
-                        remedy="Check that the path is that of the ink station, and its firmware.",
-                    )
+        """Open the port and learn who answers; moves nothing. Raises `DeviceError`."""
+        await self._port.open()
+        answer = await self._ask("identify", attempts=CONNECT_ATTEMPTS)
+        match answer.split(" "):
+            case [model, version, firmware, ("real" | "loopback") as kind] if (model, version) == (MODEL, PROTOCOL):
+                return Identity(MODEL, firmware, kind == "loopback")
+            case _:
+                what = f"identifies as {answer!r}, expected {MODEL} with protocol {PROTOCOL}"
+                remedy = "Check that the path is that of the ink station, and its firmware."
+                raise ProtocolViolation(DEVICE, "connect", what, remedy=remedy)
 
     async def _give(self, volume_ml: float) -> None:
         """Return when the ink is in the well. A dose that was sent cannot be interrupted, which is why it is small."""

@@ -189,9 +189,11 @@ def the_only_driver(rig: RigConfig) -> Iterator[None]:
 async def arm(rig: RigConfig, the_only_driver: None) -> AsyncIterator[AuboArcs]:
     """Connected; nothing was powered from here."""
     robot = make_robot(rig, HostClock(), print)
-    await robot.connect()
-    yield robot
-    await robot.close()
+    try:
+        await robot.connect()
+        yield robot
+    finally:
+        await robot.close()
 
 
 @pytest.fixture

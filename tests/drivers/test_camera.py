@@ -200,8 +200,10 @@ async def test_a_server_that_says_nothing_is_given_up():
         writer.close()
 
     async with await asyncio.start_server(say_nothing, HOST, 0) as mute:
+        camera = camera_at(f"http://{HOST}:{mute.sockets[0].getsockname()[1]}/", timeout_s=0.5)
         with pytest.raises(DeviceError):
-            await camera_at(f"http://{HOST}:{mute.sockets[0].getsockname()[1]}/", timeout_s=0.5).connect()
+            await camera.connect()
+        await camera.close()
         assert not [thread for thread in threading.enumerate() if thread.name == "camera grabber"]
         over.set()
 

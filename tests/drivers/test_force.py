@@ -202,6 +202,7 @@ async def test_where_no_board_answers_the_connection_times_out(monkeypatch: pyte
     sensor = sensor_on("nobody")
     with pytest.raises(DeviceTimeout, match=r"no whole round in 0.2 s \(0 torn, 0 refused\).*termination"):
         await sensor.connect()
+    await sensor.close()
     assert readers() == 0
     with pytest.raises(NotConnected):
         sensor.latest()

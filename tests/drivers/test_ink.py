@@ -125,6 +125,7 @@ async def test_a_board_that_starts_slowly_is_waited_for_and_another_device_is_re
             station = station_at(path)
             with pytest.raises(ProtocolViolation, match=r"expected ink-station with protocol 1.*Check that the path"):
                 await station.connect()
+            await station.close()
             with pytest.raises(NotConnected):
                 await station.level()
 
@@ -281,6 +282,7 @@ async def test_a_line_that_echoes_is_refused():
         pump = pump_at(path)
         with pytest.raises(ProtocolViolation, match=r"echoes.*Switch off local echo"):
             await pump.connect()
+        await pump.close()
         with pytest.raises(NotConnected):
             await pump.dose(0.1)
 

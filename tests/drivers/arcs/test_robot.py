@@ -87,8 +87,10 @@ async def test_a_cabinet_of_the_older_generation_is_named_as_such(
 
 async def test_a_connect_that_fails_half_way_leaves_nothing_open(cabinet: Cabinet, make_arm: MakeArm):
     del cabinet._methods["rob1.RobotConfig.getRobotType"]
+    arm = make_arm()
     with pytest.raises(RpcError, match="-32601"):
-        await make_arm().connect()
+        await arm.connect()
+    await arm.close()
     await until(lambda: cabinet.clients == 0, "the connections to be closed")
 
 
