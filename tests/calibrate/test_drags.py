@@ -211,7 +211,7 @@ def test_the_length_of_a_stroke_is_along_its_own_axis(angle_deg: float) -> None:
         # One of these photographs is blank, and some strokes are bent.
         ("frida_bigbrush_tilt_16x20", 31, {"length_mm": 0.95, "depth_mid_mm_nominal": 0.8}),
         # Specks and neighbours: their bounding box follows the command with r = .12 only.
-        ("frida_ink_10x8", 24, {"length_mm": 0.9}),
+        pytest.param("frida_ink_10x8", 24, {"length_mm": 0.9}, marks=pytest.mark.soak),
     ],
 )
 def test_real_dragged_strokes_are_all_found_and_follow_their_commands(

@@ -77,7 +77,8 @@ def same(one: Press, other: Press) -> bool:
 
 
 def test_fit_and_validate_do_no_work_twice(session: Path, tmp_path: Path, calls: Counter[str]) -> None:
-    request = ValidateRequest(places=(session,), out=tmp_path / "report")
+    models = ("ccd-bsm", "ccd-bsm-heldout")
+    request = ValidateRequest(places=(session,), models=models, out=tmp_path / "report")
     fit_press_session(FitRequest(session))
     validate(request)
     assert (calls["prepare_job"], calls["refit"], calls["score_job"]) == (3, 3, 3)

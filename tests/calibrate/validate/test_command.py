@@ -71,6 +71,7 @@ def test_a_recording_that_is_not_the_one_its_journal_closed_is_damaged(session: 
 CLUSTER = """
 import os, signal, sys
 from pathlib import Path
+import dask
 from distributed import LocalCluster
 from brushloop.calibrate import work
 from brushloop.calibrate.errors import CalibrationError
@@ -93,6 +94,7 @@ def done(pool, folder, by=None):
     return results
 
 session, here, there = sys.argv[1:]
+dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"})
 jobs = [(str(k), (one, None)) for k, one in enumerate(list(Recording(Path(session)).captures()) * 2)]
 with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
     address, worker = cluster.scheduler_address, cluster.workers[0].pid
