@@ -8,7 +8,7 @@ import random
 import re
 import threading
 import time
-from collections.abc import AsyncIterator, Iterator, Sequence
+from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from functools import partial
 from itertools import count, pairwise
@@ -254,26 +254,6 @@ async def test_a_bias_over_silence_is_refused_and_closing_ends_one(board: ForceB
 
 
 # ---------------------------------------------------------------- the rounds of the force board
-
-
-def feed(parts: RoundAssembler, wrench: Sequence[float], leave_out: int = -1, at_s: float = 0.0) -> list[Wrench]:
-    frames = [frame for place, frame in enumerate(encode_round(tuple(wrench))) if place != leave_out]
-    return [whole for can_id, data in frames if (whole := parts.feed(can_id, data, at_s)) is not None]
-
-
-@pytest.mark.parametrize("leave_out", [0, 1, 2])
-def test_joining_in_mid_round_is_no_fault_and_each_round_without_one_frame_is_dropped_and_counted_once(leave_out: int):
-    parts, (first, second, third) = RoundAssembler(), encode_round(WRENCH)
-    assert parts.feed(*third, 0.0) is None
-    assert feed(parts, WRENCH) == [WRENCH]
-    assert parts.torn == 0
-    for _ in range(5):
-        assert feed(parts, WRENCH, leave_out) == []
-    assert feed(parts, WRENCH) == [WRENCH]
-    assert (parts.torn, parts.refused) == (5, 0)
-    cut = (second[0], second[1][:4])
-    assert [parts.feed(*frame, 0.0) for frame in (first, cut, third)] == [None] * 3
-    assert parts.torn == 6
 
 
 def test_with_frames_lost_or_late_at_random_every_wrench_is_of_one_round(monkeypatch: pytest.MonkeyPatch):

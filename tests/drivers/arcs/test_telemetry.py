@@ -48,18 +48,14 @@ HANGS_UP = b""
 
 async def newest(*said: bytes) -> list[Any]:
     """The newest sample of a controller that says this, and then is silent or hangs up."""
-    over = asyncio.Event()
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        try:
-            for piece in said:
-                writer.write(piece)
-                await asyncio.sleep(0.01)
-            if HANGS_UP not in said:
-                await reader.read()
-        finally:
-            writer.close()
-            over.set()
+        for piece in said:
+            writer.write(piece)
+            await asyncio.sleep(0.01)
+        if HANGS_UP not in said:
+            await reader.read()
+        writer.close()
 
     async with await asyncio.start_server(serve, HOST, 0) as server:
         stream = RtdeStream(HOST, server.sockets[0].getsockname()[1])
@@ -68,7 +64,7 @@ async def newest(*said: bytes) -> list[Any]:
             return (await stream.samples())[-1]
         finally:
             await stream.close()
-            await over.wait()
+            await asyncio.sleep(0.1)  # for the controller
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,6 @@ import numpy as np
 import pytest
 
 from bench.brushes import FROZEN
-from brushloop.collect.rig.config import QualityConfig
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.loopback import RigRefused
@@ -21,7 +19,6 @@ from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Flaw, Waypoint
 from brushloop.drivers.sim.brush.paper import PX_PER_MM, Footprint, Paper
 from brushloop.drivers.sim.brush.spec import PAPER, load_brush
 from brushloop.drivers.sim.config import SimConfig, Table
-from brushloop.drivers.sim.rig import rig_toml
 from brushloop.drivers.sim.world import INK_PER_PRESS, Press, World, bent_toward
 
 PRESSED = (
@@ -119,23 +116,6 @@ def test_a_brush_out_of_range_is_refused_with_file_field_and_range(tmp_path: Pat
         load_brush(path)
     assert str(refused.value).startswith(f"{path}: ")
     assert "\n" not in str(refused.value)
-
-
-def test_the_rig_toml_of_the_paper_s_brush_says_where_its_marks_begin() -> None:
-    paper = load_brush(Path(PAPER))
-    assert paper.quality is not None
-    assert "made to agree with the paper's Table 2: no evidence for the model" in paper.name
-    heads_mm: list[float] = []
-    for tilt_deg in (0.0, 10.0):  # the farthest back and the farthest forward
-        mark = Brush(paper.brush).press(20.0, tilt_deg, ink_load=1.0, press_seed=1)
-        columns = np.flatnonzero((mark.density > 0.5).any(axis=0))
-        heads_mm.append((columns[-1] + 1 - mark.origin_px[0]) / mark.px_per_mm)
-    assert max(abs(at - paper.quality.head_mm) for at in heads_mm) < paper.quality.misplaced_mm - 0.5
-    assert max(abs(at - QualityConfig().head_mm) for at in heads_mm) > QualityConfig().misplaced_mm
-
-    quality = tomllib.loads(rig_toml(SimConfig(brush=paper.brush, head=paper.quality)))["quality"]
-    assert quality == {"head_mm": paper.quality.head_mm, "misplaced_mm": paper.quality.misplaced_mm}
-    assert "quality" not in tomllib.loads(rig_toml(SimConfig()))
 
 
 TABLE = Table()
