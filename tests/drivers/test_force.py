@@ -261,6 +261,8 @@ def test_with_frames_lost_or_late_at_random_every_wrench_is_of_one_round(monkeyp
     rng = random.Random(22)
     for _ in range(500):
         parts, kept, whole = RoundAssembler(), [[rng.random() > 0.3 for _ in range(3)] for _ in range(8)], 0
+        assert parts.feed(*encode_round(WRENCH)[2], 0.0) is None
+        assert parts.torn == 0, "to join in mid-round is no fault"
         for number, keeps in enumerate(kept):
             for place, frame in enumerate(encode_round((float(number),) * 6)):
                 late_s = 0.0 if keeps[place] else rng.choice((-1.0, 0.006, 1e9, math.nan, math.inf))

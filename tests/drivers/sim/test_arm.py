@@ -98,6 +98,16 @@ def test_a_turn_on_the_spot_reads_metres_as_radians(queue: MotionQueue):
     assert queue.exec_id(16.0) == -1
 
 
+def test_a_corner_is_rounded_within_its_radius_and_taken_without_a_rest(cornered: MotionQueue):
+    walk = walked(cornered, 2.5)
+    near_mm = np.linalg.norm(walk - CORNER.position_mm, axis=1)
+    assert 3.0 < near_mm.min() < 20.0
+    off_the_lines = np.minimum(np.abs(walk[:, 1]), np.abs(walk[:, 0] - 100.0))
+    assert near_mm[off_the_lines > 1e-6].max() <= 20.0 + 1e-6
+    assert speeds(walk)[near_mm[:-1] < 20.0].min() > 60.0
+    assert tuple(walk[-1]) == BEYOND.position_mm
+
+
 ways = st.lists(
     st.tuples(st.floats(-80.0, 80.0), st.floats(-80.0, 80.0), st.floats(0.0, 60.0), st.floats(60.0, 200.0)),
     min_size=2,
