@@ -20,7 +20,7 @@ from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, NotConnected
 from brushloop.drivers.sim.faults import Device, Fault
 from brushloop.drivers.sim.rig import HOST
 from tests.drivers.arcs.conftest import Cabinet
-from tests.drivers.arcs.transcript import Archive
+from tests.drivers.arcs.transcript import Archive, Replayed
 from tests.drivers.failing import mute_to
 
 REPORTS = sorted((Path(__file__).parent / "reports").glob("*.zip"))
@@ -105,8 +105,10 @@ async def test_a_cabinet_that_does_not_answer_the_login_is_asked_all_the_same(ca
 @pytest.mark.parametrize("path", REPORTS, ids=lambda path: path.stem)
 async def test_the_same_questions_get_the_same_answers(path: Path) -> None:
     archive = Archive(path)
-    async with archive.replayed() as port:
-        exchanges = await survey(HOST, port, archive.framing)
+    controller = Replayed(archive)
+    await controller.start(HOST, 0)
+    exchanges = await survey(HOST, controller.port, archive.framing)
+    await controller.stop()
     for exchange, line in zip(exchanges, archive.lines, strict=True):
         assert (exchange["method"], exchange["params"]) == (line["method"], line["params"])
         assert exchange["answer"].keys() == line["answer"].keys(), line["method"]
