@@ -207,9 +207,9 @@ SHARED = b"\x82\x00\xd8\x1c\x82\x01\xd8\x1d\x00"
 """A value that holds itself."""
 GREETING = b'{"protocol":"rtde","version":1,"input":{"set_recipe":100},"output":{"R1_actual_TCP_pose":1021}}\n\n'
 READERS: dict[str, tuple[Read, list[bytes], int]] = {
-    "a reply": (answered, REPLIES, 8000),
-    "a push": (pushed, PUSHES, 10_000),
-    "a greeting": (greeted, [GREETING, b'{"protocol":"rtde","output":{}}\n\n'], 8000),
+    "a reply": (answered, REPLIES, 4000),
+    "a push": (pushed, PUSHES, 5000),
+    "a greeting": (greeted, [GREETING, b'{"protocol":"rtde","output":{}}\n\n'], 4000),
     "a stream of pushes": (streamed, [encode_short(PUSHES[0]) * 3, encode_short(PUSHES[4])], 2000),
     "rounds of the force board": (joined, [ROUND * 3], 2000),
 }
@@ -254,13 +254,10 @@ def decoded(chunks: Iterable[bytes]) -> tuple[list[bytes], bool]:
     return payloads, False
 
 
-@pytest.mark.parametrize("valid", [SOF, BARE, [SOF[0] + BARE[0] + PING + SOF[1]]], ids=["SOF", "bare", "both"])
-def test_any_stream_is_the_same_payloads_or_a_violation_wherever_it_is_cut(
-    valid: list[bytes], monkeypatch: pytest.MonkeyPatch
-):
+def test_any_stream_is_the_same_payloads_or_a_violation_wherever_it_is_cut(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(wire, "MAX_BYTES", 150)  # so that a message can be too long
     rng, taken, count = random.Random(1), 0, 0
-    for stream in hostile(valid, 5000):
+    for stream in hostile([*SOF, *BARE, SOF[0] + BARE[0] + PING + SOF[1]], 6000):
         *coarser, finest = (decoded(chunks) for chunks in pieces(stream, rng))
         for payloads, refused in coarser:
             assert refused == finest[1], stream
@@ -309,14 +306,14 @@ FINDERS: dict[str, tuple[Find, list[bytes]]] = {
 def test_any_bytes_hold_one_reply_or_none_wherever_they_are_cut(find: Find, valid: list[bytes]):
     """As `SerialPort` asks: everything so far is shown after each piece, until something is made of it."""
     rng, replies = random.Random(31), 0
-    for received in hostile(valid, 1500):
+    for received in hostile(valid, 1000):
         firsts: list[object] = []
         for chunks in pieces(received, rng):
             shown = (find(b"".join(chunks[: end + 1])) for end in range(len(chunks)))
             firsts.append(next((reply for reply in shown if reply is not None), None))
         assert firsts[0] == firsts[1] == firsts[2], received
         replies += firsts[0] is not None
-    assert replies > 75
+    assert replies > 50
 
 
 @pytest.mark.parametrize("sound", [LINES[1], START], ids=["ink station", "pump"])
