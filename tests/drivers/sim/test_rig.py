@@ -75,8 +75,9 @@ async def test_serving_ends_by_itself_and_leaves_a_rig_toml_unless_another_file_
 
 
 async def test_a_rig_with_a_client_is_not_idle(rig: LoopbackRig):
-    idle = asyncio.create_task(rig.idle(0.3))
     _, writer = await asyncio.open_connection(HOST, rig.arcs.port)
+    await until(lambda: rig.arcs.clients == 1, "the server to notice")
+    idle = asyncio.create_task(rig.idle(0.3))
     await asyncio.sleep(0.6)
     assert not idle.done()
     writer.close()
