@@ -134,6 +134,7 @@ def test_an_edited_file_hostile_ink_and_presses_are_refused_with_one_line(
         with pytest.raises(CalibrationError, match=words):
             DragArtefact.read(edited)
     assert "holds drags" in refused("recover", session)
+    assert "validate one such session at a time" in refused("validate", session, session)
 
 
 @pytest.fixture(scope="module")
