@@ -65,9 +65,10 @@ class DeviceTimeout(DeviceError, TimeoutError):
 class Stale(DeviceTimeout):
     """The newest sample is older than allowed; `age_ms` is its age."""
 
-    def __init__(self, device: str, age_ms: float, limit_ms: float) -> None:
+    def __init__(self, device: str, age_ms: float, limit_ms: float, *, remedy: str = "") -> None:
         self.age_ms = age_ms
-        super().__init__(device, "latest", f"newest sample is {age_ms:.0f} ms old, limit {limit_ms:.0f} ms")
+        what = f"newest sample is {age_ms:.0f} ms old, limit {limit_ms:.0f} ms"
+        super().__init__(device, "latest", what, remedy=remedy)
 
 
 class Stuck(DeviceError):

@@ -25,7 +25,7 @@ from brushloop.collect.engine.open_or_resume import CollectRequest, Opening
 from brushloop.collect.rig import devices
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import Rig, connected
-from brushloop.drivers.arcs.wire import RpcConnection
+from brushloop.drivers.arcs import wire
 from brushloop.drivers.camera.source import CameraTable
 from brushloop.drivers.devices import Frame, Identity, Stamp
 from brushloop.drivers.errors import DeviceTimeout
@@ -356,7 +356,7 @@ def wireless_lab(folder: Path, config: SimConfig = COARSE) -> Iterator[Lab]:
     rig = WirelessRig(config)
     with pytest.MonkeyPatch.context() as patch:
         # nobody waits for a busy machine here
-        patch.setitem(RpcConnection.__init__.__kwdefaults__ or {}, "timeout_s", 1.0)
+        patch.setattr(wire, "REPLY_S", 1.0)
         patch.setattr("brushloop.collect.engine.engine.connected", rig.connected)
         patch.setattr(Engine, "new_event_loop", staticmethod(lambda: MemoryLoop(rig.time)))
         patch.setattr("brushloop.collect.engine.engine.HostClock", lambda: rig.time)

@@ -220,15 +220,16 @@ async def in_time(device: str, op: str, seconds: float, awaited: str) -> AsyncGe
 
 
 Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
+REPLY_S = 1.0
+"""Longest wait for a reply, and for a connection."""
 
 
 class RpcConnection:
     """A socket with one caller at a time; late replies to calls that timed out are passed over."""
 
-    def __init__(self, host: str, port: int, *, timeout_s: float = 1.0, framing: Framing = "sof") -> None:
+    def __init__(self, host: str, port: int, *, framing: Framing = "sof") -> None:
         self.host = host
         self.port = port
-        self._timeout_s = timeout_s
         self._framing = framing
         self._last_id = 0
         self._lock = asyncio.Lock()
@@ -253,7 +254,7 @@ class RpcConnection:
         """
         await self.close()
         try:
-            async with in_time(DEVICE, "connect", self._timeout_s, f"answer from {self.host}:{self.port}"):
+            async with in_time(DEVICE, "connect", REPLY_S, f"answer from {self.host}:{self.port}"):
                 self._stream = await asyncio.open_connection(self.host, self.port)
             self._decoder = Decoder()
             if login and self._framing == "sof":
@@ -288,7 +289,7 @@ class RpcConnection:
                 raise NotConnected(DEVICE, op, "not connected")
             # No drain: requests are small, and a socket that cannot be written to fails the reader.
             self._stream[1].write(request)
-            async with in_time(DEVICE, op, self._timeout_s, "reply"):
+            async with in_time(DEVICE, op, REPLY_S, "reply"):
                 return await self._reply(ident, op, self._stream)
 
     async def _reply(self, ident: str | int, op: str, stream: Stream) -> Any:

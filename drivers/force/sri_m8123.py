@@ -13,7 +13,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import math
 import statistics
 import struct
 import threading
@@ -106,8 +105,6 @@ CONNECT_S = 10.0
 RECEIVE_S = 0.05
 JOIN_S = 5.0
 """Longest wait for the reader to stop the board."""
-SILENT_S = 1.0
-"""A board that streamed and then sends nothing for this long is lost: a gateway that goes away gives no notice."""
 STUCK_MS, STUCK_ROUNDS = 100.0, 10
 """Rounds that are equal to the last bit in all six values, so many and for so long, mean a stuck sensor. Fewer may be
 equal by chance, on a sensor that is slow or coarse."""
@@ -203,7 +200,7 @@ class SriM8123:
         stamp, wrench = newest
         age_ms = (self._clock.now_ns() - stamp.host_ns) / 1e6
         if age_ms > self._table.stale_ms:
-            raise Stale(DEVICE, age_ms, self._table.stale_ms)
+            raise Stale(DEVICE, age_ms, self._table.stale_ms, remedy="Check the sensor's power, adapter and wiring.")
         alike, alike_ms = stamp.seq - since.seq, (stamp.host_ns - since.host_ns) / 1e6
         if alike >= STUCK_ROUNDS and alike_ms > STUCK_MS:
             raise Stuck(DEVICE, alike_ms, alike)
@@ -285,16 +282,9 @@ class SriM8123:
 
         try:
             command(START)
-            quiet_s = -math.inf  # until the board streams
             while self._loss is None and not self._closing.is_set():
                 if (message := bus.recv(RECEIVE_S)) is not None:
-                    quiet_s = 0.0
                     self._take(message)
-                    continue
-                # Only time in which the bus was listened to: a computer that was held up has missed nothing.
-                quiet_s += RECEIVE_S
-                if quiet_s > SILENT_S:
-                    self._lose_bus(f"has been silent for {SILENT_S:g} s")
         except (can.CanError, OSError) as error:
             self._lose_bus(f"failed: {error}")
         finally:

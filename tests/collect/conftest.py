@@ -9,21 +9,16 @@ from pathlib import Path
 import pytest
 
 from brushloop.collect.engine.engine import Engine
-from brushloop.drivers.arcs.wire import RpcConnection
-from brushloop.drivers.force import sri_m8123 as stream
+from brushloop.drivers.arcs import wire
 from brushloop.drivers.sim.config import SimConfig
 from tests import rigs
 from tests.rigs import BARE, BENT_VIEW, COARSE, SHARP, Lab
-from tests.waiting import PATIENCE_S
-
-RPC_TIMEOUT_S = 30.0
 
 
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The simulated cabinet and the force board may have to wait for their turn on a busy machine."""
-    monkeypatch.setitem(RpcConnection.__init__.__kwdefaults__, "timeout_s", RPC_TIMEOUT_S)
-    monkeypatch.setattr(stream, "SILENT_S", PATIENCE_S)
+    """The simulated cabinet may have to wait for its turn on a busy machine."""
+    monkeypatch.setattr(wire, "REPLY_S", 30.0)
 
 
 @pytest.fixture
