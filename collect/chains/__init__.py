@@ -44,7 +44,6 @@ class WritingRequest:
     practice: Annotated[bool, Option(help="First write a practice sheet, and fit the brush to it.")] = False
     data: CharacterData = None
     cell_mm: Annotated[float, Option(min=10, max=500, help="Side of the character's patch of paper.")] = 70.0
-    speed_mm_s: Annotated[float, Option(min=1, max=100, help="Speed of the tip.")] = 15.0
     sheet: NewSheet = None
     armed: Arm = False
     tui: Tui = None

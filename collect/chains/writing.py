@@ -70,7 +70,6 @@ class Writing:
             data=request.data,
             radius_mm=brush.radius_mm,
             length_mm=brush.length_mm,
-            speed_mm_s=request.speed_mm_s,
             footprint=self._footprint() if request.practice else None,
             cell_mm=request.cell_mm,
             repeats=self._repeats(1),

@@ -12,6 +12,7 @@ from brushloop.collect.engine import CollectRequest
 from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.open_or_resume import Opening
 from brushloop.collect.errors import NotAccepted
+from brushloop.collect.photograph.photographer import FASTER
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.doctor import examine
 from brushloop.collect.touch.heights import plane_of
@@ -133,11 +134,8 @@ class ProofStep(Step):
             f"{PRESSES} presses passed the quality checks, {again} were repeated; camera delay {delay_ms:.0f} ms",
         )
         if delay_ms > SLOW_CAMERA_MS:
-            visit.say(
-                f"The camera is slow: {delay_ms / 1e3:.1f} s. Each photograph waits for it.",
-                "Use a cable instead of Wi-Fi, MJPEG instead of H.264, fewer pixels, or no buffer in between.",
-                tone="warning",
-            )
+            slow = f"The camera is slow: {delay_ms / 1e3:.1f} s. Each photograph waits for it."
+            visit.say(slow, FASTER, tone="warning")
         visit.say("Lay a fresh sheet before the first session: this one has the marks of the proof.", "READY")
 
 

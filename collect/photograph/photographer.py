@@ -152,6 +152,7 @@ STAY_S = 0.15
 GROWN_SHARE, GROWN_S = 0.2, 0.1
 """A delay that exceeds the known one by a fifth and by 0.1 s has to be measured again."""
 POSE_PERIOD_S = 0.005
+FASTER = "Use a cable instead of Wi-Fi, MJPEG instead of H.264, fewer frames or pixels, or no buffer in between."
 
 
 class Photographer:
@@ -317,16 +318,12 @@ class Photographer:
             yield placed
 
     def _too_late(self, what: str) -> CameraLate:
-        return CameraLate(
-            f"the camera's delay is too long: {what}; camera.max_delay_ms = {self._config.max_delay_ms:g}. "
-            "Use a cable instead of Wi-Fi, MJPEG instead of H.264, fewer frames or pixels, or no buffer in between."
-        )
+        limit = f"camera.max_delay_ms = {self._config.max_delay_ms:g}"
+        return CameraLate(f"the camera's delay is too long: {what}; {limit}. {FASTER}")
 
     def _uneven(self, what: str = "frames come too unevenly to measure it") -> CameraLate:
-        return CameraLate(
-            f"the camera's delay is not steady: {what}; camera.max_jitter_ms = {self._config.max_jitter_ms:g}. "
-            "Use a cable instead of Wi-Fi, fewer frames or pixels, and a less busy computer."
-        )
+        limit = f"camera.max_jitter_ms = {self._config.max_jitter_ms:g}"
+        return CameraLate(f"the camera's delay is not steady: {what}; {limit}. {FASTER}")
 
     def _not_shown(self) -> CameraLate:
         return CameraLate(
