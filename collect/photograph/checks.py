@@ -119,16 +119,11 @@ class Photograph:
         """Check exposure and blur, as before any press or for the board's picture."""
         return Verdict((exposure(self.image, self.limits), *blurred(self.image, self.plane, self.limits)))
 
-    def check_press(self, patch: Patch, depth_mm: float, anchor_mm: Point | None = None) -> Verdict:
-        """Judge one press of commanded depth `depth_mm`.
-
-        `anchor_mm` is the zero-touch point if it is not the patch's own. Checks that an earlier failure makes
-        meaningless are left out of the verdict.
-        """
-        frame, limits = self.check_frame(), self.limits
+    def check_press(self, patch: Patch, depth_mm: float) -> Verdict:
+        """Judge one press of commanded depth `depth_mm`, by the checks that no earlier failure makes meaningless."""
+        frame, limits, anchor = self.check_frame(), self.limits, patch.anchor_mm
         if not frame.passed:
             return frame
-        anchor = patch.anchor_mm if anchor_mm is None else anchor_mm
         ink = self._ink(patch, MARGIN_MM, anchor)
         checks = [*frame.checks, cut(ink, self.plane, self.image.shape, anchor, limits), self._glare(patch)]
         if not all(check.passed for check in checks):

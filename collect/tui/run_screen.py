@@ -280,8 +280,11 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
             self._sheet.border_title = f"Sheet {now.sheet.number}: {now.sheet.marks.count(None)} free"
         if now.messages != before.messages:
             self._log.show(Content("\n").join(_message_content(line) for line in now.messages[-LOG_LINES:]))
-        if now.last is not None and now.last is not before.last:
-            self._show_capture(now.last)
+        if (last := now.last) is not None and last is not before.last:
+            self._words.show(_capture_words(last))
+            pictures = (last.photo, binary_picture(last.binary), binary_picture(last.model))
+            for widget, picture in zip(self._pictures, pictures, strict=True):
+                widget.show(picture)
         self._note.show(_note_content(now))
 
     def _show_state(self, now: Snapshot) -> None:
@@ -291,12 +294,6 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
         self._state.set_class(now.no_pose_s is not None, "-silent")
         for known in State:
             self._state.set_class(known is state, f"-{known}")
-
-    def _show_capture(self, last: LastCapture) -> None:
-        self._words.show(_capture_words(last))
-        pictures = (last.photo, binary_picture(last.binary), binary_picture(last.model))
-        for widget, picture in zip(self._pictures, pictures, strict=True):
-            widget.show(picture)
 
 
 def figures_content(now: Snapshot) -> Content:

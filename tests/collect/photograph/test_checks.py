@@ -7,6 +7,7 @@ import csv
 import itertools
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -274,6 +275,17 @@ DEPTH_MM = 9.0
 BLANK = "png/120.png"
 
 
+@dataclass(frozen=True)
+class Page(Patch):
+    """A photograph as a whole, and where the brush touched it."""
+
+    start_mm: tuple[float, float]
+
+    @property
+    def anchor_mm(self) -> tuple[float, float]:
+        return self.start_mm
+
+
 def judge(row: dict[str, str], limits: QualityConfig = WHITENED) -> Verdict:
     """The verdict on one photograph as a whole, as if it were a patch."""
     image = cv2.imread(str(DATA / row["file"]), cv2.IMREAD_GRAYSCALE)
@@ -282,8 +294,8 @@ def judge(row: dict[str, str], limits: QualityConfig = WHITENED) -> Verdict:
     size_mm = image.shape[1] * x_mm, image.shape[0] * y_mm
     photograph = Photograph(image.astype(np.uint8), flat_plane(image.shape[::-1], (x_mm, y_mm)), limits, size_mm)
     depth_mm = max(float(row.get("depth_mid_mm_nominal") or DEPTH_MM), 1.0)
-    anchor_mm = float(row["start_x_px"]) * x_mm, size_mm[1] - float(row["start_y_px"]) * y_mm
-    return photograph.check_press(Patch(0, 0.0, 0.0, *size_mm), depth_mm, anchor_mm)
+    start_mm = float(row["start_x_px"]) * x_mm, size_mm[1] - float(row["start_y_px"]) * y_mm
+    return photograph.check_press(Page(0, 0.0, 0.0, *size_mm, start_mm), depth_mm)
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the folder of real photographs is not here")
