@@ -1,21 +1,20 @@
-"""Kinematics of the i5 from its nominal table (modified DH), and the paths of its tip.
+"""Kinematics of the i5 from its nominal table (modified DH).
 
 The loopback controller answers FK and IK with it. A real arm is calibrated and differs by most of a millimetre, so the
-driver always asks the controller. Lengths are in mm, or in rad where a path is angular.
+driver always asks the controller.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.drivers.devices import Pose
-from brushloop.drivers.geometry import columns, interpolate, of_matrix, unit, vector
+from brushloop.drivers.geometry import columns, of_matrix, unit, vector
 
 Matrix = NDArray[np.float64]
 Joints = tuple[float, ...]
@@ -113,65 +112,3 @@ def pose_of(matrix: Matrix) -> Pose:
     """A 4x4 matrix (m) as a pose (mm)."""
     x, y, z = (float(v) * 1e3 for v in matrix[:3, 3])
     return Pose(x, y, z, *of_matrix(matrix[:3, :3].tolist()))
-
-
-ROTATION_AS_LINEAR_MM = 1.0
-"""Below this travel, ARCS reads speed and acceleration as rad/s and rad/s2."""
-TURN_RAD = 1e-4
-STRETCHES = 16
-"""Number of straight pieces in which a curved path is reported to the world."""
-ROUNDING = 1e-9
-"""A path ends exactly at its end, although sums of lengths are rounded."""
-
-
-@dataclass(frozen=True, slots=True)
-class Path:
-    """A way of the tip, by its length in mm, or in rad where it is angular."""
-
-    length: float
-    pose: Callable[[float], Pose]
-    """Where the tip is after some of the length; the ends are exact."""
-    angular: bool
-    stretches: int = STRETCHES
-    joints: Callable[[float], Joints] | None = None
-    """The joints after some of the length; None where the path is not given in joints."""
-
-
-def line(start: Pose, end: Pose, travel_mm: float, turn_rad: float) -> Path:
-    """Straight for the tip. `travel_mm` and `turn_rad` are those of the tool centre point that was configured."""
-    angular = travel_mm < ROTATION_AS_LINEAR_MM and turn_rad > TURN_RAD
-    length = turn_rad if angular else travel_mm
-
-    def pose(done: float) -> Pose:
-        if done >= length - ROUNDING:
-            return end
-        return start if done <= 0.0 else interpolate(start, end, done / length)
-
-    return Path(length, pose, angular, stretches=1)
-
-
-def corner(a: Path, b: Path, cut: float) -> Path:
-    """The parabola that leaves the line `a` at `cut` before its end and meets `b` at `cut` after its start.
-
-    Its length is the one that it replaces; the curve itself is shorter.
-    """
-    start, middle, end = a.pose(a.length - cut), a.pose(a.length), b.pose(cut)
-
-    def pose(done: float) -> Pose:  # by de Casteljau's algorithm, turns included
-        u = done / (2.0 * cut)
-        return interpolate(interpolate(start, middle, u), interpolate(middle, end, u), u)
-
-    return Path(2.0 * cut, pose, angular=False)
-
-
-def joint_line(start: Joints, end: Joints, tool: Matrix) -> Path:
-    """Straight in joints; its length is the angle of the joint that turns farthest."""
-    length = max(abs(a - b) for a, b in zip(start, end, strict=True))
-
-    def joints(done: float) -> Joints:
-        if done >= length - ROUNDING:
-            return end
-        share = max(done, 0.0) / length
-        return tuple(a + share * (b - a) for a, b in zip(start, end, strict=True))
-
-    return Path(length, lambda done: pose_of(forward(joints(done)) @ tool), angular=True, joints=joints)

@@ -16,19 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from brushloop.drivers.devices import Pose
-from brushloop.drivers.geometry import distance
-from brushloop.drivers.sim.kinematics import (
-    HOME,
-    Joints,
-    Matrix,
-    Path,
-    corner,
-    inverse,
-    joint_line,
-    line,
-    matrix_of,
-    pose_of,
-)
+from brushloop.drivers.geometry import distance, interpolate
+from brushloop.drivers.sim.kinematics import HOME, Joints, Matrix, forward, inverse, matrix_of, pose_of
 
 STEADY_LAG_S = 0.08
 """The controller reports steady a little after its queue is empty."""
@@ -39,8 +28,66 @@ RESTS_KEPT = 64
 SHORTEST_CUT = 1e-6
 CORNER_SHARE = 0.5
 """Share of the acceleration that the bend of a corner may need; the rest is left for the speed along it."""
-SLACK = 1e-9
-"""Tolerance for rounding of speeds."""
+ROTATION_AS_LINEAR_MM = 1.0
+"""Below this travel, ARCS reads speed and acceleration as rad/s and rad/s2."""
+TURN_RAD = 1e-4
+STRETCHES = 16
+"""Number of straight pieces in which a curved path is reported to the world."""
+ROUNDING = 1e-9
+"""By which lengths and speeds may differ because sums of them are rounded."""
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """A way of the tip, by its length in mm, or in rad where it is angular."""
+
+    length: float
+    pose: Callable[[float], Pose]
+    """Where the tip is after some of the length; the ends are exact."""
+    angular: bool
+    stretches: int = STRETCHES
+    joints: Callable[[float], Joints] | None = None
+    """The joints after some of the length; None where the path is not given in joints."""
+
+
+def line(start: Pose, end: Pose, travel_mm: float, turn_rad: float) -> Path:
+    """Straight for the tip. `travel_mm` and `turn_rad` are those of the tool centre point that was configured."""
+    angular = travel_mm < ROTATION_AS_LINEAR_MM and turn_rad > TURN_RAD
+    length = turn_rad if angular else travel_mm
+
+    def pose(done: float) -> Pose:
+        if done >= length - ROUNDING:
+            return end
+        return start if done <= 0.0 else interpolate(start, end, done / length)
+
+    return Path(length, pose, angular, stretches=1)
+
+
+def corner(a: Path, b: Path, cut: float) -> Path:
+    """The parabola that leaves the line `a` at `cut` before its end and meets `b` at `cut` after its start.
+
+    Its length is the one that it replaces; the curve itself is shorter.
+    """
+    start, middle, end = a.pose(a.length - cut), a.pose(a.length), b.pose(cut)
+
+    def pose(done: float) -> Pose:  # by de Casteljau's algorithm, turns included
+        u = done / (2.0 * cut)
+        return interpolate(interpolate(start, middle, u), interpolate(middle, end, u), u)
+
+    return Path(2.0 * cut, pose, angular=False)
+
+
+def joint_line(start: Joints, end: Joints, tool: Matrix) -> Path:
+    """Straight in joints; its length is the angle of the joint that turns farthest."""
+    length = max(abs(a - b) for a, b in zip(start, end, strict=True))
+
+    def joints(done: float) -> Joints:
+        if done >= length - ROUNDING:
+            return end
+        share = max(done, 0.0) / length
+        return tuple(a + share * (b - a) for a, b in zip(start, end, strict=True))
+
+    return Path(length, lambda done: pose_of(forward(joints(done)) @ tool), angular=True, joints=joints)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +156,7 @@ def timetable(pieces: Sequence[Piece], start: Knot) -> list[Knot] | None:
         before, piece = pieces[i - 1 : i + 1]
         if before.through:
             leaving[i - 1] = min(before.cap, piece.cap, reach(piece, leaving[i]))
-    if start.speed > reach(pieces[0], leaving[0]) * (1.0 + SLACK) + SLACK:
+    if start.speed > reach(pieces[0], leaving[0]) * (1.0 + ROUNDING) + ROUNDING:
         return None
     knots = [start]
     for piece, limit in zip(pieces, leaving, strict=True):
