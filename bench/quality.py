@@ -27,7 +27,7 @@ from brushloop.collect.rig.paper import Patch, Sheet
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.brush.brush import BrushSpec, Flaw
 from brushloop.drivers.sim.brush.drag import Waypoint
-from brushloop.drivers.sim.brush.paper import PX_PER_MM, Footprint
+from brushloop.drivers.sim.brush.footprint import PX_PER_MM, Footprint
 from brushloop.drivers.sim.config import SimConfig, Table, View
 from brushloop.drivers.sim.scene import Scene
 from brushloop.drivers.sim.world import World

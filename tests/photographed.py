@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
-from brushloop.drivers.sim.brush.paper import Footprint
+from brushloop.drivers.sim.brush.footprint import Footprint
 from brushloop.sessions.imports import ImportOptions, import_photographs
 
 PAPER_GRAY, INK_GRAY = 235, 200

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.drivers.sim.brush.brush import Brush, Descent
-from brushloop.drivers.sim.brush.paper import Footprint
+from brushloop.drivers.sim.brush.footprint import Footprint
 from brushloop.drivers.sim.brush.spec import ALLOWED, BrushSpec
 from brushloop.model.presses import DepthTilt, Grid
 

@@ -23,7 +23,7 @@ from brushloop.drivers.camera.source import LOOPBACK_SERVER
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import columns as axes
 from brushloop.drivers.loopback import LoopbackServer
-from brushloop.drivers.sim.brush.paper import PX_PER_MM
+from brushloop.drivers.sim.brush.footprint import PX_PER_MM
 from brushloop.drivers.sim.config import Table, View
 from brushloop.drivers.sim.faults import Device, FaultBoard
 from brushloop.drivers.sim.world import World

@@ -1,14 +1,17 @@
-"""The simulated world: where the tool is, its contacts with paper and ink, the force on it, and its marks."""
+"""The simulated world: where the tool is, its contacts with paper and ink, the force on it, and its sheet of marks."""
 
 from __future__ import annotations
 
 import functools
 import itertools
 import math
+import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from brushloop.drivers.devices import Pose
@@ -29,8 +32,7 @@ from brushloop.drivers.geometry import (
 from brushloop.drivers.ink.simulator import Well
 from brushloop.drivers.sim.brush.brush import MAX_TILT_DEG, Brush, BrushSpec
 from brushloop.drivers.sim.brush.drag import Waypoint, ink_left
-from brushloop.drivers.sim.brush.footprint import Flaw, natural_split
-from brushloop.drivers.sim.brush.paper import Paper
+from brushloop.drivers.sim.brush.footprint import PX_PER_MM, Flaw, Footprint, Image, natural_split
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.kinematics import Matrix, matrix_of
 from brushloop.drivers.sim.motion import MotionQueue
@@ -129,6 +131,67 @@ class Press:
     ink_load: float
     flaw: Flaw | None = None
     """The flaw of the mark: scripted, or a spontaneous split."""
+
+
+class Paper:
+    """Ink per area on a sheet of (width, height) mm; row 0 is the far edge (largest y), as a camera sees it."""
+
+    def __init__(self, size_x_mm: float, size_y_mm: float) -> None:
+        self.size_x_mm = size_x_mm
+        self.size_y_mm = size_y_mm
+        shape = (round(size_y_mm * PX_PER_MM), round(size_x_mm * PX_PER_MM))
+        self._density: Image = np.zeros(shape, np.float32)
+        self._coming: deque[tuple[Callable[[], Footprint], float, float, float]] = deque()
+        self._lock = threading.Lock()
+
+    @property
+    def density(self) -> Image:
+        """Ink per area, (rows, columns), 0 to 1, including every mark laid so far."""
+        with self._lock:
+            while self._coming:
+                make, x_mm, y_mm, heading_deg = self._coming[0]
+                self._lay(make(), x_mm, y_mm, heading_deg)
+                self._coming.popleft()
+            return self._density
+
+    @density.setter
+    def density(self, density: Image) -> None:
+        with self._lock:
+            self._coming.clear()
+            self._density = density
+
+    def lay_later(self, make: Callable[[], Footprint], x_mm: float, y_mm: float, heading_deg: float) -> None:
+        """When the sheet is next read, call `make` in the reader's thread and lay the footprint that it returns.
+
+        A footprint takes a tenth of a second to compute, too long for the thread that moves the arm.
+        """
+        self._coming.append((make, x_mm, y_mm, heading_deg))
+
+    def lay(self, footprint: Footprint, x_mm: float, y_mm: float, heading_deg: float) -> None:
+        """Lay a footprint with its zero-touch point at (x, y) and its +x along the heading, on top of earlier ink.
+
+        Its scale is that of the sheet.
+        """
+        self.lay_later(lambda: footprint, x_mm, y_mm, heading_deg)
+
+    def _lay(self, footprint: Footprint, x_mm: float, y_mm: float, heading_deg: float) -> None:
+        cos, sin = math.cos(math.radians(heading_deg)), math.sin(math.radians(heading_deg))
+        # Rows run against y, so a counter-clockwise heading is clockwise in row and column.
+        linear = np.array([[cos, sin], [-sin, cos]])
+        anchor = np.array([x_mm * PX_PER_MM, (self.size_y_mm - y_mm) * PX_PER_MM])
+        # cv2 puts pixel centres on integers, our coordinates put them on halves.
+        half = np.array([0.5, 0.5])
+        offset = anchor - linear @ (np.array(footprint.origin_px) - half) - half
+        rows, columns = self._density.shape
+        laid = cv2.warpAffine(footprint.density, np.column_stack([linear, offset]), (columns, rows))
+        height, width = footprint.density.shape
+        corners = offset + np.array([(-1, -1), (width, -1), (width, height), (-1, height)]) @ linear.T
+        left, top = np.maximum(np.floor(corners.min(axis=0)).astype(int) - 1, 0)
+        right, bottom = np.maximum(np.ceil(corners.max(axis=0)).astype(int) + 2, 0)
+        inked = np.s_[top:bottom, left:right]
+        density = self._density.copy()  # other threads may hold the old array
+        density[inked] = 1.0 - (1.0 - density[inked]) * (1.0 - np.clip(laid[inked], 0.0, 1.0))
+        self._density = density
 
 
 class World:

@@ -20,7 +20,7 @@ from brushloop.calibrate.board.pix2len import local_scale
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.brush.brush import BrushSpec
-from brushloop.drivers.sim.brush.paper import PX_PER_MM as SHEET_PX_PER_MM
+from brushloop.drivers.sim.brush.footprint import PX_PER_MM as SHEET_PX_PER_MM
 from brushloop.drivers.sim.config import SimConfig, Table, View
 from brushloop.drivers.sim.scene import Optics, Scene
 from brushloop.drivers.sim.world import World

@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from brushloop.drivers.sim.brush.drag import Stances, Waypoint, draw_drag
 from brushloop.drivers.sim.brush.footprint import (
     FLAWLESS,
+    PX_PER_MM,
     Flaw,
+    Footprint,
     Trouble,
     blank_footprint,
     draw_trouble,
@@ -32,7 +34,6 @@ from brushloop.drivers.sim.brush.mechanics import (
     pull_spine,
     rest_spine,
 )
-from brushloop.drivers.sim.brush.paper import PX_PER_MM, Footprint
 from brushloop.drivers.sim.brush.spec import BrushSpec, within
 
 __all__ = ["Brush", "BrushSpec", "Flaw", "Footprint", "Waypoint"]

@@ -10,9 +10,17 @@ from dataclasses import dataclass, fields, replace
 import cv2
 import numpy as np
 
-from brushloop.drivers.sim.brush.footprint import MARGIN_MM, Tuft, frame_around
+from brushloop.drivers.sim.brush.footprint import (
+    MARGIN_MM,
+    PX_PER_MM,
+    Footprint,
+    Image,
+    Tuft,
+    frame_around,
+    scatter,
+    soak,
+)
 from brushloop.drivers.sim.brush.mechanics import SpineShape, Vector
-from brushloop.drivers.sim.brush.paper import PX_PER_MM, Footprint, Image, scatter, soak
 
 STEP_MM = 0.3
 """Longest distance that the commanded tip travels between two moments of a drag."""

@@ -16,10 +16,10 @@ from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.loopback import RigRefused
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Flaw, Waypoint
-from brushloop.drivers.sim.brush.paper import PX_PER_MM, Footprint, Paper
+from brushloop.drivers.sim.brush.footprint import PX_PER_MM, Footprint
 from brushloop.drivers.sim.brush.spec import PAPER, load_brush
 from brushloop.drivers.sim.config import SimConfig, Table
-from brushloop.drivers.sim.world import INK_PER_PRESS, Press, World, bent_toward
+from brushloop.drivers.sim.world import INK_PER_PRESS, Paper, Press, World, bent_toward
 
 PRESSED = (
     (3986.908, 3129.639, 3100.391),
