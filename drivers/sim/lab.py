@@ -11,10 +11,8 @@ import os
 import secrets
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, RobotMode
 from brushloop.drivers.arcs.wire import AUBOPE_PORT
@@ -83,8 +81,9 @@ class UnknownLab(LoopbackRig):
         """The gateway and bus of the force sensor."""
         self.arcs.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
         self.arcs.cabinet.payload = [self.facts.payload_kg, [0.0] * 3, [0.0] * 3, [0.0] * 6]
-        self._noise, self._luck = (np.random.default_rng([seed, stream]) for stream in (17, 31))
-        self.servers["room"] = MjpegServer(self.world, self._wall)
+        self._luck, noise = (np.random.default_rng([seed, stream]) for stream in (31, 17))
+        # a wall, and no sheet
+        self.servers["room"] = MjpegServer(self.world, lambda _: noise.normal(185.0, 2.0, (480, 640)).astype(np.uint8))
         if not self.facts.speaks_arcs:
             del self.servers["arcs"], self.servers["rtde"]
             # the software before ARCS takes connections, and answers nothing that ARCS would
@@ -92,10 +91,6 @@ class UnknownLab(LoopbackRig):
         self._trap = trap
         self._touches = 0
         self._pulled: list[int] = []
-
-    def _wall(self, _tool: Pose) -> NDArray[np.uint8]:
-        """What the second camera sees: a wall, and no sheet."""
-        return self._noise.normal(185.0, 2.0, (480, 640)).astype(np.uint8)
 
     def labels(self, control: Path | None = None) -> list[str]:
         """What a person can read in the lab now: on labels, plugs, the print and the pendant."""
@@ -116,31 +111,30 @@ class UnknownLab(LoopbackRig):
             "Ctrl-C ends",
         ]
 
-    async def hand(self, act: str = "", to: str = "", index: int = 0, corner: str = "") -> dict[str, Any]:
-        """What the person did: `says`, and for `bring` whether it was `reached`. Raises ValueError, with one line."""
+    async def hand(self, act: str = "", to: str = "", index: int = 0, corner: str = "") -> str:
+        """Ask the person for something; return what was done. Raises ValueError for what cannot be."""
         match act:
             case "bring":
                 return await self.bring(to, index, corner)
             case "measure":
-                return {"says": self._measured(to)}
+                return self._measured(to)
             case "mend":
-                return {"says": await self.mend()}
+                return await self.mend()
             case _:
                 raise ValueError(f"act = {act!r} is not one of bring, measure, mend")
 
-    async def bring(self, to: str, index: int = 0, corner: str = "") -> dict[str, Any]:
-        """Guide the tip to one of `THINGS`, or hold or push it. Raises ValueError for another thing or corner."""
+    async def bring(self, to: str, index: int = 0, corner: str = "") -> str:
+        """Guide the tip to one of `THINGS`, or hold or push it; return what was done. Raises as `hand` does."""
         if to not in THINGS:
             raise ValueError(f"to = {to!r} is not one of {', '.join(THINGS)}")
         self.scene.held = self._grip(index) if to == "hold-board" else None
         if to == "hold-board":
-            return {"reached": True, "says": "I hold the print before the camera."}
+            return "I hold the print before the camera."
         if to == "push-sensor":
             await self._push(index)
-            return {"reached": True, "says": "I pushed the tip for a second."}
+            return "I pushed the tip for a second."
         aim = self.aim(to, index, corner)
-        if (trouble := self._take_hold()) is not None:
-            return {"reached": False, "says": trouble}
+        self._take_hold()
         short_mm = await self.guide(aim, along_brush=to == "pin")
         if to in TOUCHED:
             self._touches += 1
@@ -148,8 +142,8 @@ class UnknownLab(LoopbackRig):
             lost = ((Device.ROBOT, "deaf"), (Device.TELEMETRY, "mute"))
             self._pulled = [self.faults.hang(Fault(device=d, kind=kind, count=ALWAYS)) for d, kind in lost]
         if short_mm > 0.0:
-            return {"reached": False, "says": f"The arm is stretched out, {short_mm:.0f} mm before the {to}."}
-        return {"reached": True, "says": f"The tip is at the {to}{f', {corner}' if corner else ''}."}
+            raise ValueError(f"The arm is stretched out, {short_mm:.0f} mm before the {to}.")
+        return f"The tip is at the {to}{f', {corner}' if corner else ''}."
 
     async def mend(self) -> str:
         """Correct the mistake that the trap is; return what was done."""
@@ -223,15 +217,14 @@ class UnknownLab(LoopbackRig):
         finally:
             self.world.push_n = (0.0, 0.0, 0.0)
 
-    def _take_hold(self) -> str | None:
-        """Power the arm at the pendant; return why it cannot be guided."""
+    def _take_hold(self) -> None:
+        """Power the arm at the pendant. Raises ValueError where it cannot be guided."""
         world, power = self.world, self.arcs.cabinet.power
         if power.safety not in MOVING_ALLOWED:
-            return f"The pendant shows {power.safety.value}: that has to be ended first."
+            raise ValueError(f"The pendant shows {power.safety.value}: that has to be ended first.")
         if world.target() is not None or world.motion.held:
-            return "The arm moves by itself; I keep my hands off."
+            raise ValueError("The arm moves by itself; I keep my hands off.")
         power.then((0.0, RobotMode.RUNNING))
-        return None
 
     async def guide(self, aim: Pose, *, along_brush: bool = False) -> float:
         """Lift, swing over, lower; return by how many mm the aim was missed because it is out of reach.

@@ -135,8 +135,8 @@ class LoopbackRig:
             "faults": len(self.faults.hanging),
         }
 
-    async def hand(self, act: str = "", to: str = "", index: int = 0, corner: str = "") -> dict[str, Any]:
-        """Ask the person in the lab for something. Raises ValueError, with one line, for what nobody can do."""
+    async def hand(self, act: str = "", to: str = "", index: int = 0, corner: str = "") -> str:
+        """Ask the person in the lab for something; return what was done. Raises ValueError for what cannot be."""
         raise ValueError("there is no person here: only the lab of `brushloop sim --unknown` has one")
 
     async def idle(self, seconds: float) -> None:
@@ -217,7 +217,7 @@ class ControlServer(LoopbackServer):
                 rig.world.fresh_sheet()
                 return {}
             case {"do": "hand", **wanted} if wanted.keys() <= {"act", "to", "index", "corner"}:
-                return await rig.hand(**wanted)
+                return {"says": await rig.hand(**wanted)}
             case _:
                 raise ValueError(USAGE)
 

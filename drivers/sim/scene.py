@@ -42,10 +42,9 @@ class Optics:
         self._map = None
         """(h, w, 2): for every pixel of the distorted image, its place in the undistorted one."""
         if view.k1:
-            columns, rows = np.meshgrid(np.arange(view.width_px), np.arange(view.height_px))
-            pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2).astype(np.float64)
-            places = cv2.undistortPoints(pixels, self.camera_matrix, self.distortion, P=self.camera_matrix)
-            self._map = places.reshape(view.height_px, view.width_px, 2).astype(np.float32)
+            pinhole, size = self.camera_matrix, (view.width_px, view.height_px)
+            kept = np.eye(3)  # the picture is not turned
+            self._map, _ = cv2.initInverseRectificationMap(pinhole, self.distortion, kept, pinhole, size, cv2.CV_32FC2)
 
     def image_of(self, paper_mm: Floats) -> Floats:
         """(n, 2) pixels (centres on integers) of (n, 2) points of the paper plane, distortion included."""

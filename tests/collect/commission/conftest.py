@@ -133,8 +133,10 @@ class InLab(Person):
             raise LeftOff
         self.brought.append(thing)
         kind, index, *corner = thing.split(" ", 2)
-        answer = await self._in_lab(self.lab.bring(kind, int(index), *corner))
-        return bool(answer["reached"])
+        with contextlib.suppress(ValueError):
+            await self._in_lab(self.lab.bring(kind, int(index), *corner))
+            return True
+        return False
 
     async def _in_lab(self, work: Any) -> Any:
         return await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(work, self.loop))
