@@ -115,7 +115,7 @@ def ask(path: Path, request: Mapping[str, object]) -> dict[str, Any]:
 
 ENDS_OF_A_CLIENT = (
     *(ConnectionError, TimeoutError, asyncio.IncompleteReadError),  # it disconnected
-    *(ProtocolViolation, asyncio.LimitOverrunError),  # it does not speak the protocol
+    *(ProtocolViolation, ValueError, asyncio.LimitOverrunError),  # it does not speak the protocol
     asyncio.CancelledError,  # `stop`: the streams module would report a cancelled handler as an error
 )
 

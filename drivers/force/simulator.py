@@ -18,7 +18,6 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.force.sri_m8123 import BUS_OFF, COMMAND_ID, LOOPBACK_CHANNEL, START, STOP, Wrench, encode_round
 from brushloop.drivers.host import alongside
 from brushloop.drivers.loopback import LoopbackServer
@@ -90,19 +89,13 @@ class SocketcandServer(LoopbackServer):
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Open the bus for the client, then relay its frames and the board's until it disconnects."""
         writer.write(b"< hi >")
-        try:
-            while (words := await _command(reader)) != ["rawmode"]:
-                writer.write(b"< ok >" if words == ["open", LOOPBACK_CHANNEL] else b"< error could not open bus >")
-            writer.write(b"< ok >")
-            async with alongside(self._send_rounds(writer), "force rounds"):
-                while True:
-                    match await _command(reader):
-                        case ["send", can_id, _, *data]:
-                            self.board.obey(CanFrame(int(can_id, 16), bytes(int(byte, 16) for byte in data)))
-                        case _:
-                            writer.write(b"< error unknown command >")
-        except ValueError as error:
-            raise ProtocolViolation("socketcand", "read", f"not a command: {error}") from None
+        while (words := await _command(reader)) != ["rawmode"]:
+            writer.write(b"< ok >" if words == ["open", LOOPBACK_CHANNEL] else b"< error could not open bus >")
+        writer.write(b"< ok >")
+        async with alongside(self._send_rounds(writer), "force rounds"):
+            while True:
+                _send, can_id, _length, *data = await _command(reader)
+                self.board.obey(CanFrame(int(can_id, 16), bytes(int(byte, 16) for byte in data)))
 
     async def _send_rounds(self, writer: asyncio.StreamWriter) -> None:
         loop = asyncio.get_running_loop()

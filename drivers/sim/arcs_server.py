@@ -111,21 +111,20 @@ class ArcsServer(LoopbackServer):
             if isinstance(params, list):
                 by_name = dict(zip(parameters(name), params, strict=True))  # pyright: ignore[reportUnknownArgumentType]
             result = self._methods[name](by_name)
-        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
             return _error(ident, INVALID_PARAMS, f"invalid params: {error!r}")
         return _reply(ident, result=result)
 
 
 def request_of(payload: bytes) -> dict[str, Any]:
-    """A request by its fields; none where it is no JSON object with a method. A login has only the method `login`."""
+    """A request by its fields; none where it is no object with a method. A login has only the method `login`.
+
+    Raises ValueError where it is no JSON.
+    """
     if payload.startswith(b"__login__"):
         return {"method": "login"}
-    try:
-        request: Any = json.loads(payload)
-    except (ValueError, RecursionError):
-        return {}
-    match request:
-        case {"method": str()}:
+    match json.loads(payload):
+        case {"method": str()} as request:
             return request  # pyright: ignore[reportUnknownVariableType]
         case _:
             return {}

@@ -164,8 +164,6 @@ class Cabinet:
 
     def stop(self, acc_m_s2: float, acc_rad_s2: float) -> int:
         """Decelerate and forget the path."""
-        if not (acc_m_s2 > 0.0 and acc_rad_s2 > 0.0):
-            return -ReturnCode.INVALID_ARGUMENT
         self.motion.stop(acc_m_s2 * 1e3, acc_rad_s2, self.now_s())
         return ReturnCode.OK
 

@@ -145,10 +145,8 @@ class Brush:
 
         The mark's frame lies along the paper's: its origin is the first waypoint, columns grow with +x, rows with -y.
         `heading_deg` is where the ferrule leans, or would lean, when the tip lands; from there on the bundle trails.
-        Raises ValueError as `press` does, and if there is no waypoint. If no depth exceeds 0, the paper stays blank.
+        Raises ValueError as `press` does. If no depth exceeds 0, the paper stays blank.
         """
-        if not path:
-            raise ValueError("a drag needs at least one waypoint")
         deepest = max(w.depth_mm for w in path)
         self._check(deepest, tilt_deg, ink_load)
         if deepest <= LEAST_DEPTH_MM:
