@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from brushloop.drivers.devices import Pose
-from brushloop.drivers.geometry import DOWN, brush_pose, of_vector, product
+from brushloop.drivers.geometry import DOWN, brush_pose, from_line, of_vector, product
 from brushloop.drivers.sim.brush.brush import BrushSpec
 from brushloop.drivers.sim.config import CORNERS, Place, SimConfig, Table, View
 from brushloop.drivers.sim.kinematics import HOME, inverse, matrix_of
@@ -267,17 +267,11 @@ def _places_aside(rng: np.random.Generator, config: SimConfig, tries: int) -> It
         bearing = math.radians(math.degrees(math.atan2(middle[1], middle[0])) + rng.uniform(-80, 80))
         z_mm = table.paper_z_mm + float(rng.uniform(110, 180))
         place = (float(reach_mm * math.cos(bearing)), float(reach_mm * math.sin(bearing)), z_mm)
-        if in_picture(config, [place]) or _nearest_mm(middle, place) < BASE_CLEAR_MM:
+        base, sheet, aside = (brush_pose(x, y, 0.0) for x, y, _ in ((0.0, 0.0, 0.0), middle, place))
+        if in_picture(config, [place]) or from_line(sheet, aside, base)[0] < BASE_CLEAR_MM:
             continue
         if abs(math.degrees(bearing)) < 150.0 and reaches(config, [brush_pose(*place)]):
             yield place
-
-
-def _nearest_mm(start: Place, end: Place) -> float:
-    """Least distance of a straight way from the axis of the base."""
-    a, b = np.array(start[:2]), np.array(end[:2])
-    along = float(np.clip(-a @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0))
-    return float(np.linalg.norm(a + along * (b - a)))
 
 
 def in_picture(config: SimConfig, places: Sequence[Place], margin_px: float | None = None) -> bool:
