@@ -192,27 +192,24 @@ class RtdeServer(LoopbackServer):
                 fault = self.faults.meet(Device.TELEMETRY)
                 late_s = 0.0 if fault is None else fault.late_s
                 if fault is None or fault.kind != "mute":
-                    sample = encode_sample(chanel, [self._value(name, at_s, pose) for name in names])
+                    outputs = self._outputs(at_s, pose)
+                    sample = encode_sample(chanel, [outputs[name] for name in names])
                     loop.call_later(late_s, self.write, writer, sample)
             before_s = now_s
             await writer.drain()  # a client that does not read is sent nothing more until it has caught up
             due = max(due + period_s, loop.time())
             await asyncio.sleep(due - loop.time())
 
-    def _value(self, name: str, at_s: float, tip: Pose) -> Any:
-        """An output with the arm there."""
+    def _outputs(self, at_s: float, tip: Pose) -> dict[str, Any]:
+        """Every output with the arm there."""
         cabinet = self._cabinet
-        match name:
-            case "timestamp":
-                return at_s
-            case "R1_actual_q":
-                return list(cabinet.motion.near_joints(tip))
-            case "R1_robot_mode":
-                return cabinet.power.mode.value
-            case "R1_safety_mode":
-                return cabinet.power.safety.value
-            case _:
-                return to_wire(cabinet.configured(tip))
+        return {
+            "timestamp": at_s,
+            "R1_actual_q": list(cabinet.motion.near_joints(tip)),
+            "R1_robot_mode": cabinet.power.mode.value,
+            "R1_safety_mode": cabinet.power.safety.value,
+            "R1_actual_TCP_pose": to_wire(cabinet.configured(tip)),
+        }
 
 
 def topic_of(payload: bytes) -> tuple[int, float, list[str]]:
