@@ -65,8 +65,6 @@ class Asker:
         self, *, watched: bool, waiting: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext
     ) -> None:
         """`waiting` is entered while a question waits for its answer."""
-        self.attended = watched
-        """Whether the run was begun with somebody who watches; the screen may be gone since."""
         self._waiting = waiting
         self._given_up: Callable[[str], Exception] | None = None if watched else NeedsOperator
         self._lock = threading.Lock()

@@ -27,9 +27,7 @@ async def dip(context: StepContext) -> DipResult:
     """The DIP step. Looks at the sheet first, so that the filled brush does not wait for it."""
     await look_at_sheet(context)
     well = await fill_brush(context)
-    if well is None or well.level is None:
-        return DipResult()
-    return DipResult(ink_level=well.level, dosed_ml=well.dosed_ml)
+    return DipResult() if well is None else DipResult(ink_level=well.level, dosed_ml=well.dosed_ml)
 
 
 async def fill_brush(context: StepContext) -> Well | None:

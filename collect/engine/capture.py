@@ -49,7 +49,7 @@ async def decide(
         return True, False
     if press.take <= run.rig.config.quality.retakes:
         return False, True
-    if not run.asker.attended:
+    if not run.opening.request.on_screen:
         run.progress.log(f"{stroke_id}: left out", warning=True)
         return False, False
     text = f"{stroke_id}, take {press.take}: {verdict.reason}"

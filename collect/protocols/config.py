@@ -25,10 +25,9 @@ from brushloop.collect.protocols.kinds import (
     WriteConfig,
 )
 from brushloop.collect.rig.config_file import read_text, read_toml, refusal
-from brushloop.sessions.disk import as_text, number
+from brushloop.sessions.disk import MAX_SNAPSHOT_BYTES, as_text, number
 
 MAX_PROTOCOL_BYTES = 4 * 1024 * 1024
-MAX_EFFECTIVE_BYTES = 64 * 1024 * 1024
 MAX_TABLE_BYTES = 4 * 1024 * 1024
 ProtocolConfig = GridConfig | FewStrokesConfig | ListConfig | ReplayConfig | WriteConfig
 TaggedProtocol = Annotated[ProtocolConfig, Field(discriminator="kind")]
@@ -42,7 +41,7 @@ def load_protocol(path: Path) -> ProtocolConfig:
         raise ConfigError(path, "", "no such file: --protocol names another one, such as examples/protocol.toml")
     try:
         if path.suffix == ".json":
-            return _PROTOCOL.validate_json(read_text(path, MAX_EFFECTIVE_BYTES))
+            return _PROTOCOL.validate_json(read_text(path, MAX_SNAPSHOT_BYTES))
         values = read_toml(path, MAX_PROTOCOL_BYTES)
         if "robot" in values and "kind" not in values:
             raise ConfigError(path, "", "is a rig, not a protocol: give it to --config, and the protocol to --protocol")
