@@ -267,14 +267,19 @@ class SriM8123:
     # What follows runs in the thread.
 
     def _run(self) -> None:
+        table = self._table
         try:
             import can  # slow to import, and most rigs have no such sensor
 
-            bus = self._open()
+            # It warns of frames that arrive in two pieces, which is harmless; a lost frame shows in the counts.
+            logging.getLogger("can").setLevel(logging.ERROR)
+            gateway: dict[str, Any] = {} if table.host is None else {"host": table.host, "port": table.port}
+            # Use these settings only: python-can would also read can.ini, the environment and the home folder.
+            bus = can.Bus(table.channel, table.interface, ignore_config=True, bitrate=table.bitrate, **gateway)
         except Exception as error:
             # Back ends raise arbitrary exceptions if a library or a package is missing.
-            name = f"{self._table.interface} {self._table.channel}"
-            self._loss = (f"cannot open {name}: {error}", "Check the adapter and that its interface is up.")
+            what = f"cannot open {table.interface} {table.channel}: {error}"
+            self._loss = (what, "Check the adapter and that its interface is up.")
             return
 
         def command(data: bytes) -> None:
@@ -285,24 +290,12 @@ class SriM8123:
             while self._loss is None and not self._closing.is_set():
                 if (message := bus.recv(RECEIVE_S)) is not None:
                     self._take(message)
-        except (can.CanError, OSError) as error:
+        except Exception as error:
             self._lose_bus(f"failed: {error}")
         finally:
             with contextlib.suppress(can.CanError, OSError):
                 command(STOP)
             bus.shutdown()
-            if not self._closing.is_set() and self._loss is None:
-                self._loss = ("the reader failed", "Connect again.")
-
-    def _open(self) -> can.BusABC:
-        import can
-
-        table = self._table
-        # Use these settings only: python-can would also read can.ini, the environment and the home folder.
-        # The library warns of frames that arrive in two pieces, which is harmless; a lost frame shows in the counts.
-        logging.getLogger("can").setLevel(logging.ERROR)
-        gateway: dict[str, Any] = {} if table.host is None else {"host": table.host, "port": table.port}
-        return can.Bus(table.channel, table.interface, ignore_config=True, bitrate=table.bitrate, **gateway)
 
     def _take(self, message: can.Message) -> None:
         if message.is_error_frame:
