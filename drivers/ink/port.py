@@ -171,8 +171,6 @@ class SerialPort:
         Raises `DeviceTimeout` if nothing arrived, `ProtocolViolation` if something else arrived, `ConnectionLost`,
         `NotConnected`, each with `condition`.
         """
-        if self._port is None:
-            raise NotConnected(self._device, op, "not connected")
 
         async def in_turn() -> tuple[bytes, T | None]:
             async with self._turn:
@@ -209,10 +207,10 @@ class SerialPort:
     def _ask(
         self, op: str, request: bytes, find: Callable[[bytes], T | None], timeout_s: float
     ) -> tuple[bytes, T | None]:
-        """Everything received, and the reply in it. Raises `NotConnected` if the port was closed, `OSError`."""
+        """Everything received, and the reply in it. Raises `NotConnected` if the port is not open, `OSError`."""
         port = self._port
         if port is None or self._closing.is_set():
-            raise NotConnected(self._device, op, "closed while waiting")
+            raise NotConnected(self._device, op, "not connected")
         time.sleep(self._gap_s)
         if waiting := port.in_waiting:
             port.read(waiting)  # late replies and noise from before this request
