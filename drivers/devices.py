@@ -181,13 +181,3 @@ class ForceSensor(Device, Protocol):
     async def bias(self, seconds: float) -> None:
         """Average for `seconds` with nothing touching, and subtract that from now on."""
         ...
-
-
-@dataclass(frozen=True, slots=True)
-class Well:
-    """The well before a dip."""
-
-    level: float | None
-    """0 to 1; None where the device has no gauge."""
-    dosed_ml: float = 0.0
-    """What the device has given since it was connected, by a replenishing that failed half way too."""

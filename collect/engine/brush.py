@@ -15,7 +15,7 @@ from brushloop.collect.touch.heights import plane_of
 from brushloop.collect.touch.measure import measure_plane
 from brushloop.collect.touch.selfcheck import self_check, triangle_on
 from brushloop.collect.walk import all_poses, step_poses, touch_of
-from brushloop.drivers.devices import PoseSample, Well
+from brushloop.drivers.devices import PoseSample
 from brushloop.sessions.events import DipResult, PressResult, SelfCheckResult, StepKind, ZeroTouchResult
 from brushloop.sessions.records import InkState, Topic
 
@@ -26,21 +26,21 @@ STALE_INK_S = 5.0
 async def dip(context: StepContext) -> DipResult:
     """The DIP step. Looks at the sheet first, so that the filled brush does not wait for it."""
     await look_at_sheet(context)
-    well = await fill_brush(context)
-    return DipResult() if well is None else DipResult(ink_level=well.level, dosed_ml=well.dosed_ml)
+    ink = await fill_brush(context)
+    return DipResult() if ink is None else DipResult(ink_level=ink.level, dosed_ml=ink.dosed_ml)
 
 
-async def fill_brush(context: StepContext) -> Well | None:
+async def fill_brush(context: StepContext) -> InkState | None:
     """Fill up the well if needed, then dip. Return how the well was; None without an ink device."""
-    run, well = context.run, None
+    run, device, state = context.run, context.run.rig.ink, None
     with run.progress.meanwhile("dip"):
-        if run.rig.ink is not None:
-            well = await run.rig.ink.replenish()
-            state = InkState(level=well.level, dosed_ml=well.dosed_ml, light=run.light)
+        if device is not None:
+            level = await device.replenish()
+            state = InkState(level=level, dosed_ml=device.dosed_ml, light=run.light)
             context.recorder.event(Topic.INK, state)
         await context.guard.guarded(run.procedures.dip())
         run.left_ink_ns = run.rig.clock.now_ns()
-    return well
+    return state
 
 
 async def mark(context: StepContext, step: PressStep | DrawStep) -> PressResult:

@@ -17,7 +17,7 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, Field
 
-from brushloop.drivers.devices import Device, Well
+from brushloop.drivers.devices import Device
 from brushloop.drivers.errors import (
     ConnectionLost,
     DeviceError,
@@ -74,11 +74,12 @@ class InkDevice(Device, ABC):
         self._smallest_ml = smallest_ml
         self._taken: list[tuple[int, float]] = []
         """Times and volumes of the doses of the last minute."""
-        self._dosed_ml = 0.0
+        self.dosed_ml = 0.0
+        """What the device has given, by a replenishing that failed half way too."""
 
     @abstractmethod
-    async def replenish(self) -> Well:
-        """Before a dip: add ink if the table asks for it.
+    async def replenish(self) -> float | None:
+        """Before a dip: add ink if the table asks for it. Returns the level of the well, as `level` does.
 
         Raises `InkRefused` or `DoseLost` where only a person can help, else `DeviceError`.
         """
@@ -98,7 +99,7 @@ class InkDevice(Device, ABC):
             raise LimitExceeded(self._name, "dose per minute", within_ml, 0.0, a_minute_ml, "ml")
         self._taken.append((now_ns, volume_ml))
         await self._give(volume_ml)
-        self._dosed_ml += volume_ml
+        self.dosed_ml += volume_ml
 
     async def light(self) -> float | None:
         """Set the light over the sheet as the table says and return it, 0 to 1; None where there is none to set."""

@@ -20,7 +20,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from brushloop.drivers.devices import Identity, Well
+from brushloop.drivers.devices import Identity
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected, ProtocolViolation
 from brushloop.drivers.host import Clock, finished
 from brushloop.drivers.ink.port import InkDevice, InkRefused, InkTable, SerialPort, crc16
@@ -160,12 +160,11 @@ class ModbusPump(InkDevice):
                     remedy="Something held the host up.",
                 )
 
-    async def replenish(self) -> Well:
+    async def replenish(self) -> None:
         """Dose before every `every_dips`-th dip since `connect`. Raises as `dose` does, and does not count that dip."""
         if self._dips % self._every_dips == self._every_dips - 1:
             await self.dose(self._table.dose_ml)
         self._dips += 1
-        return Well(None, self._dosed_ml)
 
     async def close(self) -> None:
         """Stop the pump once more, then close the port. Raises `DeviceError` only if the pump may still be running."""

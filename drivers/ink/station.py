@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from brushloop.drivers.devices import Identity, Well
+from brushloop.drivers.devices import Identity
 from brushloop.drivers.errors import DeviceError, ProtocolViolation
 from brushloop.drivers.host import Clock
 from brushloop.drivers.ink.port import DoseLost, InkDevice, InkRefused, InkTable, SerialPort, crc16
@@ -125,7 +125,7 @@ class InkStation(InkDevice):
         if abs(given_ml - volume_ml) > max(2 * SMALLEST_ML, 0.05 * volume_ml):
             raise DeviceError(DEVICE, "dose", f"gave {given_ml:.3f} ml instead of {volume_ml:.3f} ml")
 
-    async def replenish(self) -> Well:
+    async def replenish(self) -> float:
         """Dose until the gauge shows `keep_level`. Raises `DoseLost` if a dose does not arrive, and as `dose` does."""
         level, dose_ml = await self.level(), self._table.dose_ml
         while level < self._keep_level:
@@ -133,7 +133,7 @@ class InkStation(InkDevice):
             before, level = level, await self.level()
             if level < before + LEVEL_RISES:
                 raise DoseLost(DEVICE, "dose", f"a dose of {dose_ml:g} ml left the well at {level:.0%} of its capacity")
-        return Well(level, self._dosed_ml)
+        return level
 
     async def light(self) -> float | None:
         """Set the light as the table says; return it, None if the table says nothing. Raises as `level` does."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 from typing import Literal
 
-from brushloop.drivers.devices import Identity, Well
+from brushloop.drivers.devices import Identity
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.host import Clock
 from brushloop.drivers.ink.port import InkDevice, InkTable
@@ -39,9 +39,8 @@ class SyringePump(InkDevice):
         if (answer := await self._ask(f"DOSE {volume_ml:.3f}")) != "OK":
             raise ProtocolViolation("ink", "dose", f"answered {answer!r}, expected 'OK'")
 
-    async def replenish(self) -> Well:
+    async def replenish(self) -> None:
         await self.dose(self._table.dose_ml)
-        return Well(level=None, dosed_ml=self._dosed_ml)
 
     async def close(self) -> None:
         if self._streams is not None:
