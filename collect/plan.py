@@ -126,10 +126,6 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
     )
 
 
-MOST_ROWS = 40
-"""Most rows of (H, alpha); nobody would read more."""
-
-
 def plan_table(plan: Plan) -> Group:
     """Return the plan's totals and what is pressed where, as tables."""
     totals = Table(title=f"plan of {plan.kind}", show_header=False)
@@ -156,13 +152,9 @@ def duration(seconds: float) -> str:
 def _conditions(plan: Plan) -> Table:
     table = Table("H mm", "alpha deg", "strokes", "on each sheet")
     counts = Counter((press.condition, press.sheet) for press in plan.placed)
-    conditions = sorted({press.condition for press in plan.placed})
-    for asked in conditions[:MOST_ROWS]:
+    for asked in sorted({press.condition for press in plan.placed}):
         by_sheet = [counts[asked, sheet] for sheet in range(plan.sheets)]
-        sheets = " ".join(map(str, by_sheet[:20]))
-        table.add_row(f"{asked.depth_mm:g}", f"{asked.tilt_deg:g}", str(sum(by_sheet)), sheets)
-    if len(conditions) > MOST_ROWS:
-        table.add_row("...", "...", f"{len(conditions) - MOST_ROWS} more", "")
+        table.add_row(f"{asked.depth_mm:g}", f"{asked.tilt_deg:g}", str(sum(by_sheet)), " ".join(map(str, by_sheet)))
     return table
 
 
