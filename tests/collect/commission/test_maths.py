@@ -93,7 +93,7 @@ def axis_error_deg(fit: AxisFit, true: Rotation) -> float:
 def test_of_twelve_holds_one_to_four_bad_ones_are_named_and_none_of_the_others() -> None:
     rng, errors_deg, stated_deg = np.random.default_rng(28), list[float](), list[float]()
     named = missed = wrongly = 0
-    for number in range(400):
+    for number in range(100):
         true = Rotation.from_euler("ZYX", [0.0, *rng.uniform(-3.0, 3.0, 2)], degrees=True)
         count = 1 + number % 4
         off_deg = [*rng.uniform(2.0, 40.0, count), *[0.0] * (12 - count)]
@@ -106,7 +106,7 @@ def test_of_twelve_holds_one_to_four_bad_ones_are_named_and_none_of_the_others()
         errors_deg.append(axis_error_deg(fit, true))
         stated_deg.append(fit.sigma_deg)
         assert fit.clear
-    assert (named, missed, wrongly) == (1000, 0, 0)
+    assert (named, missed, wrongly) == (250, 0, 0)
     assert max(errors_deg) < 0.2, "the mean of all twelve is off by up to ten degrees"
     assert math.sqrt(np.mean(np.square(errors_deg)) / 2.0) == pytest.approx(np.mean(stated_deg), rel=0.15)
 

@@ -35,9 +35,8 @@ def lab(lab: Lab) -> Lab:
     return lab
 
 
-def start_and_pause(engine: Engine) -> None:
-    engine.start()
-    until(engine, lambda now: now.strokes_done == 1)
+def pause_after(engine: Engine, strokes: int = 1) -> None:
+    until(engine, lambda now: now.strokes_done == strokes)
     engine.pause()
     until(engine, lambda now: now.state is State.PAUSED)
 
@@ -78,8 +77,8 @@ def assert_up_along_the_tool_first(sent: list[Pose]) -> None:
 
 
 def test_an_arm_that_was_put_under_the_paper_in_a_pause_first_goes_up_along_its_tool(lab: Lab) -> None:
-    engine = lab.engine()
-    start_and_pause(engine)
+    engine = lab.started()
+    pause_after(engine)
     second_client(lab, engine, UNDER)
     sent = lines_sent(lab)
     engine.resume()
@@ -120,36 +119,32 @@ def up_slowly(lab: Lab) -> dict[str, Any]:
     return {"MotionControl_moveLine": {"pose": up, "a": 1.0, "v": 0.00005, "blend_radius": 0.0, "duration": 0.0}}
 
 
-@pytest.mark.parametrize(
-    ("calls", "asks"),
-    [
+def test_what_a_second_client_did_in_a_pause_is_asked_about_before_anything_moves_and_then_set_right(lab: Lab) -> None:
+    lab.write_protocol("[11.0]", "[0.0]", repeats=4)
+    engine = lab.started(on_screen=True)
+    acts: list[tuple[Callable[[Lab], dict[str, Any]], str]] = [
         (up_slowly, "the arm is moving, and not from here"),
         (lambda _: {"RobotManage_poweroff": {}}, "robot mode is not Running"),
         (lambda _: SHORTER, "tool offset is (0, 0, 170) mm"),
-    ],
-    ids=["still moving", "switched off", "another tool"],
-)
-def test_what_a_second_client_did_in_a_pause_is_asked_about_before_anything_moves_and_then_set_right(
-    lab: Lab, calls: Callable[[Lab], dict[str, Any]], asks: str
-) -> None:
-    engine = lab.engine(on_screen=True)
-    start_and_pause(engine)
-    second_client(lab, engine, **calls(lab))
-    sent = lines_sent(lab)
-    engine.resume()
-    prompt = question(engine, asks)
-    assert prompt.default == "x"
-    assert not sent
-    engine.answer(prompt.number, "g")
+    ]
+    for done, (calls, asks) in enumerate(acts, 1):
+        pause_after(engine, done)
+        second_client(lab, engine, **calls(lab))
+        sent = lines_sent(lab)
+        engine.resume()
+        prompt = question(engine, asks)
+        assert prompt.default == "x"
+        assert not sent
+        engine.answer(prompt.number, "g")
     wait_for_end(engine)
-    assert engine.snapshot().strokes_done == 2
+    assert engine.snapshot().strokes_done == 4
     assert lab.rig.arcs.cabinet.tcp_offset[2] == 0.18
     assert max(press.depth_mm for press in lab.rig.world.presses) < 11.1, "none went deeper than asked"
 
 
 def test_an_arm_that_was_left_outside_its_limits_is_not_moved_until_it_is_jogged_back(lab: Lab) -> None:
-    engine = lab.engine(on_screen=True)
-    start_and_pause(engine)
+    engine = lab.started(on_screen=True)
+    pause_after(engine)
     second_client(lab, engine, brush_pose(480.0, 40.0, 250.0, tilt_deg=60.0))
     sent = lines_sent(lab)
     engine.resume()

@@ -66,7 +66,7 @@ async def test_the_plane_of_a_leaning_sheet_is_found_by_force(
 
 
 @pytest.mark.parametrize(
-    "sheets", [1, pytest.param(9, marks=[pytest.mark.soak, pytest.mark.timeout(300)], id="more than 200 touches")]
+    "sheets", [1, pytest.param(18, marks=[pytest.mark.soak, pytest.mark.timeout(300)], id="more than 200 touches")]
 )
 async def test_touches_by_camera_lie_within_150_um_of_the_truth_at_3_sigma(
     make_bench: MakeBench, monkeypatch: pytest.MonkeyPatch, sheets: int
@@ -82,9 +82,9 @@ async def test_touches_by_camera_lie_within_150_um_of_the_truth_at_3_sigma(
         bench = make_bench(slope_deg, paper_z_mm=120.0 + rng.uniform(-1.5, 1.5), seed=seed)
         places = [(2.0, 2.0), (76.0, 2.0), (39.0, 31.0)]
         touches.clear()
-        await measured(bench, method="camera", touches=8, points_mm=places)
+        await measured(bench, method="camera", touches=4, points_mm=places)
         errors += [touch.z_mm - bench.truth_mm(touch.x_mm, touch.y_mm) for touch in touches]
-    assert len(errors) == 24 * sheets
+    assert len(errors) == 12 * sheets
     assert abs(float(np.mean(errors))) + 3.0 * float(np.std(errors)) < 0.15
     assert abs(float(np.mean(errors))) < 0.03
 
@@ -231,9 +231,8 @@ async def test_no_touch_leaves_what_was_checked(
         assert all(here.z_mm >= config.motion.safe_z_mm for here, _ in beside), "it was lifted before it travelled"
     assert not not_checked(config, bench.sent, planned.segments)
     assert not not_sent(config, planned, bench.sent)
-    assert (
-        min(pose.z_mm for pose in bench.sent) > 120.0 - config.touch.travel_mm - 2.1
-    )  # what a lean of 1 deg over 116 mm may be
+    lean_mm = 2.1  # of 1 deg over 116 mm
+    assert min(pose.z_mm for pose in bench.sent) > 120.0 - config.touch.travel_mm - lean_mm
 
 
 async def test_the_self_check_presses_as_deep_as_was_checked(make_bench: MakeBench) -> None:
