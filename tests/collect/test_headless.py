@@ -21,7 +21,7 @@ from brushloop.collect.errors import ConfigError, Parked
 from brushloop.collect.protocols.kinds import GridConfig
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.devices import Rig, make_robot, sole_driver
-from brushloop.collect.start import collect, ending
+from brushloop.collect.start import ending
 from brushloop.drivers import host as sole
 from brushloop.drivers.devices import Identity
 from brushloop.drivers.geometry import brush_pose
@@ -172,18 +172,6 @@ def test_the_recording_and_what_comes_next(tmp_path: Path) -> None:
     recorded = f"recorded: {folder}/grid-01.mcap"
     assert ending(folder, "grid") == [recorded, f"next:     brushloop analyse {folder}"]
     assert ending(folder, "write") == [recorded]
-
-
-def test_the_ending_is_printed_after_the_screen_too(
-    bare_lab: Lab, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    lab = bare_lab
-    monkeypatch.setattr("brushloop.collect.tui.app.run_app", lambda app: (app.engine.start(), wait_for_end(app.engine)))
-    rig, protocol = lab.folder / "rig.toml", lab.folder / "protocol.toml"
-    done = collect(CollectRequest(rig, protocol, lab.sessions, on_screen=True))
-    assert (done.folder, done.given_up) == (str(lab.session), 0)
-    assert capsys.readouterr().out.splitlines() == ending(lab.session, "grid")
-    assert (lab.session / f"{lab.session.name}.mcap").is_file()
 
 
 # An arm that no longer sends its pose: every screen says so after a second, long before a call times out

@@ -205,31 +205,26 @@ def test_the_paper_is_found_again_by_jog_and_a_jog_that_is_given_up_or_not_taken
     assert voids[-2:] == ["the new height was not accepted.", "the operator gave up at touch 1 of 1"]
 
 
-@pytest.mark.parametrize(
-    ("error", "asks"),
-    [
-        (ForceTooHigh(6.0, 5.0), "the force reached 6.00 N"),  # looked at before the arm moves
-        (DeviceTimeout("force", "latest", "no sample"), ""),
-    ],
-)
 def test_a_jog_between_strokes_that_fails_leaves_the_paper_where_it_was(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch, error: Exception, asks: str
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    perform = Run.perform
+    perform, errors = Run.perform, [DeviceTimeout("force", "latest", "no sample"), ForceTooHigh(6.0, 5.0)]
 
     async def performed(self: Run, step: Step) -> StepResult:
         if isinstance(step, ZeroTouchStep) and step.between_strokes:
-            raise error
+            raise errors.pop()
         return await perform(self, step)
 
     monkeypatch.setattr(Run, "perform", performed)
+    lab.write_protocol("[11.0, 15.0]", "[0.0]")
     engine = lab.engine(on_screen=True)
     engine.request(OperatorRequest.JOG)
     engine.start()
-    if asks:
-        answer(engine, asks, "g")
+    answer(engine, "the force reached 6.00 N", "g")  # looked at before the arm moves
+    engine.request(OperatorRequest.JOG)
     wait_for_end(engine)
-    assert engine.snapshot().strokes_done == 1
+    assert (engine.snapshot().strokes_done, errors) == (2, [])
+    assert [result.method for result in lab.state.results(ZeroTouchResult)] == ["taught"]
 
 
 def test_a_guided_set_up_measures_again_when_it_is_asked_to_and_later_views_of_the_board_are_not_asked_about(
