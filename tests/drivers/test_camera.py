@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from brushloop.drivers import camera as camera_module
 from brushloop.drivers.camera import Backlog, CameraTable, FrameFault, Locked, OpenCvCamera, found_settings, looked_at
-from brushloop.drivers.camera.source import Capture, JpegStream, open_source
+from brushloop.drivers.camera.source import Capture, JpegStream, is_repeated, open_source
 from brushloop.drivers.devices import Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout
 from brushloop.drivers.host import HostClock
@@ -400,6 +400,12 @@ async def test_settings_are_locked_read_back_and_reported(monkeypatch: pytest.Mo
     assert await asyncio.to_thread(found_settings, 0, 0.0) == read_back, "it has no white balance"
     with pytest.raises(DeviceError, match="exposure = 156 was asked for, but 160 is read back"):
         await camera_at("0", locked=Locked(exposure=156.0)).connect()
+
+
+def test_a_picture_is_the_one_before_where_only_what_a_jpeg_says_about_itself_has_changed() -> None:
+    (jpeg, other), (image, another) = (jpeg_of(page()), jpeg_of(page())), (page(), page())
+    same = [(renumbered(jpeg, 7), jpeg), (other, jpeg), (jpeg, None), (image.copy(), image), (another, image)]
+    assert [is_repeated(*pair) for pair in same] == [True, False, False, True, False]
 
 
 async def test_a_picture_whose_end_is_to_the_bit_that_of_the_one_before_is_torn(camera: OpenCvCamera, feed: Feed):

@@ -165,3 +165,12 @@ def test_a_merged_file_from_a_close_that_was_cut_is_kept_beside_the_new_one(make
     make.perform(again, "b")
     assert make.stroke_names(again.close()) == ["a", "b"]
     assert (store.folder / f"{store.folder.name}.mcap.superseded-1").read_bytes() == first
+
+
+def test_a_copy_that_was_kept_once_is_not_kept_again(tmp_path):
+    path = tmp_path / "a.mcap"
+    path.write_bytes(b"precious")
+    kept = {disk.set_aside(path, "damaged") for _ in range(2)}
+    path.write_bytes(b"other")
+    assert kept == {tmp_path / "a.mcap.damaged-1"}
+    assert disk.set_aside(path, "damaged").name == "a.mcap.damaged-2"
