@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -63,7 +63,6 @@ poses = st.builds(
 )
 
 
-@settings(deadline=None)
 @given(lengths, lengths, lengths, turns, turns, turns)
 @example(1.0, 2.0, 3.0, 0.5, math.pi / 2.0, 1.5)
 def test_a_wire_pose_survives_us(x: float, y: float, z: float, rx: float, ry: float, rz: float):
@@ -75,7 +74,6 @@ def test_a_wire_pose_survives_us(x: float, y: float, z: float, rx: float, ry: fl
     assert (before.inv() * after).magnitude() < (1e-10 if abs(back[4]) < 1.57 else 1e-6)
 
 
-@settings(deadline=None)
 @given(tilts, headings)
 def test_lean_is_the_inverse_of_brush_pose(tilt: float, heading: float):
     got_tilt, got_heading = lean(brush_pose(1.0, 2.0, 3.0, heading_deg=heading, tilt_deg=tilt))
@@ -89,7 +87,6 @@ def test_the_ferrule_leans_toward_the_heading():
     assert ferrule == pytest.approx([0.0, math.sin(ten), math.cos(ten)])
 
 
-@settings(deadline=None)
 @given(poses, poses, st.floats(0.0, 1.0))
 def test_on_the_way_both_distances_are_shared_out(a: Pose, b: Pose, s: float):
     total_mm, total_deg = distance(a, b)
@@ -135,7 +132,6 @@ def test_an_orientation_that_is_none_is_refused_like_a_tilt(quaternion: tuple[fl
         LIMITS.check("robot", Pose(400.0, 0.0, 200.0, *quaternion), speed_mm_s=100.0, acc_mm_s2=500.0)
 
 
-@settings(deadline=None)
 @given(st.floats(-180.0, 180.0))
 def test_a_tilt_at_the_limit_stays_inside_after_a_trip_over_the_wire(heading: float):
     pose = brush_pose(400.0, 0.0, 200.0, heading_deg=heading, tilt_deg=15.0)
@@ -158,7 +154,6 @@ def test_a_way_between_two_poses_within_the_cone_may_leave_it() -> None:
         LIMITS.check_way("robot", start, target)
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.tuples(*[st.floats(0.0, 40.0), *[st.floats(-180.0, 180.0)] * 2] * 2))
 def test_the_steepest_tilt_on_a_way_is_that_of_its_steepest_pose(angles: tuple[float, ...]) -> None:
     start, target = leaning(*angles[:3]), leaning(*angles[3:])

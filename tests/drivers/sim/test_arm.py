@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from brushloop.drivers.arcs.controller import SafetyMode
@@ -34,7 +34,6 @@ def test_the_home_position_is_where_the_maker_says():
     assert off_deg < 1e-4
 
 
-@settings(deadline=None, max_examples=60)
 @given(joints, st.tuples(*(st.floats(-0.1, 0.1) for _ in range(6))))
 def test_what_the_inverse_finds_is_right(q: tuple[float, ...], off: tuple[float, ...]):
     solution = inverse(forward(q), [a + b for a, b in zip(q, off, strict=True)])
@@ -115,7 +114,6 @@ ways = st.lists(
 )
 
 
-@settings(deadline=None, max_examples=30)
 @given(ways)
 def test_no_way_is_taken_faster_or_harder_than_allowed_and_all_of_them_arrive(
     way: Sequence[tuple[float, float, float, float]],
