@@ -176,18 +176,15 @@ def finished_session(root: Path, config: Path, protocol: Path) -> Path | None:
     return max(sessions, key=lambda path: (path / f"{path.name}.mcap").stat().st_mtime_ns, default=None)
 
 
-def collected(request: CollectRequest) -> Snapshot:
-    """Collect a session, or go on with it; return how it ended. Raises `ConfigError` and what ended the collection."""
-    say(f"$ brushloop collect --config {request.config} --protocol {request.protocol} --out {request.out}")
-    return collect(request)
-
-
 def collected_session(request: CollectRequest) -> Path:
     """The finished and calibrated session that is asked for; collected and calibrated if missing.
 
     Raises `ConfigError` and what ended the collection.
     """
-    session = finished_session(request.out, request.config, request.protocol) or Path(collected(request).folder)
+    session = finished_session(request.out, request.config, request.protocol)
+    if session is None:
+        say(f"$ brushloop collect --config {request.config} --protocol {request.protocol} --out {request.out}")
+        session = Path(collect(request).folder)
     calibrated(session)
     return session
 

@@ -25,7 +25,7 @@ from brushloop.collect.chains.writing import write
 from brushloop.collect.engine import CollectRequest
 from brushloop.collect.engine.open_or_resume import open_sessions
 from brushloop.collect.errors import StrokesLeftOut
-from brushloop.collect.start import calibrated, collected, finished_session, fitted
+from brushloop.collect.start import calibrated, collect, finished_session, fitted
 from brushloop.drivers.loopback import LoopbackRig, start
 from brushloop.model.generator import SHIPPED_GENERATOR
 from brushloop.sessions.terminal import say
@@ -149,7 +149,7 @@ class Demo:
             return
         sheet = 1 if earlier else None
         request = CollectRequest(self._started().config, self._protocol, self._sessions, sheet=sheet, on_screen=False)
-        ended = collected(request)
+        ended = collect(request)
         self._session, self._left_out = Path(ended.folder), ended.given_up
 
     def _fit(self) -> None:

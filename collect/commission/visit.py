@@ -48,10 +48,7 @@ UNKNOWN = "not "
 HEAD = "# Made by `brushloop rig new`. Each value: how it was obtained, how well it is known, when."
 UNPROVEN = "# NOT PROVEN: `brushloop rig teach proof --arm` has not been run since the last value was taught."
 PROVEN = "# Proven by a dry run, a touch, the self-check and a judged press"
-UNTRIED = """\
-# The software that wrote this file has never been tried on a real cabinet. A difference would show in:
-#   framing, ports, modes: step 1 of `brushloop rig new`; flange poses: the residuals of step 3;
-#   speeds and stops: the dry run of the last step; forces: the push in the step of the brush."""
+UNTRIED = "# No real cabinet has confirmed this software yet: docs/unconfirmed.md says where a difference would show."
 
 
 def now_utc() -> str:
@@ -174,7 +171,7 @@ def rig_of(notebook: Notebook, rig_path: Path) -> RigConfig:
 def rig_text(notebook: Notebook, rig_path: Path) -> str:
     """`rig.toml`: every value with how it was obtained, how well it is known, and when."""
     proven = notebook.done.get("proof")
-    lines = [HEAD, UNPROVEN if proven is None else f"{PROVEN}, {proven}.", *UNTRIED.splitlines()]
+    lines = [HEAD, UNPROVEN if proven is None else f"{PROVEN}, {proven}.", UNTRIED]
     tables = defaultdict[str, list[str]](list)
     named = {"name": rig_path.stem, "paper.name": "Xuan paper"}
     for path, value in {**named, **notebook.table("")}.items():

@@ -57,7 +57,7 @@ class Chain:
         self.left_out = 0
         self.validate_fails = False
 
-    def collected(self, request: CollectRequest) -> Snapshot:
+    def collect(self, request: CollectRequest) -> Snapshot:
         self.ran.append("collect")
         number = 1 + len(list(request.out.glob("*")))
         session = finished(request.config, request.protocol, request.out, number)
@@ -92,7 +92,7 @@ class Chain:
 @pytest.fixture
 def chain(monkeypatch: pytest.MonkeyPatch) -> Chain:
     made = Chain()
-    monkeypatch.setattr(demo, "collected", made.collected)
+    monkeypatch.setattr(demo, "collect", made.collect)
     monkeypatch.setattr(command, "validate", made.validated)
     monkeypatch.setattr(demo, "calibrated", lambda _session: made.ran.append("calibrate"))
     monkeypatch.setattr(demo, "fitted", lambda _session: made.ran.append("fit"))
