@@ -34,7 +34,7 @@ class LoopRequest:
 class WritingRequest:
     """Plan characters, write them on the rig, compare with simulation and reference. Run it again to resume."""
 
-    what: Annotated[str, Argument(help="Characters (字 子 永 are shipped), or a .csv trajectory.")]
+    what: Annotated[str, Argument(help="Characters; 字 子 永 are shipped.")]
     config: Rig = RIG_FILE
     out: Annotated[Path, Option(help="Folder for the plan and the report.")] = Path("written")
     sessions: Annotated[Path, Option(help="Folder that holds sessions.")] = Path("sessions")

@@ -119,7 +119,7 @@ class Writing:
         protocol = load_protocol(path)
         assert isinstance(protocol, WriteConfig)
         names = "".join(figure.name for figure in protocol.figures)
-        if not what.lower().endswith(".csv") and names != what:
+        if names != what:
             raise ConfigError(path, "figures", f"plans {names}, not {what}: use another --out")
         if protocol.repeats != repeats:
             raise ConfigError(path, "repeats", f"plans {protocol.repeats} writings, not {repeats}: use another --out")
