@@ -19,8 +19,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import StrEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from brushloop.drivers.camera.source import (
     DEVICE,
@@ -58,25 +57,16 @@ PERIODS_KEPT = 31
 PERIODS_LEARNED = 3
 """Number of gaps from which the usual period is taken."""
 
-
-class FrameFault(StrEnum):
-    """What is wrong with a frame."""
-
-    BLACK = "black"
-    SATURATED = "saturated"
-    TORN = "torn"
-    FROZEN = "frozen"
-    LATE = "late"
-
-
-LIKELY = {
-    FrameFault.BLACK: "The picture is black: lens covered or light off? ",
-    FrameFault.SATURATED: "The picture is white: too much light, or exposed too long? ",
+Fault = Literal["black", "saturated", "torn", "frozen", "late"]
+"""What is wrong with a frame."""
+LIKELY: dict[Fault, str] = {
+    "black": "The picture is black: lens covered or light off? ",
+    "saturated": "The picture is white: too much light, or exposed too long? ",
 }
 """The cause of a fault that a person can see at the camera."""
 
 
-def looked_at(picture: Picture) -> NDArray[np.uint8] | FrameFault:
+def looked_at(picture: Picture) -> NDArray[np.uint8] | Fault:
     """The picture as (h, w) uint8 gray levels, or the first fault that it shows by itself.
 
     The colour of ink on paper is not worth three times the disk space.
@@ -91,17 +81,17 @@ def looked_at(picture: Picture) -> NDArray[np.uint8] | FrameFault:
                 jpeg.draft("L", jpeg.size)
                 image = np.asarray(jpeg.convert("L"))
         except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
-            return FrameFault.TORN  # cut off or broken
+            return "torn"  # cut off or broken
     else:
         image = picture if picture.ndim == 2 else np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), np.uint8)
     sample = image[::SAMPLE_STEP, ::SAMPLE_STEP]
     if np.count_nonzero(sample >= BLACK_BELOW) < LIGHT_SHARE * sample.size:
-        return FrameFault.BLACK
+        return "black"
     if float(np.mean(sample >= 255)) > SATURATED_SHARE:
-        return FrameFault.SATURATED
+        return "saturated"
     band = image[-max(8, round(TORN_BAND_SHARE * image.shape[0])) :]
     if int(band.max()) - int(band.min()) <= 1 and int(band.min()) < 254:  # clipped white is light, not loss
-        return FrameFault.TORN
+        return "torn"
     return image
 
 
@@ -160,7 +150,7 @@ class OpenCvCamera:
         self._clock = clock
         self._on_notice = on_notice
         self._newest: _Arrival | None = None
-        self._skipped: Counter[FrameFault] = Counter()
+        self._skipped: Counter[Fault] = Counter()
         """Frames that were passed over, by the thread or when somebody looked at them."""
         self._lost_ns: int | None = None
         """Since when the source has been gone."""
@@ -192,7 +182,7 @@ class OpenCvCamera:
                 raise ConnectionLost(DEVICE, "fresh", "closed")
             if newest is not None and newest.exposed_after_ns >= after_ns:
                 image = await asyncio.to_thread(looked_at, newest.picture)
-                if not isinstance(image, FrameFault):
+                if not isinstance(image, str):
                     return Frame(newest.stamp, newest.exposed_after_ns, image)
                 self._skipped[image] += 1
                 after_ns = newest.exposed_after_ns + 1
@@ -214,7 +204,7 @@ class OpenCvCamera:
         if self._thread.ident is not None:
             await asyncio.to_thread(self._thread.join, JOIN_S)
 
-    def _why_none(self, skipped: Counter[FrameFault]) -> str:
+    def _why_none(self, skipped: Counter[Fault]) -> str:
         """Why no valid frame came, in brackets; empty if that is not known."""
         if self._lost_ns is not None:
             return " (the stream ended and is opened again)"
@@ -269,9 +259,9 @@ class OpenCvCamera:
             torn = source.patches and not repeated and is_patched(picture, before)
             before = picture
             if late or repeated:
-                self._skipped[FrameFault.LATE if late else FrameFault.FROZEN] += 1
+                self._skipped["late" if late else "frozen"] += 1
             elif torn:
-                self._skipped[FrameFault.TORN] += 1
+                self._skipped["torn"] += 1
             else:
                 seq = self._newest.stamp.seq + 1 if self._newest is not None else 0
                 self._newest = _Arrival(Stamp(arrival_ns, None, seq), exposed_ns, picture)

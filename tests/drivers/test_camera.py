@@ -16,7 +16,7 @@ import pytest
 from numpy.typing import NDArray
 
 from brushloop.drivers import camera as camera_module
-from brushloop.drivers.camera import Backlog, CameraTable, FrameFault, Locked, OpenCvCamera, found_settings, looked_at
+from brushloop.drivers.camera import Backlog, CameraTable, Locked, OpenCvCamera, found_settings, looked_at
 from brushloop.drivers.camera.source import Capture, JpegStream, is_repeated, open_source
 from brushloop.drivers.devices import Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout
@@ -225,17 +225,17 @@ WHOLE = slice(None)
     ("image", "fault"),
     [
         (filled(slice(200, 260), slice(100, 500), 20), None),
-        (page(8.0, 3.0), FrameFault.BLACK),
-        (page(300.0), FrameFault.SATURATED),
+        (page(8.0, 3.0), "black"),
+        (page(300.0), "saturated"),
         (page(245.0), None),
-        (filled(END, WHOLE, 0), FrameFault.TORN),
-        (filled(END, WHOLE, 200), FrameFault.TORN),
+        (filled(END, WHOLE, 0), "torn"),
+        (filled(END, WHOLE, 200), "torn"),
     ],
     ids=["ink", "lens cap", "overexposed", "white paper", "black end", "gray end"],
 )
-def test_one_frame_is_judged_by_what_it_shows(image: np.ndarray, fault: FrameFault | None) -> None:
+def test_one_frame_is_judged_by_what_it_shows(image: np.ndarray, fault: str | None) -> None:
     seen = looked_at(image)
-    assert seen is image if fault is None else seen is fault
+    assert seen is image if fault is None else seen == fault
 
 
 def test_a_jpeg_is_the_same_picture_in_gray_and_one_that_is_cut_off_is_torn(capfd: pytest.CaptureFixture[str]) -> None:
@@ -245,11 +245,11 @@ def test_a_jpeg_is_the_same_picture_in_gray_and_one_that_is_cut_off_is_torn(capf
     assert isinstance(seen, np.ndarray)
     assert np.abs(seen.astype(float) - cv2.cvtColor(colours, cv2.COLOR_BGR2GRAY)).mean() < 3.0
     for size in (1, 200, len(jpeg) // 2, len(jpeg) - 2):
-        assert looked_at(jpeg[:size]) is FrameFault.TORN
-    assert looked_at(torn(jpeg)) is FrameFault.TORN
+        assert looked_at(jpeg[:size]) == "torn"
+    assert looked_at(torn(jpeg)) == "torn"
     huge, at = bytearray(jpeg), jpeg.index(b"\xff\xc0") + 5  # height and width in the frame's header
     huge[at : at + 4] = (20_000).to_bytes(2, "big") * 2
-    assert looked_at(bytes(huge)) is FrameFault.TORN
+    assert looked_at(bytes(huge)) == "torn"
     assert not capfd.readouterr().err, "a decoder that writes on the terminal would spoil the screen"
 
 
