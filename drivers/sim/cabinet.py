@@ -128,8 +128,7 @@ class Cabinet:
     def power_off(self) -> int:
         """Stop the arm, engage the brakes, then switch its power off."""
         self.stop(HARD_STOP_M_S2, HARD_STOP_M_S2)
-        if self.power.mode != RobotMode.POWER_OFF:
-            self.power.then((0.0, RobotMode.POWERING_OFF), (POWER_OFF_S, RobotMode.POWER_OFF))
+        self.power.then((0.0, RobotMode.POWERING_OFF), (POWER_OFF_S, RobotMode.POWER_OFF))
         return ReturnCode.OK
 
     @property

@@ -13,7 +13,6 @@ import random
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import cast
 
 import cv2
 import numpy as np
@@ -59,7 +58,7 @@ class Optics:
         if self._map is None:
             return undistorted
         distorted = cv2.remap(undistorted, self._map, np.empty(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return cast("NDArray[np.uint8]", distorted)
+        return np.asarray(distorted, np.uint8)
 
 
 def mapped(homography: Floats, points: Floats) -> Floats:
