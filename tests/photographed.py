@@ -49,13 +49,24 @@ def imported_presses(
     at: Sequence[tuple[float, float]],
     size_px: tuple[int, int] = (300, 480),
     touch_px: tuple[int, int] = (380, 150),
+    *,
+    name: str = "presses",
+    seed: int = 0,
+    blank: bool = False,
+    origin: str = "",
 ) -> Path:
-    """`under / "presses"`: the session of one press of the default brush for each (H, alpha), taken at 10 px/mm."""
-    photos = under / "photos"
+    """`under / name`: the session of one press of the default brush for each (H, alpha), taken at 10 px/mm.
+
+    The presses differ with `seed`; the last photograph, called "blank", shows nothing if wanted.
+    """
+    photos = under / f"{name}-photos"
     photos.mkdir(parents=True)
     lines = ["file,depth_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
     for k, (height, tilt) in enumerate(at):
-        mark = Brush(BrushSpec()).press(height, tilt, ink_load=1.0, press_seed=k)
+        mark = Brush(BrushSpec()).press(height, tilt, ink_load=1.0, press_seed=seed + k)
         photograph(photos / f"{k}.png", mark, size_px, touch_px)
         lines.append(f"{k}.png,{height},{tilt},10.0,{touch_px[0]:.1f},{touch_px[1]:.1f}")
-    return imported(photos, lines, under / "presses", "press")
+    if blank:
+        cv2.imwrite(str(photos / "blank.png"), np.full(size_px, PAPER_GRAY, np.uint8))
+        lines.append(f"blank.png,11.0,0.0,10.0,{touch_px[0]:.1f},{touch_px[1]:.1f}")
+    return imported(photos, lines, under / name, "press", origin=origin)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import errno
 import shutil
-import subprocess
-import sys
 from collections import Counter
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -27,18 +26,12 @@ from brushloop.calibrate.presses import Press, cut, too_thin, uncommanded
 from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.calibrate.validate import run as validation
 from brushloop.calibrate.validate.command import validate
-from brushloop.sessions.recording import Recording, mark_bad_or_good
+from brushloop.sessions.recording import Recording
+from brushloop.sessions.records import Stroke
 from tests.calibrate.given import CALIBRATION
 from tests.photographed import imported, imported_presses
 
 CONDITIONS = [(11.0, 0.0), (15.0, 5.0), (20.0, 10.0)]
-READ = """
-import sys
-from pathlib import Path
-from brushloop.calibrate.presses import read_presses
-from brushloop.calibrate.session import open_session
-print([float(press.coverage.sum()) for press in read_presses(open_session(Path(sys.argv[1])), [])])
-"""
 
 
 @pytest.fixture
@@ -65,10 +58,9 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     return counts
 
 
-def read(session: Path | OpenSession, refused: list[tuple[str, str]] | None = None) -> list[Press]:
-    refused = [] if refused is None else refused
+def read(session: Path | OpenSession) -> list[Press]:
     opened = open_session(session) if isinstance(session, Path) else session
-    return list(presses.read_presses(opened, refused, uncommanded, cut, too_thin))
+    return list(presses.read_presses(opened, [], uncommanded, cut, too_thin))
 
 
 def same(one: Press, other: Press) -> bool:
@@ -102,11 +94,11 @@ def test_what_a_press_depends_on_makes_it_anew(
     read(session)
     assert calls["prepare_job"] == 12, "other software"
 
-    photograph = tmp_path / "photos" / "0.png"
+    photograph = tmp_path / "presses-photos" / "0.png"
     image = cv2.imread(str(photograph), cv2.IMREAD_GRAYSCALE)
     cv2.imwrite(str(photograph), np.roll(image, 10, axis=1))
-    lines = (tmp_path / "photos" / "strokes.csv").read_text().splitlines()
-    other = imported(tmp_path / "photos", lines, tmp_path / "other", "press")
+    lines = (tmp_path / "presses-photos" / "strokes.csv").read_text().splitlines()
+    other = imported(tmp_path / "presses-photos", lines, tmp_path / "other", "press")
     shutil.copytree(session / work.FOLDER, other / work.FOLDER)
     assert not same(first[0], read(other)[0])
     assert calls["prepare_job"] == 15, "another photograph"
@@ -130,14 +122,11 @@ def test_damaged_large_and_lost_entries_are_prepared_again(
     assert work.Store(session / work.FOLDER).get(key) is None, "more than may be unpacked"
 
 
-def test_two_processes_at_once_do_no_harm(session: Path, calls: Counter[str]) -> None:
-    command = [sys.executable, "-c", READ, str(session)]
-    both = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
-    one, other = (process.communicate()[0] for process in both)
-    assert [process.returncode for process in both] == [0, 0]
-    assert one == other != ""
-    assert str([float(press.coverage.sum()) for press in read(session)]) == one.strip()
-    assert calls["prepare_job"] == 0
+def test_two_commands_at_once_do_no_harm(session: Path) -> None:
+    with ThreadPoolExecutor(2) as both:
+        one, other = both.map(read, (session, session))
+    assert all(map(same, one, other))
+    assert all(map(same, one, read(session)))
     assert len(list((session / work.FOLDER).iterdir())) == 3, "no half-written file is left"
 
 
@@ -148,17 +137,6 @@ def test_a_folder_that_cannot_be_written_does_not_stop_the_work(session: Path, m
     monkeypatch.setattr(Path, "mkdir", full)
     assert len(read(session)) == 3
     assert not (session / work.FOLDER).exists()
-
-
-def test_a_press_that_is_marked_bad_is_refused_and_comes_back_without_work(session: Path, calls: Counter[str]) -> None:
-    name = next(Recording(session).captures()).stroke.stroke_id
-    mark_bad_or_good(session, 0, name, 1)  # before anything of the session was read
-    refused: list[tuple[str, str]] = []
-    assert len(read(session, refused=refused)) == 2
-    assert refused == [(name, "was marked bad")]
-    mark_bad_or_good(session, 0, name, 2)
-    assert len(read(session)) == 3
-    assert calls["prepare_job"] == 3
 
 
 def test_a_press_is_cut_out_of_its_page_before_the_page_is_resampled(session: Path, tmp_path: Path) -> None:
@@ -173,8 +151,11 @@ def test_a_press_is_cut_out_of_its_page_before_the_page_is_resampled(session: Pa
     assert prepared.anchor_px == pytest.approx([20.0 * (at + 16.0) for at in ANCHOR_MM], abs=20.0)
 
 
-def test_a_start_outside_its_page_is_refused_and_a_photograph_that_cannot_be_read(session: Path) -> None:
+def test_what_cannot_be_read_has_no_scale_or_starts_outside_its_page_is_refused(session: Path) -> None:
     capture = next(Recording(session).captures())
+    unscaled = replace(capture, stroke=Stroke(stroke_id="s", kind="press", still=0, anchor_mm=(3.0, 4.0)))
+    [(name, why)] = presses.prepare_job((unscaled, None)).items()
+    assert (name, str(why)) == ("refused", "has neither a calibration nor a scale of its own")
     torn = replace(capture, still_png=capture.still_png[:100]), None
     assert list(presses.prepare_job(torn)) == ["refused"]
     stroke = capture.stroke.model_copy(update={"anchor_px": (9000.0, 150.0)})

@@ -15,9 +15,7 @@ from brushloop.calibrate import work
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.validate.command import open_session
 from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.events import Closed, Open
-from brushloop.sessions.journal import Journal
-from brushloop.sessions.recording import Recording
+from tests.calibrate.given import CALIBRATION, photographed
 from tests.command import brushloop
 from tests.waiting import PATIENCE_S, wait_until
 
@@ -55,17 +53,10 @@ def test_after_kill_9_the_same_command_gives_the_same_bytes_and_repeats_nothing(
 
 
 def test_a_recording_that_is_not_the_one_its_journal_closed_is_damaged(session: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "presses"
-    folder.mkdir()
-    (folder / "presses.mcap").write_bytes((session / "presses.mcap").read_bytes())
-    header = Recording(session).header.model_copy(update={"session_id": "presses"})
-    closed = Closed(t_ns=1, file="presses.mcap", sha256="0" * 64, counts={})
-    journal = Journal(folder / "journal.jsonl", "presses")
-    for event in (Open(t_ns=1, header=header), closed):
-        journal.append(event)
-    journal.close()
+    closed = photographed(tmp_path / "presses", CALIBRATION.board, [])
+    shutil.copy(session / "presses.mcap", closed)
     with pytest.raises(SessionDamaged, match="SHA-256 differs"):
-        open_session(folder)
+        open_session(closed)
 
 
 CLUSTER = """

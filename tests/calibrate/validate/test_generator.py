@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
-from typing import cast
 
 import numpy as np
 import pytest
-import torch
 
-from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.session import OpenSession, open_session
+from brushloop.calibrate.session import open_session
 from brushloop.calibrate.training import captures_of
 from brushloop.calibrate.validate.tables import NORMAL, Report
+from brushloop.model.generator import SHIPPED_GENERATOR
 from brushloop.model.generator.stroke import load_generator
 from brushloop.sessions.records import Source
-from tests.calibrate.validate.conftest import MakeSession
+from tests.calibrate.conftest import CONDITIONS
 from tests.command import refused, said
+from tests.photographed import imported_presses
 
-# One word a line, as the file's owner would write it.
 TRAINING = """
 steps = 120
 training_images = 200
@@ -31,7 +28,7 @@ learning_rate = 0.01
 [target]
 px_mm = 1.0
 size_px = 32
-placement = "PLACEMENT"
+placement = "centred"
 [layers]
 width = 32
 channels = 4
@@ -39,26 +36,16 @@ side = 8
 """
 
 
-@pytest.fixture(autouse=True)
-def one_thread() -> object:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 @pytest.fixture(scope="module")
 def generator(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("generator")
-    (folder / "train.toml").write_text(TRAINING.replace("PLACEMENT", "centred"))
+    (folder / "train.toml").write_text(TRAINING)
     said("train", "--config", folder / "train.toml", "--out", folder / "made")
     return folder / "made" / "generator.safetensors"
 
 
 def test_a_generator_is_scored_beside_what_it_was_trained_on(session: Path, generator: Path, tmp_path: Path) -> None:
-    training = generator.parent
-    given = ("--generator", generator, "--curves", f"CCD-BSMG={training}", "--no-held-out")
-    said("validate", session, "--out", tmp_path, *given)
+    said("validate", session, "--out", tmp_path, "--generator", generator, "--no-held-out")
     report = Report.read(tmp_path)
     drawn, exact = (report.stat(name, NORMAL) for name in ("ccd-bsmg", "ccd-bsm"))
     assert drawn is not None
@@ -71,29 +58,23 @@ def test_a_generator_is_scored_beside_what_it_was_trained_on(session: Path, gene
     assert len(rival.sha256) == 64
 
 
-@pytest.mark.parametrize("placement", ["centred", "zero-touch"])
-def test_a_generator_is_tuned_on_the_presses_of_a_session(
-    session: Path, generator: Path, tmp_path: Path, placement: str
-) -> None:
-    if placement == "zero-touch":
-        (tmp_path / "train.toml").write_text(
-            TRAINING.replace("PLACEMENT", placement)
-            .replace("steps = 120", "steps = 20")
-            .replace("px_mm = 1.0", "px_mm = 1.4")
-        )
-        said("train", "--config", tmp_path / "train.toml", "--out", tmp_path / "made")
-        generator = tmp_path / "made" / "generator.safetensors"
-    images = captures_of([open_session(session)], generator)[0].images
-    assert images.inputs.tolist()[:2] == [[11.0, 0.0], [11.0, 10.0]]
-    inputs, truth = images.pick(np.arange(len(images)))
-    assert truth.shape == (10, 32, 32)
-    # The ink of a deeper press is more; none is cut off, and it lies where the generator puts it.
-    area = truth.sum(axis=(1, 2))
-    assert area[2] > 1.5 * area[0]
-    assert truth[:, 0].max() == truth[:, -1].max() == 0.0
-    middle = (truth.sum(axis=1) * np.arange(32)).sum(axis=1) / area
-    assert np.abs(middle - (16 if placement == "centred" else 18)).max() < 4.0
+def test_captures_lie_where_the_generator_puts_its_strokes(session: Path, generator: Path) -> None:
+    for path, middle_px, within_px in ((generator, 16, 4.0), (SHIPPED_GENERATOR, 65, 16.0)):
+        images = captures_of([open_session(session)], path)[0].images
+        assert images.inputs.tolist()[:2] == [[11.0, 0.0], [11.0, 10.0]]
+        _, truth = images.pick(np.arange(len(images)))
+        assert len(truth) == 10
+        # The ink of a deeper press is more, and none is cut off.
+        area = truth.sum(axis=(1, 2))
+        assert area[2] > 1.5 * area[0]
+        assert truth[:, 0].max() == truth[:, -1].max() == 0.0
+        middle = (truth.sum(axis=1) * np.arange(truth.shape[2])).sum(axis=1) / area
+        assert np.abs(middle - middle_px).max() < within_px
 
+
+def test_a_generator_is_tuned_on_the_presses_of_a_session(session: Path, generator: Path, tmp_path: Path) -> None:
+    images = captures_of([open_session(session)], generator)[0].images
+    inputs, truth = images.pick(np.arange(len(images)))
     command = ("train", "tune", generator, session, "--out", tmp_path / "tuned", "--steps", "100")
     output = said(*command, "--learning-rate", "0.001")
     assert "left out: blank" in output
@@ -111,12 +92,11 @@ def test_a_generator_is_tuned_on_the_presses_of_a_session(
 
 
 def test_presses_of_a_single_condition_are_refused_and_a_described_brush_keeps_its_remark(
-    make_session: MakeSession, generator: Path, tmp_path: Path
+    generator: Path, tmp_path: Path
 ) -> None:
-    pressed = open_session(make_session(tmp_path, repeats=1, blank=False))
+    pressed = open_session(imported_presses(tmp_path, CONDITIONS))
     twin = {"source": Source.LOOPBACK, "brush": "soft (twin of monday, simulated)"}
     pressed.recording.header = pressed.header.model_copy(update=twin)
     assert captures_of([pressed], generator)[0].source == "loopback rig, brush twin of monday, simulated"
-    recording = SimpleNamespace(path=tmp_path, captures=lambda: iter(()))
-    with pytest.raises(CalibrationError, match="0 conditions are left, at least 2 are needed"):
-        captures_of([cast(OpenSession, SimpleNamespace(header=pressed.header, recording=recording))], generator)
+    single = imported_presses(tmp_path, CONDITIONS[:1] * 2, name="single")
+    assert "1 conditions are left, at least 2 are needed" in refused("train", "tune", generator, single)

@@ -17,13 +17,20 @@ import pytest
 import brushloop
 from brushloop.calibrate.compare import MM_PER_PX
 from tests.blocks import ROOT, blocks_of
-from tests.calibrate.validate.conftest import MakeSession
+from tests.calibrate.conftest import CONDITIONS
+from tests.photographed import imported_presses
 
 
-def test_the_import_loads_nothing_heavy() -> None:
+def test_the_import_loads_nothing_heavy_and_models_are_drawn_without_torch() -> None:
     heavy = ("torch", "cv2", "textual", "numpy", "typing", "pydantic")
-    code = f"import sys, brushloop; print([name for name in {heavy} if name in sys.modules])"
-    assert subprocess.check_output([sys.executable, "-c", code], text=True) == "[]\n"
+    code = f"""
+import sys, brushloop
+print([name for name in {heavy} if name in sys.modules])
+for model in brushloop.models():
+    brushloop.predict(brushloop.Condition(15.0, 5.0), model=model)
+print("torch" in sys.modules)
+"""
+    assert subprocess.check_output([sys.executable, "-c", code], text=True) == "[]\nFalse\n"
 
 
 def test_every_name_of_the_door_is_there_and_no_other() -> None:
@@ -34,11 +41,7 @@ def test_every_name_of_the_door_is_there_and_no_other() -> None:
         _ = brushloop.presses  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def test_the_blocks_of_the_page_run_in_order(
-    tmp_path: Path,
-    session: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_blocks_of_the_page_run_in_order(tmp_path: Path, session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(session, tmp_path / "presses")
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
@@ -72,12 +75,9 @@ def test_a_model_draws_a_press_as_an_image_and_as_an_outline_of_one_area(model: 
 
 
 def test_the_example_runs_on_a_session(
-    tmp_path: Path,
-    make_session: MakeSession,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = make_session(tmp_path, "few", repeats=1)
+    folder = imported_presses(tmp_path, CONDITIONS, blank=True)
     monkeypatch.setattr(sys, "argv", ["notebook.py", os.fspath(folder)])
     runpy.run_path(str(ROOT / "examples" / "notebook.py"), run_name="__main__")
     lines = capsys.readouterr().out.splitlines()
