@@ -21,7 +21,7 @@ from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.brush.brush import BrushSpec
 from brushloop.drivers.sim.brush.footprint import PX_PER_MM as SHEET_PX_PER_MM
-from brushloop.drivers.sim.config import SimConfig, Table, View
+from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.scene import Optics, Scene
 from brushloop.drivers.sim.world import World
 from brushloop.sessions.records import Stroke
@@ -62,17 +62,6 @@ class Shot:
     ink: NDArray[np.float32]
     """(rows, columns) ink per area of the sheet at 10 px/mm; row 0 is its far edge."""
     sheet_mm: tuple[float, float]
-
-
-def board_of(table: Table) -> BoardSpec:
-    """The rig's board as a configuration names it."""
-    return BoardSpec(
-        squares=table.board_squares,
-        square_mm=table.board_square_mm,
-        marker_mm=table.board_marker_mm,
-        dictionary=table.board_dictionary,
-        origin_mm=table.board_origin_mm,
-    )
 
 
 def aimed(view: View, rng: np.random.Generator) -> View:
@@ -155,5 +144,6 @@ def _photographed(world: World, anchors: tuple[tuple[float, float], ...]) -> Sho
     scene = Scene(world)
     world.version += 1
     table = world.config.table
+    board = BoardSpec(**{name: getattr(table, f"board_{name}") for name in BoardSpec.model_fields})
     image = scene.render(brush_pose(*world.config.home_mm))  # the arm stands where it hides no corner
-    return Shot(image, scene.optics, board_of(table), anchors, world.paper.density, table.sheet_mm)
+    return Shot(image, scene.optics, board, anchors, world.paper.density, table.sheet_mm)
