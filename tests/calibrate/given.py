@@ -22,7 +22,7 @@ from brushloop.calibrate.presses import Press, prepare_job, press_of
 from brushloop.calibrate.scores import Scores
 from brushloop.calibrate.session import Calibration
 from brushloop.calibrate.stroke.preprocess import Measured
-from brushloop.calibrate.writing import Figure
+from brushloop.calibrate.writing import Figure, Plan, PlannedBy, as_points
 from brushloop.calibrate.writing.compare import KEYS as WRITTEN_KEYS
 from brushloop.calibrate.writing.compare import PAIRS, PLANNED, Character, Table3Row, WritingComparison, WrittenRecord
 from brushloop.model.raster import coverage
@@ -159,7 +159,6 @@ def kept_lens(
 
 # What `brushloop repress` and `brushloop write` leave behind, without a rig: small records of a few scores
 
-
 LEVELS = {AGAIN: 0.94, ANOTHER: 0.95, SIMULATED: 0.9}
 
 
@@ -193,11 +192,26 @@ def loop_record(original: str, original_sha256: str, source: Source = Source.LOO
     return record.model_copy(update=changes).sealed()
 
 
+def cross(dx: int = 0, width: int = 8) -> np.ndarray:
+    """(128, 128) ink: two bars, moved to the right."""
+    image = np.zeros((128, 128), np.float32)
+    image[60 : 60 + width, 30 + dx : 100 + dx] = 1.0
+    image[30:100, 62 + dx : 62 + dx + width] = 1.0
+    return image
+
+
+def plan_of(character: str = "字", reference: str = "a font") -> Plan:
+    """A plan of one character, a cross that a press would draw with wider bars."""
+    strokes = [np.array([[1.0, 2.0, 3.0, 4.0, -0.0001], [5.5, 6.25, 7.125, 8.0, 9.0]])]
+    images = {"wanted": cross(), "simulated": cross(width=10)}
+    figure = Figure(name=character, source=reference, commanded=as_points(strokes), **images)
+    return Plan(model="CCD-BSM", planned_by=PlannedBy(), cell_mm=60.0, software="test", figures=(figure,))
+
+
 def table_of(character: str = "字", reference: str = "a font") -> tuple[Table3Row, ...]:
     """Table 3 of one character, written twice: CSIM .8 and .9, where paper counts .99."""
-    ink = np.zeros((128, 128), np.float32)
-    figure = Figure(name=character, source=reference)
-    written = Character(figure, {f"x-r{k}": dict.fromkeys(Tone, ink) for k in range(2)})
+    [figure] = plan_of(character, reference).figures
+    written = Character(figure, {f"x-r{k}": dict.fromkeys(Tone, cross()) for k in range(2)})
     twice = np.array([[0.8, 0.7], [0.9, 0.8]])
     # Takes the place of what would be computed from the images.
     written.__dict__["scores"] = {

@@ -1,8 +1,6 @@
-"""Trajectories within reach, refined to the wanted image; plans that lead the brush by its footprint; and the lag."""
+"""Trajectories within reach, stamps and their slopes; plans that lead the brush by its footprint; and the lag."""
 
 from __future__ import annotations
-
-from importlib.resources import files
 
 import numpy as np
 import pytest
@@ -11,9 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from brushloop.model.ccdbsm import Brush
-from brushloop.model.characters.glyph import parse_glyph, paths_of, reference
 from brushloop.model.characters.plan import (
-    Patch,
     Phase,
     Reach,
     StrokePath,
@@ -25,7 +21,7 @@ from brushloop.model.characters.plan import (
     phases_of,
     resampled,
 )
-from brushloop.model.characters.presses import Stamps, depth_of, refine, trajectory, written
+from brushloop.model.characters.presses import Stamps, depth_of
 from brushloop.model.drag import (
     NAMES,
     START,
@@ -33,7 +29,6 @@ from brushloop.model.drag import (
     Drawings,
     Footprint,
     fit_each,
-    fit_footprint,
     inked,
     lagging,
     marks,
@@ -43,22 +38,7 @@ from brushloop.model.raster import coverage
 from brushloop.model.strokes import stroke_model
 
 MODEL = stroke_model("ccd-bsm", Brush())
-PATCH = Patch(60.0)
 REACH = Reach()
-
-
-def apart(points: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1)
-
-
-def assert_feasible(points: np.ndarray, reach: Reach) -> None:
-    steps = apart(points)
-    assert np.all(points[:, 2] >= reach.depth_mm[0] - 1e-9)
-    assert np.all(points[:, 2] <= reach.depth_mm[1] + 1e-9)
-    assert np.all((points[:, 3] >= reach.tilt_deg[0]) & (points[:, 3] <= reach.tilt_deg[1]))
-    assert np.all(np.abs(np.diff(points[:, 2])) <= reach.plunge * steps + 1e-9)
-    assert np.all(np.abs(np.diff(points[:, 4])) <= reach.turn_deg_mm * steps + 1e-6)
-    assert np.all(np.abs(points[:, 4]) <= reach.wrist_deg + 1e-9)
 
 
 def test_depth_is_the_inverse_of_width() -> None:
@@ -73,7 +53,13 @@ def test_depth_is_the_inverse_of_width() -> None:
 @given(arrays(np.float64, (8, 5), elements=st.floats(-400, 400)))
 def test_whatever_comes_is_made_feasible(points: np.ndarray) -> None:
     made = REACH.within(points, 60.0)
-    assert_feasible(made, REACH)
+    steps = np.linalg.norm(np.diff(made[:, :2], axis=0), axis=1)
+    assert np.all(made[:, 2] >= REACH.depth_mm[0] - 1e-9)
+    assert np.all(made[:, 2] <= REACH.depth_mm[1] + 1e-9)
+    assert np.all((made[:, 3] >= REACH.tilt_deg[0]) & (made[:, 3] <= REACH.tilt_deg[1]))
+    assert np.all(np.abs(np.diff(made[:, 2])) <= REACH.plunge * steps + 1e-9)
+    assert np.all(np.abs(np.diff(made[:, 4])) <= REACH.turn_deg_mm * steps + 1e-6)
+    assert np.all(np.abs(made[:, 4]) <= REACH.wrist_deg + 1e-9)
     assert np.all((made[:, :2] >= 0) & (made[:, :2] <= 60))
     assert np.allclose(REACH.within(made, 60.0), made)
 
@@ -115,23 +101,14 @@ def test_the_slopes_of_an_image_are_those_of_every_number_of_a_press() -> None:
         assert slopes[press, number] == pytest.approx((after - before) / 0.01, rel=0.05, abs=0.05)
 
 
-def test_refinement_brings_a_character_to_its_image_within_reach() -> None:
-    text = (files("brushloop.model.characters") / "data" / "子.json").read_text("utf-8")
-    glyph = parse_glyph(text)
-    wanted = reference(glyph, PATCH, 64)
-    first = [trajectory(path, MODEL, REACH, PATCH, 5.0) for path in paths_of(glyph, PATCH, 2.5)]
-    better = refine(MODEL, first, wanted, PATCH.side_mm, REACH, 25)
-    before, after = (np.square(written(MODEL, one, PATCH.side_mm, 64) - wanted).mean() for one in (first, better))
-    assert after < 0.15 * before
-    for points in (*first, *better):
-        assert_feasible(points, REACH)
-
-
 # The tip runs ahead, and the ink lands where it is wanted
-
 
 SIDE_MM, SIZE_PX = 48.0, 96
 HOOK = np.array([[12.0, 36.0], [20.0, 36.0], [28.0, 36.0], [34.0, 34.0], [34.0, 26.0], [33.0, 18.0], [30.0, 21.0]])
+
+
+def brush_of(**changed: float) -> Footprint:
+    return Footprint(tuple({**dict(zip(NAMES, START, strict=True)), **changed}.values()))
 
 
 def hook() -> StrokePath:
@@ -160,27 +137,6 @@ def test_leading_the_brush_puts_the_ink_on_the_corner() -> None:
     assert led[0][:, 2].max() <= reach.depth_mm[1]
 
 
-def test_a_footprint_is_found_again_from_its_ink() -> None:
-    true = Footprint(
-        tuple({**dict(zip(NAMES, Footprint().values, strict=True)), "leash_mm": 2.0, "half_mm_2": 0.9}.values())
-    )
-    x_mm, y_mm = grid(SIDE_MM, 64)
-    paths = [
-        np.array([[14.0, 24.0, depth, turn], [34.0, 24.0, depth, turn], [30.0, 14.0, 0.5 * depth, turn]])
-        for depth, turn in ((3.0, 0.0), (6.0, 30.0), (9.0, -20.0))
-    ]
-    ink = np.array([inked([true], [path], x_mm, y_mm) > 0.0 for path in paths], np.float32)
-    found = fit_footprint(Drawings(paths, np.arange(4), ink, x_mm, y_mm))
-
-    def wrong(brush: Footprint) -> int:
-        seen = [inked([brush], [path], x_mm, y_mm) > 0.0 for path in paths]
-        return np.count_nonzero(np.array(seen) != (ink > 0.5))
-
-    assert wrong(found) < 0.4 * wrong(Footprint())
-    with pytest.raises(ValueError, match="a footprint has 28 finite values, got 2"):
-        Footprint((1.0, 2.0))
-
-
 def test_pressing_deeper_on_the_spot_marks_like_landing_as_deep() -> None:
     lands = np.array([[24.0, 24.0, 8.0, 30.0], [24.01, 24.0, 8.0, 30.0]])
     deepens = np.array([[24.0, 24.0, 2.0, 30.0], [24.01, 24.0, 8.0, 30.0]])
@@ -195,10 +151,7 @@ def test_pressing_deeper_on_the_spot_marks_like_landing_as_deep() -> None:
 
 
 def test_each_stroke_has_a_footprint_of_its_own() -> None:
-    wide, narrow = (
-        Footprint(tuple({**dict(zip(NAMES, Footprint().values, strict=True)), "half_mm_2": half}.values()))
-        for half in (1.2, 0.4)
-    )
+    wide, narrow = brush_of(half_mm_2=1.2), brush_of(half_mm_2=0.4)
     x_mm, y_mm = grid(SIDE_MM, 64)
     paths = [np.array([[12.0, y, 5.0, 0.0], [36.0, y, 5.0, 0.0]]) for y in (16.0, 32.0)]
     ink = (inked([wide, narrow], paths, x_mm, y_mm) > 0.0).astype(np.float32)[None]
@@ -206,6 +159,8 @@ def test_each_stroke_has_a_footprint_of_its_own() -> None:
     depth = np.array([5.0])
     assert upper.half_width_mm(depth) > lower.half_width_mm(depth) + 0.4
     assert np.count_nonzero((inked([upper, lower], paths, x_mm, y_mm) > 0.0) != (ink[0] > 0.5)) < 40
+    with pytest.raises(ValueError, match="a footprint has 28 finite values, got 2"):
+        Footprint((1.0, 2.0))
 
 
 def test_a_path_is_sampled_densely_from_its_landing_to_its_lift() -> None:
@@ -236,7 +191,6 @@ def test_a_stroke_is_divided_into_phases() -> None:
 
 
 # A brush drawn along the paper: the lag has closed forms on a straight line and on a corner
-
 
 STIFF = DragModel(half_mm=2.0, half_per_mm=0.0, leash_mm=0.0, leash_per_mm=0.0, settle_mm=0.0, front=0.0)
 X_MM, Y_MM = np.linspace(-10.0, 50.0, 121), np.linspace(-20.0, 20.0, 81)
