@@ -242,13 +242,9 @@ TRUTH = DragModel(half_mm=1.5, half_per_mm=0.4, leash_mm=3.0, leash_per_mm=0.5, 
 
 
 def arcs(count: int, seed: int) -> list[np.ndarray]:
-    rng = np.random.default_rng(seed)
-    t = np.linspace(0.0, 1.0, 15)
-    out = []
-    for _ in range(count):
-        length, bend, depth = rng.uniform(20.0, 35.0), rng.uniform(-9.0, 9.0), rng.uniform(3.0, 9.0)
-        out.append(np.column_stack([length * t, 4.0 * bend * t * (1.0 - t), np.full(15, depth)]))
-    return out
+    """Commanded paths of any length, bend and depth; the depth is constant along each."""
+    length, bend, depth = np.random.default_rng(seed).uniform([20.0, -9.0, 3.0], [35.0, 9.0, 9.0], (count, 3)).T
+    return [commanded_path(*command) for command in zip(length, bend, depth, depth, strict=True)]
 
 
 def drawings(paths: list[np.ndarray], model: DragModel = TRUTH) -> Drawings:

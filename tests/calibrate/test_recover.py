@@ -6,7 +6,7 @@ import csv
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -14,7 +14,6 @@ import pytest
 
 from brushloop.calibrate.commands import RecoverRequest
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.presses import prepare_job
 from brushloop.calibrate.recover import (
     NO_MODEL_ERROR,
     NOT_INFORMATIVE,
@@ -31,11 +30,9 @@ from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.kinds import ReplayConfig
 from brushloop.model.ccdbsm import Brush, ccdbsm
 from brushloop.model.raster import coverage
-from brushloop.sessions.imports import ImportOptions, import_photographs
-from brushloop.sessions.messages import encode_png
-from brushloop.sessions.recording import Capture
-from brushloop.sessions.records import Condition, Stroke
-from tests.command import brushloop
+from brushloop.sessions.records import Condition
+from tests.command import said
+from tests.photographed import imported
 
 PRESSES = [(12.0, 3.0), (15.0, 6.0), (18.5, 9.0)]
 PX = 12.0  # of the pretended scan, per mm
@@ -49,17 +46,14 @@ def photograph(depth_mm: float, tilt_deg: float, start_x_mm: float = START[0]) -
     return np.rint(230.0 * (1.0 - 0.92 * ink)).astype(np.uint8)
 
 
-def session(folder: Path, *, kind: str = "press", start_x_mm: float = START[0]) -> Path:
+def session(folder: Path, *, kind: Literal["press", "drag"] = "press", start_x_mm: float = START[0]) -> Path:
     photos = folder / "photos"
     photos.mkdir()
-    rows = ["file,depth_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
+    lines = ["file,depth_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
     for k, (height, tilt) in enumerate(PRESSES):
         cv2.imwrite(str(photos / f"p{k}.png"), photograph(height, tilt, start_x_mm))
-        rows.append(f"p{k}.png,{height},{tilt},{PX},{start_x_mm * PX},{START[1] * PX}")
-    (photos / "strokes.csv").write_text("\n".join(rows) + "\n")
-    out = folder / "sessions" / "shots"
-    import_photographs(photos, photos / "strokes.csv", out, ImportOptions(kind=kind), "test", lambda: 1)
-    return out
+        lines.append(f"p{k}.png,{height},{tilt},{PX},{start_x_mm * PX},{START[1] * PX}")
+    return imported(photos, lines, folder / "sessions" / "shots", kind)
 
 
 def recovered(session: Path, out: Path, **options: Any) -> Recovered:
@@ -67,22 +61,26 @@ def recovered(session: Path, out: Path, **options: Any) -> Recovered:
 
 
 def test_a_session_is_inverted_and_can_be_replayed(tmp_path: Path) -> None:
-    made = recovered(session(tmp_path), tmp_path / "out")
-    assert made.refused == []
-    for row, (height, tilt) in zip(made.rows, PRESSES, strict=True):
-        # The preprocessing's own threshold is what is left: .03 mm of depth.
-        assert row.depth_mm == pytest.approx(height, abs=0.08)
-        assert row.tilt_deg == pytest.approx(tilt, abs=0.6)
-        assert 0 < row.depth_sd_mm < 0.2
-    protocol = load_protocol(made.protocol)
+    out = tmp_path / "out" / "recovered.csv"
+    words = said("recover", session(tmp_path), "--out", out)
+    assert "3 presses recovered by ccd-bsm (imported photographs)" in words
+    assert "H: recovered -0.0" in words
+    assert "3 of 3 intervals (95 %) hold the command" in words
+    assert "warning: the intervals of 3 presses leave out the error of the model" in words
+    protocol = load_protocol(out.with_name(PROTOCOL))
     assert isinstance(protocol, ReplayConfig)
     assert protocol.of == "shots"
     assert [press.stroke_id for press in protocol.presses] == ["p0", "p1", "p2"]
-    assert protocol.presses[1].depth_mm == pytest.approx(made.rows[1].depth_mm, abs=1e-3)
-    with (tmp_path / "out" / "recovered.csv").open() as file:
-        first = next(csv.DictReader(file))
-    assert first["commanded_depth_mm"] == "12"
-    assert first["source"] == "imported photographs"
+    with out.open() as file:
+        rows = list(csv.DictReader(file))
+    assert rows[0]["commanded_depth_mm"] == "12"
+    assert rows[0]["source"] == "imported photographs"
+    for row, press, (height, tilt) in zip(rows, protocol.presses, PRESSES, strict=True):
+        # The preprocessing's own threshold is what is left: .03 mm of depth.
+        assert float(row["depth_mm"]) == pytest.approx(height, abs=0.08)
+        assert float(row["tilt_deg"]) == pytest.approx(tilt, abs=0.6)
+        assert 0 < float(row["depth_sd_mm"]) < 0.2
+        assert press.depth_mm == pytest.approx(float(row["depth_mm"]), abs=1e-3)
     few = recovered(tmp_path / "sessions" / "shots", tmp_path, presses=2)  # spread evenly over the session
     assert ([row.stroke_id for row in few.rows], few.refused) == (["p0", "p1"], [])
 
@@ -98,25 +96,6 @@ def test_what_cannot_be_inverted_is_refused_and_writes_nothing(tmp_path: Path) -
     with pytest.raises(CalibrationError, match=r"must end in \.csv"):
         recover(RecoverRequest(tmp_path, tmp_path / PROTOCOL))
     assert not (tmp_path / "recovered.csv").exists()
-
-
-def test_a_capture_without_any_scale_is_refused() -> None:
-    stroke = Stroke(stroke_id="s", kind="press", still=0, anchor_mm=(3.0, 4.0))
-    capture = Capture(stroke, encode_png(photograph(12.0, 3.0)), "s")
-    [(name, why)] = prepare_job((capture, None)).items()
-    assert (name, str(why)) == ("refused", "has neither a calibration nor a scale of its own")
-
-
-def test_the_command_compares_with_what_was_commanded(tmp_path: Path) -> None:
-    session(tmp_path)
-    ran = brushloop("recover", "sessions/shots", "--out", "again/recovered.csv", cwd=tmp_path)
-    assert ran.returncode == 0, ran.stderr
-    words = " ".join(ran.stdout.split())
-    assert "3 presses recovered by ccd-bsm (imported photographs)" in words
-    assert "H: recovered -0.0" in words
-    assert "3 of 3 intervals (95 %) hold the command" in words
-    assert "warning: the intervals of 3 presses leave out the error of the model" in words
-    assert load_protocol(tmp_path / "again" / PROTOCOL).kind == "replay"
 
 
 CONDITIONS = [Condition(h, a) for h in (11.0, 13.0, 15.0, 17.0, 20.0) for a in (0.0, 5.0, 10.0)]

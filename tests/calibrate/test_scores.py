@@ -19,7 +19,16 @@ from brushloop.calibrate.compare import (
     similarity,
     simulated,
 )
-from brushloop.calibrate.loop import AGAIN, ANOTHER, SIMULATED, Pair, pair_up, score_pairs, statistics_of
+from brushloop.calibrate.loop import (
+    AGAIN,
+    ANOTHER,
+    SIMULATED,
+    LoopRecord,
+    Pair,
+    pair_up,
+    score_pairs,
+    statistics_of,
+)
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.scores import Scores, find_stat, similarities
 from brushloop.calibrate.validate.run import score_job
@@ -176,9 +185,6 @@ def test_the_field_holds_every_condition_of_the_grid() -> None:
     for depth_mm, tilt_deg in ((11.0, 0.0), (11.0, 10.0), (20.0, 0.0), (20.0, 10.0)):
         image = simulated(MODELS["ccd-bsm"], depth_mm, tilt_deg)[KEYS.index((Alignment.MM, Tone.GRAY))] / 255
         assert np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]).max() == 0.0
-        assert image.sum() * 0.3**2 == pytest.approx(
-            MODELS["ccd-bsm"].profile(depth_mm, tilt_deg).area_mm2[0], rel=1e-3
-        )
 
 
 def test_the_table_is_in_order_of_capture_and_its_groups_in_order_of_session_and_condition() -> None:
@@ -194,7 +200,6 @@ def test_the_table_is_in_order_of_capture_and_its_groups_in_order_of_session_and
 
 
 # Presses made again: pairs by name, scored against the brush's own repeatability
-
 
 MODEL = MODELS["ccd-bsm"]
 
@@ -217,21 +222,32 @@ ORIGINALS = [
 ]
 
 
-def test_a_press_made_again_as_it_was_beats_the_other_press_of_its_condition() -> None:
+def record_of(again: Iterable[Press]) -> LoopRecord:
+    scores = score_pairs(paired(ORIGINALS, again)[0], ORIGINALS)
+    return loop_record("grid", "ab", stats=tuple(statistics_of(scores)))
+
+
+def test_a_press_made_again_beats_the_other_press_of_its_condition_and_what_repeats_nothing_is_named() -> None:
     again = [
         press("a-r01~1", (14.6, 5.0), (14.6, 5.0), "a-r01"),
         press("a-r02~1", (15.4, 5.0), (15.4, 5.0), "a-r02"),
+        press("x~1", (15.0, 5.0), (15.0, 5.0), "x"),
+        press("y", (15.0, 5.0), (15.0, 5.0)),
     ]
     pairs, refused = paired(ORIGINALS, again)
     names = [(pair.original.stroke.stroke_id, pair.again.stroke.stroke_id) for pair in pairs]
     assert names == [("a-r01", "a-r01~1"), ("a-r02", "a-r02~1")]
-    assert refused == {"b-r01": "was not pressed again"}
+    assert refused == {
+        "x~1": "repeats x: it has no original that can be used",
+        "y": "repeats no stroke: it has no original that can be used",
+        "b-r01": "was not pressed again",
+    }
     scores = score_pairs(pairs, ORIGINALS)
     csim = {what: scores.of_key(what, MM)[:, 0] for what in scores.models}
     assert csim[AGAIN].min() == pytest.approx(1.0)
     assert csim[ANOTHER].max() < 0.98
     assert csim[SIMULATED].mean() > 0.99
-    record = loop_record("grid", "ab", stats=tuple(statistics_of(scores)))
+    record = record_of(again)
     assert len(record.lost) == 8
     assert all(points < 0.0 and row.csim.n == 2 for points, _, _, row in record.lost)
     assert record.answer.good
@@ -239,34 +255,14 @@ def test_a_press_made_again_as_it_was_beats_the_other_press_of_its_condition() -
 
 
 def test_a_press_made_again_too_deep_fails_and_says_so() -> None:
-    again = [press("a-r01~1", (18.0, 5.0), (18.0, 5.0), "a-r01")]
-    scores = score_pairs(paired(ORIGINALS, again)[0], ORIGINALS)
-    record = loop_record("grid", "ab", stats=tuple(statistics_of(scores)))
+    record = record_of([press("a-r01~1", (18.0, 5.0), (18.0, 5.0), "a-r01")])
     stat = find_stat(record.stats, AGAIN, MM)
     assert stat is not None
     assert stat.csim.below_ceiling > 2.0
     assert record.answer.good is False
 
 
-def test_what_repeats_nothing_is_named() -> None:
-    again = [
-        press("x~1", (15.0, 5.0), (15.0, 5.0), "x"),
-        press("y", (15.0, 5.0), (15.0, 5.0)),
-        press("a-r01~1", (15.0, 5.0), (15.0, 5.0), "a-r01"),
-    ]
-    pairs, refused = paired(ORIGINALS, again)
-    assert len(pairs) == 1
-    assert refused == {
-        "x~1": "repeats x: it has no original that can be used",
-        "y": "repeats no stroke: it has no original that can be used",
-        "a-r02": "was not pressed again",
-        "b-r01": "was not pressed again",
-    }
-
-
 def test_an_original_alone_in_its_condition_has_no_repeatability() -> None:
-    again = [press("b-r01~1", (19.0, 0.0), (19.0, 0.0), "b-r01")]
-    scores = score_pairs(paired(ORIGINALS, again)[0], ORIGINALS)
-    assert np.isnan(scores.of(ANOTHER)).all()
-    record = loop_record("grid", "ab", stats=tuple(statistics_of(scores)))
+    record = record_of([press("b-r01~1", (19.0, 0.0), (19.0, 0.0), "b-r01")])
+    assert find_stat(record.stats, ANOTHER, MM) is None
     assert (record.lost, record.answer.good) == ([], None)

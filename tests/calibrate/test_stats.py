@@ -137,7 +137,6 @@ def test_a_press_alone_in_its_condition_has_no_ceiling() -> None:
     values = ceiling_values(np.array([np.nan, 90.0, 90.0]), np.array([0, 1, 1]))
     assert np.isnan(values[0])
     assert values[1:] == pytest.approx(100.0 - 10.0 / np.sqrt(2.0))
-    assert summarise(np.array([np.nan]), np.array([0])) is None
     assert others_of(1, 3) == [2, 0]
     assert others_of(25, 28) == [26, 27, 0, 1, 2, 3, 4, 5, 6], "nine others at most, as in the paper"
 

@@ -171,7 +171,6 @@ def test_what_is_no_generator_is_refused_in_one_line(tmp_path: Path, kind: str) 
 
 # `brushloop train`
 
-
 TOML = """
 training_images = 96
 validation_images = 16
@@ -187,13 +186,6 @@ width = 16
 channels = 4
 side = 8
 """
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Any:
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

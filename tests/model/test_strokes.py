@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -131,33 +129,16 @@ def test_a_plane_is_fitted_and_needs_three_conditions() -> None:
         fit_plane(DEPTHS, np.zeros(3), {"tip_mm": DEPTHS})
 
 
-def test_models_are_drawn_without_torch() -> None:
-    code = "import sys; from brushloop import predict, Condition, models; [predict(Condition(15.0, 5.0), model=m) "
-    code += "for m in models()]; assert 'torch' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True)
+# CCD-BSM against published numbers, the cone it is cut from, and numerical integration
 
-
-# CCD-BSM against the published numbers, the cone it is cut from, and numerical integration
-
-
-# (H, alpha): O3A, O3C, O4O3, length, width, all mm, for R = 6, L = 48 and lambda = pi.
 TABLE = {
     (11, 0): (1.375, 1.375, 12.461, 13.836, 8.639),
-    (11, 5): (1.371, 1.380, 12.378, 13.749, 8.672),
     (11, 10): (1.387, 1.396, 12.401, 13.788, 8.773),
-    (13, 0): (1.625, 1.625, 14.726, 16.351, 10.210),
-    (13, 5): (1.620, 1.631, 14.629, 16.248, 10.249),
-    (13, 10): (1.639, 1.650, 14.656, 16.295, 10.368),
-    (15, 0): (1.875, 1.875, 16.992, 18.867, 11.781),
     (15, 5): (1.869, 1.882, 16.879, 18.748, 11.826),
-    (15, 10): (1.892, 1.904, 16.911, 18.802, 11.963),
-    (17, 0): (2.125, 2.125, 19.257, 21.382, 13.352),
-    (17, 5): (2.118, 2.133, 19.130, 21.248, 13.403),
-    (17, 10): (2.144, 2.158, 19.165, 21.309, 13.558),
     (20, 0): (2.500, 2.500, 22.656, 25.156, 15.708),
-    (20, 5): (2.492, 2.510, 22.506, 24.998, 15.768),
     (20, 10): (2.522, 2.539, 22.547, 25.070, 15.950),
 }
+"""(H, alpha): O3A, O3C, O4O3, length, width, all mm, for R = 6, L = 48 and lambda = pi."""
 BRUSH = Brush()
 
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Generator, Iterator
-from concurrent.futures import Executor
-from contextlib import contextmanager
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -47,15 +46,8 @@ from tests.waiting import wait_until
 GRID = Grid(np.arange(-20.0, 6.0, 0.4), np.arange(8.0, -8.0, -0.4))
 CONDITIONS = ((3.0, 0.0), (4.0, 5.0))
 BASE = BrushSpec(seed=0)
-
-
-class Serial(Executor):
-    """An executor that works in the process that asks."""
-
-    def map(
-        self, fn: Callable[..., Any], *iterables: Any, timeout: float | None = None, chunksize: int = 1
-    ) -> Iterator[Any]:
-        return map(fn, *iterables)
+ONE_THREAD = ThreadPoolExecutor(1)
+"""Draws presses in this process: processes of their own take seconds to start."""
 
 
 @given(st.sampled_from([*SHAPE, *SPREAD]), st.floats(-8.0, 8.0))
@@ -112,7 +104,7 @@ def test_a_search_comes_nearer_to_a_brush_that_gives_ink_from_higher_over_the_pa
     ink = draw(replace(BASE, film_mm=1.0), (0.0, 0.4, 0.0), CONDITIONS, GRID, repeats=2, first_seed=50)
     target = Target(BASE, CONDITIONS, GRID, ink.mean(axis=1))
     before = start()
-    after = search(target, before, Serial(), 0.5)
+    after = search(target, before, ONE_THREAD, 0.5)
     squares = [float((off(target, 0, 0.5, one.point) ** 2).sum()) for one in (before, after)]
     assert squares[1] < 0.5 * squares[0]
     assert after.point[[one.name for one in SHAPE].index("film_mm")] > 0.2
@@ -121,7 +113,7 @@ def test_a_search_comes_nearer_to_a_brush_that_gives_ink_from_higher_over_the_pa
 def test_the_individual_nearest_to_the_captures_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("brushloop.twin.search.INDIVIDUALS", range(4))
     ink = draw(replace(BASE, seed=2), HERE, CONDITIONS, GRID)
-    assert choose_individual(Target(BASE, CONDITIONS, GRID, ink[:, 0]), start(), Serial()).seed == 2
+    assert choose_individual(Target(BASE, CONDITIONS, GRID, ink[:, 0]), start(), ONE_THREAD).seed == 2
 
 
 def test_what_the_parts_disagree_on_is_not_determined() -> None:
@@ -135,7 +127,7 @@ def test_what_the_parts_disagree_on_is_not_determined() -> None:
 @pytest.mark.parametrize(("name", "value", "least"), [("place_wander_mm", 0.4, 0.25), ("reach_wander_mm", 1.0, 0.2)])
 def test_presses_that_differ_more_give_a_wider_spread_of_that_kind(name: str, value: float, least: float) -> None:
     captured = draw(replace(BrushSpec(), **{name: value}), HERE, CONDITIONS, GRID, repeats=6, first_seed=70)
-    found = fit_spread(BrushSpec(), HERE, dict(zip(CONDITIONS, captured, strict=True)), GRID, Serial())
+    found = fit_spread(BrushSpec(), HERE, dict(zip(CONDITIONS, captured, strict=True)), GRID, ONE_THREAD)
     brush = with_values(BrushSpec(), SPREAD, found.point)
     assert least < getattr(brush, name) < 1.5 * value
     assert brush.strand_mm < 0.2
@@ -156,13 +148,12 @@ def test_the_shape_is_found_with_hairs_that_stray_as_those_of_the_captures(monke
     brush = replace(BrushSpec(), strand_mm=0.5)
     captured = draw(brush, HERE, [condition], GRID, repeats=4)[0]
     presses = Presses(brush.radius_mm, brush.length_mm, GRID, np.array([condition] * 4), captured)
-    twin = fit_twin(presses, Serial())
+    twin = fit_twin(presses, ONE_THREAD)
     assert strays == [(1.0, BrushSpec().strand_mm), (0.5, pytest.approx(twin.spec.strand_mm, rel=0.2))]
     assert twin.spec.strand_mm > BrushSpec().strand_mm
 
 
 # `brushloop twin`, on an imported session of shallow presses, with a short search
-
 
 PRESSED = [(height, tilt) for height in (3.0, 5.0) for tilt in (0.0, 5.0)]
 HELD_OUT = Stat(
@@ -173,11 +164,6 @@ HELD_OUT = Stat(
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return imported_presses(tmp_path_factory.mktemp("sessions"), PRESSED, (200, 320), (250, 100))
-
-
-@contextmanager
-def _in_this_process() -> Generator[Executor]:
-    yield Serial()
 
 
 class PowerCut(BaseException):
@@ -197,7 +183,8 @@ def test_a_session_gets_a_twin_and_a_run_that_was_broken_off_goes_on(
         return found  # how a search finds its way is tested with it
 
     cut: list[bool] = []
-    short = {"COARSE_MM": (1.0,), "FINE_MM": 0.5, "workers": _in_this_process, "VOTES": 1, "search": counted}
+    in_this_process = partial(nullcontext, ONE_THREAD)
+    short = {"COARSE_MM": (1.0,), "FINE_MM": 0.5, "workers": in_this_process, "VOTES": 1, "search": counted}
     for name, value in short.items():
         monkeypatch.setattr(f"brushloop.twin.run.{name}", value)
     monkeypatch.setattr("brushloop.twin.search.INDIVIDUALS", range(2))
