@@ -168,7 +168,7 @@ def test_a_run_shows_what_it_records_and_what_the_camera_sees(lab: Lab, monkeypa
     )
     monkeypatch.setattr(start, "LiveView", lambda _port: viewer)
     request = CollectRequest(lab.folder / "rig.toml", lab.folder / "protocol.toml", lab.sessions, live=True)
-    assert start.collect(request).left_out == 0
+    assert start.collect(request).given_up == 0
     folder = lab.session
     assert verify_session(folder).sound
     assert shown == {Topic.PREVIEW, *McapFile(folder / f"{folder.name}.mcap").sound().stated}
