@@ -9,6 +9,8 @@ import asyncio
 import math
 import os
 import secrets
+import zlib
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -56,7 +58,7 @@ THINGS = (*TOUCHED, "upright", "well", "wash-pot", "park", "clear-view", "hold-b
 class UnknownLab(LoopbackRig):
     """`async with UnknownLab(seed) as lab:` serves until the block ends; `hand` asks the person for something.
 
-    The errors of the hand come from the seed, one after the other.
+    An error of the hand depends on the seed, the thing, and how often it was asked for.
     """
 
     def __init__(
@@ -81,7 +83,8 @@ class UnknownLab(LoopbackRig):
         """The gateway and bus of the force sensor."""
         self.arcs.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
         self.arcs.cabinet.payload = [self.facts.payload_kg, [0.0] * 3, [0.0] * 3, [0.0] * 6]
-        self._luck, noise = (np.random.default_rng([seed, stream]) for stream in (31, 17))
+        self._asked: Counter[str] = Counter()
+        noise = np.random.default_rng([seed, 17])
         # a wall, and no sheet
         self.servers["room"] = MjpegServer(self.world, lambda _: noise.normal(185.0, 2.0, (480, 640)).astype(np.uint8))
         if not self.facts.speaks_arcs:
@@ -167,7 +170,7 @@ class UnknownLab(LoopbackRig):
 
     def aim(self, to: str, index: int, name: str) -> Pose:
         """Pose of the tip for a thing. Raises ValueError for one that the lab does not have."""
-        rng, place = self._luck, self.facts.place(to, name)
+        rng, place = self._luck(to, index, name), self.facts.place(to, name)
         turn_deg = float(rng.normal(0.0, 5.0))
         tilt_deg, toward_deg = 0.0, 0.0
         if to == "pin":
@@ -188,7 +191,7 @@ class UnknownLab(LoopbackRig):
 
     def _grip(self, index: int) -> Pose:
         """How the board is held before the camera: each time at another slant and in another part of the picture."""
-        rng, view, table = self._luck, self.facts.config.view, self.facts.config.table
+        rng, view, table = self._luck("hold-board", index, ""), self.facts.config.view, self.facts.config.table
         slant_deg, toward_deg, turn_deg, (x, y) = GRIPS[index % len(GRIPS)]
         size_x_mm, size_y_mm = table.board_size_mm
         high = view.height_px / view.width_px
@@ -208,6 +211,11 @@ class UnknownLab(LoopbackRig):
         if what not in lengths_mm:
             raise ValueError(f"to = {what!r} is not one of {', '.join(lengths_mm)}")
         return f"{round(lengths_mm[what], 2):g}"
+
+    def _luck(self, to: str, index: int, name: str) -> np.random.Generator:
+        key = f"{to} {index} {name}"
+        self._asked[key] += 1
+        return np.random.default_rng([self.facts.config.seed, 31, zlib.crc32(key.encode()), self._asked[key]])
 
     async def _push(self, index: int) -> None:
         """Push the tip for `PUSH_S`, in the direction of this index of `PUSHES`."""
