@@ -7,20 +7,18 @@ import math
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from rich.console import Group
 from rich.table import Table
 
-from brushloop.calibrate.report import printable
+from brushloop.calibrate.report import picture_grid, printable
 from brushloop.collect.motion import Move, Region, park_move
 from brushloop.collect.motion import Path as MotionPath
 from brushloop.collect.protocols.config import ProtocolConfig
 from brushloop.collect.protocols.steps import Drawn, DrawStep, PressStep
-from brushloop.collect.rig.check import BLUE, GREY, ORANGE, Axes, finish, from_above
+from brushloop.collect.rig.check import BLUE, GREY, ORANGE, Axes, finish, from_above, outline
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import limits_of
-from brushloop.collect.rig.paper import PaperPlane, Sheet, to_base
+from brushloop.collect.rig.paper import PaperPlane, Sheet
 from brushloop.collect.touch.selfcheck import partners
 from brushloop.collect.walk import StepMoves, moves_of, sheet_of, walk
 from brushloop.drivers.arcs.motion import as_sent, durations_s
@@ -84,8 +82,6 @@ class Plan:
     """What the ink device doses; None without a device that doses by count."""
     seconds: float
     seconds_by_kind: dict[str, float]
-    touches_mm: tuple[tuple[float, float], ...]
-    """Points of zero touch, in the paper frame."""
 
 
 def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
@@ -95,7 +91,6 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
     changes: list[str] = []
     kinds: Counter[str] = Counter()
     seconds: dict[str, float] = {}
-    measured = config.touch.method != "taught" and config.touch.points_mm
     dips = 0
     sheets = 1
     plane, here = PaperPlane(config.paper.touch_z_mm), park_move(config).target
@@ -122,12 +117,11 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
         ink_ml=None if config.ink.device is None else config.ink.device.doses_ml(dips),
         seconds=sum(seconds.values()),
         seconds_by_kind=seconds,
-        touches_mm=tuple(measured or [config.paper.touch_point_mm]),
     )
 
 
-def plan_table(plan: Plan) -> Group:
-    """Return the plan's totals and what is pressed where, as tables."""
+def plan_table(plan: Plan) -> Table:
+    """Return the plan's totals, and how often each (H, alpha) is pressed, as a table."""
     totals = Table(title=f"plan of {plan.kind}", show_header=False)
     changes = f", a fresh one before {', '.join(plan.sheet_changes)}" if plan.sheet_changes else ""
     totals.add_row("strokes", str(len(plan.placed)))
@@ -139,7 +133,9 @@ def plan_table(plan: Plan) -> Group:
     totals.add_row("time", f"{duration(plan.seconds)}, not counting {OMITTED}")
     for kind, seconds in plan.seconds_by_kind.items():
         totals.add_row(f"  {kind}", duration(seconds))
-    return Group(totals, _conditions(plan))
+    for condition, count in sorted(Counter(press.condition for press in plan.placed).items()):
+        totals.add_row(f"H {condition.depth_mm:g} mm, alpha {condition.tilt_deg:g} deg", f"{count} strokes")
+    return totals
 
 
 def duration(seconds: float) -> str:
@@ -149,45 +145,30 @@ def duration(seconds: float) -> str:
     return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{seconds:.1f} s"
 
 
-def _conditions(plan: Plan) -> Table:
-    table = Table("H mm", "alpha deg", "strokes", "on each sheet")
-    counts = Counter((press.condition, press.sheet) for press in plan.placed)
-    for asked in sorted({press.condition for press in plan.placed}):
-        by_sheet = [counts[asked, sheet] for sheet in range(plan.sheets)]
-        table.add_row(f"{asked.depth_mm:g}", f"{asked.tilt_deg:g}", str(sum(by_sheet)), " ".join(map(str, by_sheet)))
-    return table
-
-
 MOST_SHEETS = 11
 """Most sheets drawn: with the view of the whole table, twelve panels."""
 
 
 def draw_plan(config: RigConfig, protocol: ProtocolConfig, plan: Plan, path: Path) -> None:
     """Write the picture, in the format of the file's ending. Raises OSError if it cannot be written."""
-    from matplotlib.figure import Figure as Picture
-
     shown = min(plan.sheets, MOST_SHEETS)
     columns = 2 if shown < 6 else 3
     rows = math.ceil((shown + 1) / columns)
     width, height = config.paper.size_mm
     panel_in = 7.2
-    picture: Any = Picture(
-        figsize=(panel_in * columns, (panel_in * height / width + 0.35) * rows), layout="constrained"
-    )
-    axes: list[Axes] = list(picture.subplots(rows, columns, squeeze=False).flat)
+    title = f"the first {shown} of {plan.sheets} sheets" if plan.sheets > shown else ""
+    size_in = panel_in * columns, (panel_in * height / width + 0.35) * rows
+    picture, grid = picture_grid(rows, columns, size_in, title)
+    axes: list[Axes] = list(grid.flat)
     sheet = sheet_of(config, protocol)
     from_above(axes[0], config)
-    touched = [to_base(config.paper, *at) for at in plan.touches_mm]
-    axes[0].plot(*zip(*touched, strict=True), "x", color=ORANGE, markersize=9, mew=2.0)
     axes[0].legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=4, frameon=False)
     drawn = {p.stroke_id: p.drawn for p in protocol.planned() if p.drawn is not None}
     for number, panel in enumerate(axes[1 : shown + 1], 1):
         _sheet(panel, config, sheet, number, plan, drawn)
     for panel in axes[shown + 1 :]:
         panel.set_axis_off()
-    if plan.sheets > shown:
-        picture.suptitle(f"the first {shown} of {plan.sheets} sheets")
-    picture.savefig(path, dpi=110)
+    picture.savefig(path)
 
 
 def _sheet(
@@ -202,14 +183,14 @@ def _sheet(
 
     depths_mm = [press.condition.depth_mm for press in plan.placed]
     low, high = min(depths_mm), max(depths_mm)
-    axes.add_patch(_outline((0.0, 0.0, *config.paper.size_mm), "black"))
+    outline(axes, (0.0, 0.0, *config.paper.size_mm), fill=False, edgecolor="black", linewidth=0.8)
     placed = [(order, press) for order, press in enumerate(plan.placed, 1) if press.sheet == number - 1]
     for order, press in placed:
         assert press.patch is not None
         patch, asked, figure = sheet.patch(press.patch), press.condition, drawn.get(press.stroke_id)
         share = 0.5 if high == low else (asked.depth_mm - low) / (high - low)
         shade = colormaps["cividis"](0.25 + 0.75 * (1.0 - share))
-        axes.add_patch(_outline(patch.rect_mm, GREY, shade if figure is None else None))
+        outline(axes, patch.rect_mm, fill=figure is None, edgecolor=GREY, facecolor=shade, linewidth=0.8)
         ink = "white" if figure is None and 0.25 + 0.75 * (1.0 - share) < 0.55 else "black"
         points = max(4.0, min(0.34 * patch.size_y_mm, 0.17 * patch.size_x_mm) * 498.0 / config.paper.size_mm[0])
         if figure is not None:
@@ -229,9 +210,10 @@ def _sheet(
     if number == 1 and plan.steps.get("self_check"):
         first = sheet.patch(0)
         for patch in (first, *partners(sheet, first, set())):
-            axes.add_patch(_outline(patch.rect_mm, GREY))
+            outline(axes, patch.rect_mm, fill=False, edgecolor=GREY, linewidth=0.8)
             axes.text(patch.x_mm + 2.0, patch.y_mm + 0.5 * patch.size_y_mm, "self-check", fontsize=8, va="center")
-    axes.plot(*zip(*plan.touches_mm, strict=True), "x", color=ORANGE, markersize=7, mew=2.0)
+    touched_mm = config.touch.points_mm or [config.paper.touch_point_mm]
+    axes.plot(*zip(*touched_mm, strict=True), "x", color=ORANGE, markersize=7, mew=2.0)
     axes.set_xlim(-3.0, config.paper.size_mm[0] + 3.0)
     axes.set_ylim(-3.0, config.paper.size_mm[1] + 3.0)
     note = "" if drawn else ": # order, H mm, a deg; darker is deeper; + where the tip meets the paper"
@@ -248,10 +230,3 @@ def _figure(axes: Axes, rect_mm: tuple[float, float, float, float], figure: Draw
         first = stroke[0]
         axes.plot(x_mm + first[0], y_mm + first[1], "o", mfc="white", mec=ORANGE, markersize=9)
         axes.text(x_mm + first[0], y_mm + first[1], str(number), fontsize=6, ha="center", va="center")
-
-
-def _outline(rect_mm: tuple[float, float, float, float], edge: str, face: object = None) -> Any:
-    from matplotlib.patches import Rectangle
-
-    x_mm, y_mm, size_x_mm, size_y_mm = rect_mm
-    return Rectangle((x_mm, y_mm), size_x_mm, size_y_mm, edgecolor=edge, facecolor=face or "none", linewidth=0.8)

@@ -88,19 +88,14 @@ def draw_rig(config: RigConfig, path: Path) -> None:
 
 def from_above(axes: Axes, config: RigConfig) -> None:
     """Everything that stands on the table, and the box of limits."""
-    from matplotlib.patches import Rectangle
-
     limits, paper, board, places = limits_of(config), config.paper, config.board, places_of(config)
     axes.plot(0.0, 0.0, "+", color="black", markersize=14, mew=2.0, label="base of the arm")
-
-    def outline(label: str, corner_mm: tuple[float, float], size: tuple[float, float], **style: Any) -> None:
-        axes.add_patch(Rectangle(corner_mm, *size, label=label, **style))
-
     (left, right), (low, high) = limits.x_mm, limits.y_mm
-    outline("box of limits", (left, low), (right - left, high - low), fill=False, edgecolor=ORANGE, linewidth=1.6)
-    dashed = {"fill": False, "edgecolor": GREY, "linestyle": "--", "angle": paper.yaw_deg}
-    outline("board", to_base(paper, *board.origin_mm), size_mm(board), **dashed)
-    outline("sheet", paper.origin_mm, paper.size_mm, facecolor=PAPER, edgecolor="black", angle=paper.yaw_deg)
+    box, turned = (left, low, right - left, high - low), {"angle": paper.yaw_deg}
+    outline(axes, box, label="box of limits", fill=False, edgecolor=ORANGE, linewidth=1.6)
+    beneath = (*to_base(paper, *board.origin_mm), *size_mm(board))
+    outline(axes, beneath, label="board", fill=False, edgecolor=GREY, linestyle="--", **turned)
+    outline(axes, (*paper.origin_mm, *paper.size_mm), label="sheet", facecolor=PAPER, edgecolor="black", **turned)
     for name, tip in (("x", (40.0, 0.0)), ("y", (0.0, 40.0))):
         axes.annotate("", to_base(paper, *tip), paper.origin_mm, arrowprops={"arrowstyle": "->", "color": "black"})
         axes.annotate(name, to_base(paper, *(1.25 * v for v in tip)), ha="center", va="center", fontsize=9)
@@ -110,6 +105,13 @@ def from_above(axes: Axes, config: RigConfig) -> None:
             axes.plot(*zip(*at, strict=True), marker, color=colour, markersize=9, mew=2.0, linestyle="none", label=kind)
     axes.margins(0.1)
     finish(axes, "from above", ("base x mm", "base y mm"))
+
+
+def outline(axes: Axes, rect_mm: tuple[float, float, float, float], **style: Any) -> None:
+    """Draw a rectangle by its lower left corner, width and height; `style` is matplotlib's."""
+    from matplotlib.patches import Rectangle
+
+    axes.add_patch(Rectangle(rect_mm[:2], *rect_mm[2:], **style))
 
 
 def finish(axes: Axes, title: str, along: tuple[str, str] = ("x mm", "y mm")) -> None:

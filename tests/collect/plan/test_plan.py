@@ -68,7 +68,6 @@ def test_a_plan_says_what_a_protocol_takes(
 ) -> None:
     plan = make_plan(config, example(name))
     assert (len(plan.placed), plan.patches_per_sheet, plan.sheets, plan.dips) == (strokes, patches, sheets, dips)
-    assert plan.touches_mm == (config.paper.touch_point_mm,)
     assert len({(p.sheet, p.patch) for p in plan.placed}) == strokes
     assert list(plan.sheet_changes) == [plan.placed[i].stroke_id for i in range(patches, strokes, patches)]
     assert sum(plan.seconds_by_kind.values()) == pytest.approx(plan.seconds)
