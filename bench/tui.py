@@ -14,6 +14,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,10 +22,8 @@ import numpy as np
 
 from bench.harness import ROOT, BenchError, Result, at_most, machine, rounds_of, tell
 from brushloop.collect.engine.control import State
-from brushloop.collect.engine.live import Telemetry
-from brushloop.collect.engine.snapshot import ConditionCount, Picture, Snapshot
+from brushloop.collect.engine.snapshot import TRACE_SLOTS, ConditionCount, Picture, Snapshot
 from brushloop.collect.tui.app import OperatorApp
-from brushloop.drivers.devices import ForceSample, Stamp
 from brushloop.sessions.records import Condition
 
 SIZE = (120, 40)
@@ -65,7 +64,7 @@ class BusyEngine:
         self.stops_ns: list[int] = []
         self._stopped_at = -1.0
         self._began = time.monotonic()
-        self._telemetry = Telemetry()
+        self._peaks_n = deque[float](maxlen=TRACE_SLOTS)
         rng = np.random.default_rng(0)
         light = 120.0 + 80.0 * np.linspace(0.0, 1.0, 320)[None, :] * np.linspace(1.0, 0.7, 240)[:, None]
         frames = [light + rng.normal(0.0, 4.0, (240, 320)) for _ in range(5)]
@@ -76,14 +75,15 @@ class BusyEngine:
         due = time.monotonic()
         for number in itertools.count():
             force_n = 0.03 + 0.02 * (number // 100 % 7)
-            self._telemetry.force(ForceSample(Stamp(time.time_ns()), (0.0, 0.0, force_n), (0, 0, 0)))
+            if number % 100 == 0:
+                self._peaks_n.append(force_n)
             due += 0.001
             time.sleep(max(0.0, due - time.monotonic()))
 
     def snapshot(self) -> Snapshot:
         """The state of a run in its middle, the tip on its way."""
         now = time.monotonic()
-        trace_n, picture = self._telemetry.trace_n(), int((now - self._began) / 0.2)
+        trace_n, picture = tuple(self._peaks_n), int((now - self._began) / 0.2)
         return Snapshot(
             session_id="bench",
             source="bench",

@@ -84,8 +84,6 @@ class NotAccepted(Exception):
     exit_code: ClassVar[int] = 4
 
     def __init__(self, what: str, way_out: str) -> None:
-        self.what = what
-        self.way_out = way_out
         super().__init__(f"{what} {way_out}")
 
 

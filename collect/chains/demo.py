@@ -74,11 +74,10 @@ class Demo:
         """What the first step collects, for every later step."""
         self._left_out = 0
         self._validated: ValidationOutput
-        self.report: Path | None = None
-        """The report's page, once it is written."""
 
     def run(self) -> None:
-        """Run every step, and print how well the models predict the strokes, and where report and recording lie.
+        """Run every step, print how well the models predict the strokes and where report and recording lie, and
+        open the report if that is asked.
 
         A session without a report is continued; a new one is started only when the last one has its report. Raises
         `ConfigError`, `SessionError`, `CollectAborted`, and at the end `StrokesLeftOut` if some were left out.
@@ -113,6 +112,8 @@ class Demo:
         session = self._session
         say("", f"Done in {time.monotonic() - began_s:.0f} s, simulated: nothing here is a result on paper.")
         say(f"Report: {_report(session)}", f"MCAP:   {session / f'{session.name}.mcap'}")
+        if asked.show:
+            webbrowser.open(_report(session).resolve().as_uri())
         if self._left_out:
             raise StrokesLeftOut(self._left_out)
 
@@ -178,7 +179,7 @@ class Demo:
         command = f"brushloop validate {self._session} --generator {SHIPPED_GENERATOR}"
         say(f"$ {command}")
         request = ValidateRequest((self._session,), command=command, generators=(SHIPPED_GENERATOR,))
-        self._validated, self.report = show_work(validate, request), _report(self._session)
+        self._validated = show_work(validate, request)
 
     def _blank_sheet(self, protocol: Path) -> None:
         """Put a blank sheet in for the session of this protocol, unless that is finished."""
@@ -205,10 +206,5 @@ def _report(session: Path) -> Path:
 
 
 def demo(request: DemoRequest) -> None:
-    """Run the demo, as `Demo.run` does, and open its report if that is asked."""
-    run = Demo(request, FULL if request.full else QUICK)
-    try:
-        run.run()
-    finally:
-        if request.show and run.report is not None:
-            webbrowser.open(run.report.resolve().as_uri())
+    """Run the demo, as `Demo.run` does."""
+    Demo(request, FULL if request.full else QUICK).run()

@@ -17,7 +17,7 @@ from collections.abc import Callable, Generator
 from pathlib import Path
 
 from brushloop.collect.engine.control import FINAL, State
-from brushloop.collect.engine.live import each_frame
+from brushloop.collect.engine.live import each_frame, picture_of
 from brushloop.collect.engine.open_or_resume import Opening, find_resumable, open_store
 from brushloop.collect.engine.policy import resume_question
 from brushloop.collect.engine.recorder import uninterrupted
@@ -34,6 +34,7 @@ from brushloop.collect.errors import (
 from brushloop.collect.operator import Asker, Choice, OperatorRequest, Prompt
 from brushloop.collect.rig.devices import Rig, connected
 from brushloop.collect.walk import check_protocol, sheet_of
+from brushloop.drivers.devices import Frame
 from brushloop.drivers.errors import DeviceError, NotConnected, Stale
 from brushloop.drivers.host import Clock, HostClock
 from brushloop.sessions.disk import check_writable
@@ -108,7 +109,7 @@ class Engine:
                 pass
             if rig.force is not None:
                 with contextlib.suppress(DeviceError):
-                    self._run.telemetry.force(sample := rig.force.latest())
+                    self._run.progress.force(sample := rig.force.latest())
                     force_n = math.hypot(*sample.force_n)
         return self._run.progress.snapshot(
             state=state,
@@ -118,19 +119,20 @@ class Engine:
             target_mm=None if rig is None else self._run.procedures.target_mm,
             parked=self._parked(),
             rest_unknown=self._rest_unknown,
-            trace_n=self._run.telemetry.trace_n(),
             force_ceiling_n=None if self._rig_config.force is None else self._rig_config.force.max_n,
-            picture=self._run.telemetry.picture,
             requests=self._run.control.requests,
             no_pose_s=no_pose_s,
         )
 
     def _see_tip(self, rig: Rig) -> tuple[float, float, float]:
-        self._run.telemetry.tip_mm = rig.robot.latest().pose.position_mm
-        return self._run.telemetry.tip_mm
+        self._run.progress.tip_mm = rig.robot.latest().pose.position_mm
+        return self._run.progress.tip_mm
+
+    def _show_frame(self, frame: Frame) -> None:
+        self._run.progress.picture = picture_of(frame)
 
     def _parked(self) -> bool:
-        tip_mm, motion = self._run.telemetry.tip_mm, self._rig_config.motion
+        tip_mm, motion = self._run.progress.tip_mm, self._rig_config.motion
         return not self._rest_unknown and tip_mm is not None and math.dist(tip_mm, motion.park_mm) < PARKED_MM
 
     def request(self, request: OperatorRequest) -> None:
@@ -235,7 +237,7 @@ class Engine:
                     run.progress.log(UNCHECKED, warning=True)
                 if live is not None:
                     run.progress.log(f"live view: {live.url}")
-                shows = ([run.telemetry.frame] if self._request.on_screen else []) + ([live.frame] if live else [])
+                shows = ([self._show_frame] if self._request.on_screen else []) + ([live.frame] if live else [])
                 async with each_frame(rig.camera, shows):
                     await run.carry_out()
                 run.control.begin_closing()
@@ -283,7 +285,7 @@ class Engine:
     def _end(self, state: State, error: Exception) -> None:
         """End with `error`, whose message says so if the arm may move or the brush may be down. The session keeps it
         for the person who resumes."""
-        tip_mm, config = self._run.telemetry.tip_mm, self._rig_config
+        tip_mm, config = self._run.progress.tip_mm, self._rig_config
         if self._rest_unknown:
             error.add_note(NOT_AT_REST)
         if tip_mm is not None and (self._rest_unknown or tip_mm[2] < config.motion.safe_z_mm - PARKED_MM):

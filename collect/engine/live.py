@@ -1,12 +1,10 @@
-"""Newest values while a run goes on: force, tip and picture for a screen; and `--live`, for a Foxglove viewer."""
+"""The camera's picture while a run goes on, for a screen; and `--live`, which shows the run in a Foxglove viewer."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import math
 import threading
-from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import TYPE_CHECKING, Any
@@ -20,7 +18,7 @@ from brushloop.collect.engine.snapshot import Picture
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.photograph.frames import gray
 from brushloop.collect.photograph.measure import blur_px, busiest_tile
-from brushloop.drivers.devices import Camera, ForceSample, Frame, Stamp
+from brushloop.drivers.devices import Camera, Frame, Stamp
 from brushloop.drivers.errors import DeviceError
 from brushloop.drivers.host import alongside
 from brushloop.sessions.mcap_writer import Outgoing, channel_of, encoded
@@ -31,9 +29,6 @@ if TYPE_CHECKING:
     from foxglove import Channel
     from google.protobuf.message import Message
 
-SLOT_NS = 100_000_000
-"""Time that one value of the trace covers. The value is the peak force, so that a short peak is seen."""
-TRACE_SLOTS = 300
 FRAME_PERIOD_S = 0.2
 """Time between two pictures of the camera."""
 WIDTH_PX = 320
@@ -62,36 +57,10 @@ def _no_wider(image: NDArray[np.uint8], width_px: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-class Telemetry:
-    """Newest values. Each write is short, and none waits for a reader."""
-
-    def __init__(self) -> None:
-        self.tip_mm: tuple[float, float, float] | None = None
-        """Where the brush tip was last seen, however long ago."""
-        self.picture: Picture | None = None
-        self._lock = threading.Lock()
-        self._peaks: deque[float] = deque(maxlen=TRACE_SLOTS)
-        self._slot = -1
-
-    def frame(self, frame: Frame) -> None:
-        """Take a frame of the camera."""
-        image = gray(frame.image)
-        self.picture = Picture(_no_wider(image, WIDTH_PX), blur_px(busiest_tile(image)))
-
-    def force(self, sample: ForceSample) -> None:
-        """Take a sample of the force sensor; called at its full rate, and from any thread."""
-        slot, force_n = sample.stamp.host_ns // SLOT_NS, math.hypot(*sample.force_n)
-        with self._lock:
-            if slot > self._slot:
-                self._slot = slot
-                self._peaks.append(force_n)
-            elif self._peaks and force_n > self._peaks[-1]:
-                self._peaks[-1] = force_n
-
-    def trace_n(self) -> tuple[float, ...]:
-        """Peak force of each tenth of a second, oldest first."""
-        with self._lock:
-            return tuple(self._peaks)
+def picture_of(frame: Frame) -> Picture:
+    """What a screen shows of a frame of the camera."""
+    image = gray(frame.image)
+    return Picture(_no_wider(image, WIDTH_PX), blur_px(busiest_tile(image)))
 
 
 HOST = "127.0.0.1"

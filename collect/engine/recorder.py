@@ -19,7 +19,7 @@ from brushloop.calibrate.board.pix2len import Plane, see_board
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.stroke.preprocess import Gray
 from brushloop.collect.engine.control import RunControl
-from brushloop.collect.engine.live import LiveView, Telemetry
+from brushloop.collect.engine.live import LiveView
 from brushloop.collect.engine.open_or_resume import Opening
 from brushloop.collect.engine.snapshot import Progress
 from brushloop.collect.errors import ConfigError, ForceTooHigh, StepError, describe
@@ -232,8 +232,6 @@ class RunContext:
     progress: Progress
     asker: Asker
     control: RunControl = field(default_factory=RunControl)
-    telemetry: Telemetry = field(default_factory=Telemetry)
-    """Gets every force."""
     rig: Rig = field(init=False)
     store: SessionStore = field(init=False)
     procedures: Procedures = field(init=False)

@@ -250,7 +250,7 @@ class Run(RunContext):
         """Within the block, record the poses and forces of an attempt, and show them to whoever watches."""
         rig, recorder = self.rig, Recorder(attempt.writer, self.rig.clock, self.opening.live)
         recorder.show(step_message(attempt.begin))
-        guard = ForceGuard(rig, recorder.force, self.telemetry.force)
+        guard = ForceGuard(rig, recorder.force, self.progress.force)
         try:
             rig.robot.listen(recorder.pose)
             if rig.force is not None:

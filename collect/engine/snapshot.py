@@ -7,8 +7,9 @@ remembered here.
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -29,9 +30,13 @@ if TYPE_CHECKING:
     from brushloop.collect.photograph.checks import Verdict
     from brushloop.collect.protocols.config import ProtocolConfig
     from brushloop.collect.rig.paper import Sheet
+    from brushloop.drivers.devices import ForceSample
     from brushloop.drivers.host import Clock
     from brushloop.sessions.store import SessionStore
 
+SLOT_NS = 100_000_000
+"""Time that one value of the trace of forces covers: the peak, so that a short one is seen."""
+TRACE_SLOTS = 50
 REFRESH_S = 0.1
 """Time between two snapshots that a screen or a progress bar shows."""
 
@@ -203,6 +208,12 @@ class Progress:
         self._started_ns = clock.now_ns()
         self._over_ns: int | None = None
         self._messages: list[str] = []
+        self.tip_mm: tuple[float, float, float] | None = None
+        """Where the brush tip was last seen, however long ago."""
+        self.picture: Picture | None = None
+        """The camera's newest picture."""
+        self._peaks_n: deque[float] = deque(maxlen=TRACE_SLOTS)
+        self._slot = -1
         self._now = Snapshot(
             session_id="" if resumes is None else resumes.name,
             folder="" if resumes is None else str(resumes),
@@ -247,6 +258,16 @@ class Progress:
         with self._lock:
             self._messages.append(f"warning: {text}" if warning else text)
 
+    def force(self, sample: ForceSample) -> None:
+        """Take a sample of the force sensor; called at its full rate."""
+        slot, force_n = sample.stamp.host_ns // SLOT_NS, math.hypot(*sample.force_n)
+        with self._lock:
+            if slot > self._slot:
+                self._slot = slot
+                self._peaks_n.append(force_n)
+            elif self._peaks_n:
+                self._peaks_n[-1] = max(self._peaks_n[-1], force_n)
+
     def over(self, error: str = "") -> None:
         """Note that the run is over, and why if it ended early."""
         self._over_ns = self._clock.now_ns()
@@ -259,6 +280,8 @@ class Progress:
                 self._now,
                 elapsed_s=((self._over_ns or self._clock.now_ns()) - self._started_ns) / 1e9,
                 messages=tuple(self._messages),
+                trace_n=tuple(self._peaks_n),
+                picture=self.picture,
                 **values,
             )
 

@@ -210,10 +210,16 @@ NAMING = {"host": "<host>", "address": "<host>", "bus": "<host>", "source": "<ca
 class Scrubber:
     """Replaces what identifies a person or a network: reports are sent to people outside the lab."""
 
-    def __init__(self, known: Mapping[str, str]) -> None:
-        """`known` are names of this rig, and what stands for each."""
+    def __init__(self, rig: Mapping[str, Any]) -> None:
+        """`rig` are the tables of `rig.toml`, whose names of devices are replaced."""
         names = {value: "<environment>" for name, value in os.environ.items() if name.upper().startswith(PREFIX)}
-        names |= known
+
+        def noted(field: str, text: str) -> str:
+            if field in NAMING:
+                names[text] = NAMING[field]
+            return text
+
+        _with_texts(rig, noted)
         names |= {
             socket.gethostname(): "<host>",
             socket.getfqdn(): "<host>",
@@ -257,19 +263,6 @@ def _user() -> str:
         return ""
 
 
-def scrubber_of(rig: Mapping[str, Any]) -> Scrubber:
-    """A scrubber that knows the names in the tables of `rig.toml`."""
-    names = dict[str, str]()
-
-    def noted(field: str, text: str) -> str:
-        if field in NAMING:
-            names[text] = NAMING[field]
-        return text
-
-    _with_texts(rig, noted)
-    return Scrubber(names)
-
-
 async def write_report(
     path: Path, rig: Mapping[str, Any], robot: ArcsTable, findings: list[Finding], **known: Any
 ) -> None:
@@ -277,7 +270,7 @@ async def write_report(
 
     `rig` are the tables of `rig.toml`, of which only numbers are kept; `known` goes into `report.json` as it is.
     """
-    scrubber = scrubber_of(rig)
+    scrubber = Scrubber(rig)
     report = {
         "format": 1,
         "versions": _versions(),

@@ -70,8 +70,6 @@ SHEET_SIGNS: dict[Mark | None, tuple[str, str]] = {
 SHARP_PX = 2.0
 """Blur in the full frame below which the lens is in focus: a hint for turning it; the step's own check decides."""
 EIGHTHS = " ▁▂▃▄▅▆▇█"
-TRACE_PEAKS = 50
-"""Peaks of the force that are drawn, of a tenth of a second each."""
 LEAST_SCALE_N = 0.1
 """Smallest full scale of that drawing, so that noise is not stretched: a soft brush pushes with a few tens of mN."""
 LOG_LINES = 200
@@ -310,7 +308,7 @@ def figures_content(now: Snapshot) -> Content:
         ("Strokes", strokes),
         ("Counts", Content.styled("   ".join(filter(None, counts)), warned)),
         *_live_rows(now),
-        ("", spark(now.trace_n[-TRACE_PEAKS:])),
+        ("", spark(now.trace_n)),
     ]
     return Content("\n").join(labelled(name, text, 9) for name, text in rows)
 
@@ -338,7 +336,7 @@ def _live_rows(now: Snapshot) -> list[tuple[str, Content | str]]:
         target = _place_text(now.target_mm) + to_go
     if now.force_n is not None:
         ceiling = "" if now.force_ceiling_n is None else f" (stops at {now.force_ceiling_n:g} N)"
-        force = f"{now.force_n:6.3f} N{ceiling}   trace up to {scale_n(now.trace_n[-TRACE_PEAKS:]):.2g} N"
+        force = f"{now.force_n:6.3f} N{ceiling}   trace up to {scale_n(now.trace_n):.2g} N"
     return [("Tip", tip), ("Target", target), ("Force", force)]
 
 

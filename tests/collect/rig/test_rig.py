@@ -16,7 +16,7 @@ from brushloop.collect.commission.visit import Notebook, Taught
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.check import check_rig, places_of
 from brushloop.collect.rig.config import load_rig
-from brushloop.collect.rig.doctor import examine, scrubber_of
+from brushloop.collect.rig.doctor import Scrubber, examine
 from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.config import SimConfig
@@ -262,7 +262,7 @@ def test_names_addresses_and_paths_stay_in_the_lab(rig: Path, monkeypatch: pytes
     monkeypatch.setenv("BRUSHLOOP_ROBOT__HOST", "arm7.lab.example")
     monkeypatch.setenv("LOGNAME", "wanghui")
     monkeypatch.setattr("socket.gethostname", lambda: "rigpc")
-    scrubber = scrubber_of(load_rig(rig).model_dump(mode="json"))
+    scrubber = Scrubber(load_rig(rig).model_dump(mode="json"))
     said = (
         "robot: connect: arm7.lab.example:30004 as wanghui@rigpc from 192.0.2.7 (fe80::1:2:3, 00:1b:44:11:3a:b7); "
         "see /home/wanghui/rig.toml and C:\\Users\\wanghui, http://wanghui:secret@cam.example/stream, "

@@ -132,7 +132,7 @@ def full_picture(**changes: Any) -> Snapshot:
         "force_ceiling_n": 5.0,
         "ink_level": 0.63,
         "given_up": 1,
-        "trace_n": tuple(0.03 * max(0.0, math.sin(n / 9)) for n in range(120)),
+        "trace_n": tuple(0.03 * max(0.0, math.sin(n / 9)) for n in range(70, 120)),
         "sheet": sheet_of(17),
         "last": capture(),
         "picture": camera_picture(),
