@@ -362,7 +362,3 @@ class Procedures:
     async def capture(self) -> Frame:
         """Park, and return the first frame exposed after the camera has shown the arm gone."""
         return await self.photographer.photograph()
-
-    async def park(self) -> None:
-        """Go out of the camera's view."""
-        await self.go(park_move(self._config))

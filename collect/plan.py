@@ -6,6 +6,7 @@ import itertools
 import math
 from collections import Counter
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 
 from rich.table import Table
@@ -130,19 +131,12 @@ def plan_table(plan: Plan) -> Table:
     if plan.ink_ml is not None:
         totals.add_row("ink", f"{plan.ink_ml:.1f} ml, dosed by the ink device")
     totals.add_row("steps", ", ".join(f"{count} {kind}" for kind, count in plan.steps.items()))
-    totals.add_row("time", f"{duration(plan.seconds)}, not counting {OMITTED}")
+    totals.add_row("time", f"{timedelta(seconds=round(plan.seconds))}, not counting {OMITTED}")
     for kind, seconds in plan.seconds_by_kind.items():
-        totals.add_row(f"  {kind}", duration(seconds))
+        totals.add_row(f"  {kind}", str(timedelta(seconds=round(seconds))))
     for condition, count in sorted(Counter(press.condition for press in plan.placed).items()):
         totals.add_row(f"H {condition.depth_mm:g} mm, alpha {condition.tilt_deg:g} deg", f"{count} strokes")
     return totals
-
-
-def duration(seconds: float) -> str:
-    """Hours and minutes, or minutes and seconds, as text."""
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{seconds:.1f} s"
 
 
 MOST_SHEETS = 11

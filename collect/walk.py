@@ -38,7 +38,6 @@ from brushloop.collect.protocols.steps import (
     DrawStep,
     Planned,
     PressStep,
-    Protocol,
     ReviewStep,
     SelfCheckStep,
     Step,
@@ -175,11 +174,6 @@ def sheet_of(config: RigConfig, protocol: ProtocolConfig) -> Sheet:
     return Sheet(config.paper, protocol.cell_mm if isinstance(protocol, WriteConfig) else None)
 
 
-def steps_on(config: RigConfig, protocol: ProtocolConfig) -> Protocol:
-    """The steps as this rig runs them: with the self-check if it is on."""
-    return protocol.steps(self_check=bool(config.self_check.enabled))
-
-
 def as_planned(step: Step, sheet: int, patch: int) -> StepResult | None:
     """The result of a step that makes its press there, as commanded; None for a step that makes none."""
     if not isinstance(step, PressStep | DrawStep):
@@ -202,7 +196,7 @@ def walk(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Walked]:
     The sheet must have room for at least one patch.
     """
     sheet, used, number = sheet_of(config, protocol), set[int](), 0
-    generator = steps_on(config, protocol)
+    generator = protocol.steps(self_check=bool(config.self_check.enabled))
     with contextlib.suppress(StopIteration):
         step = next(generator)
         while True:

@@ -13,9 +13,11 @@ from brushloop.calibrate.stroke.preprocess import PX_PER_MM, Gray, on_window, pr
 from brushloop.collect.engine.recorder import RunContext, StepContext, meanwhile, uninterrupted
 from brushloop.collect.engine.snapshot import LastCapture
 from brushloop.collect.errors import BadPicture, NeedsOperator, StepError
+from brushloop.collect.motion import park_move
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
 from brushloop.collect.photograph.checks import Failure, Photograph, Verdict
 from brushloop.collect.photograph.frames import undistorted
+from brushloop.collect.photograph.measure import around
 from brushloop.collect.protocols.steps import MARKING, CaptureStep
 from brushloop.collect.rig.config import PaperConfig
 from brushloop.collect.rig.paper import Patch
@@ -53,16 +55,14 @@ async def decide(
         run.progress.log(f"{stroke_id}: left out", warning=True)
         return False, False
     text = f"{stroke_id}, take {press.take}: {verdict.reason}"
-    await run.procedures.park()  # a person may reach under the arm
+    await run.procedures.go(park_move(run.rig.config))  # a person may reach under the arm
     answer = await run.asker.ask(Prompt(text, (KEEP, AGAIN, SKIP), SKIP.key, image=_around(run, image, patch)))
     return answer == KEEP.key, answer == AGAIN.key
 
 
 def _around(run: RunContext, image: Gray, patch: Patch) -> Gray:
     """The patch and a margin around it, seen from above."""
-    x_mm, y_mm, size_x_mm, size_y_mm = patch.rect_mm
-    margin_mm, sizes_mm = PICTURE_MARGIN_MM, (size_x_mm + 2 * PICTURE_MARGIN_MM, size_y_mm + 2 * PICTURE_MARGIN_MM)
-    window_mm = (x_mm - margin_mm, y_mm - margin_mm, *sizes_mm)
+    window_mm = around(patch.rect_mm, PICTURE_MARGIN_MM, None)
     return rectify(image, run.view.homography, window_mm, PICTURE_PX_PER_MM)
 
 

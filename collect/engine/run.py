@@ -35,7 +35,7 @@ from brushloop.collect.operator import Choice, OperatorRequest, Prompt
 from brushloop.collect.protocols import steps
 from brushloop.collect.protocols.steps import MARKING, Protocol, Step, press_of, takes
 from brushloop.collect.rig.paper import Patch
-from brushloop.collect.walk import patches_of, steps_on
+from brushloop.collect.walk import patches_of
 from brushloop.drivers.errors import ArmMoved, DeviceError, LimitExceeded, MotionError
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.events import DipResult, ReviewResult, StepKind, StepResult
@@ -60,7 +60,7 @@ class Run(RunContext):
         await self._retreat()
         if self.opening.request.guided:
             await self._result(steps.BoardStep(0))  # so that the board is seen before the brush comes down
-        await self._walk(steps_on(self.rig.config, self.opening.protocol))
+        await self._walk(self.opening.protocol.steps(self_check=bool(self.rig.config.self_check.enabled)))
         for number in itertools.count():
             step = steps.ReviewStep(number)
             if step.key not in self.store.state.done and not capture.marked_bad(self):

@@ -87,12 +87,9 @@ class PlainApp(App[None]):
 
         Ctrl-c ends the command, not the screen.
         """
-
-        def ignore(_number: int, _frame: object) -> None:
-            pass
-
         with self.suspend():
-            before = signal.signal(signal.SIGINT, ignore)
+            # A handler, not SIG_IGN, which the command would inherit.
+            before = signal.signal(signal.SIGINT, lambda _number, _frame: None)
             try:
                 sys.stdout.write(f"$ brushloop {plain(' '.join(words))}\n")
                 sys.stdout.flush()
@@ -105,7 +102,7 @@ class PlainApp(App[None]):
 
     def get_line_filters(self) -> Sequence[LineFilter]:
         """Add `PlainLines` after textual's own filters."""
-        return [*super().get_line_filters(), PLAIN_LINES]
+        return [*super().get_line_filters(), PlainLines()]
 
 
 class PlainLines(LineFilter):
@@ -114,9 +111,6 @@ class PlainLines(LineFilter):
     def apply(self, segments: list[Segment], background: Color) -> list[Segment]:
         """Filter one line."""
         return [part if part.control else Segment(inert(part.text), part.style) for part in segments]
-
-
-PLAIN_LINES = PlainLines()
 
 
 class _LostWrites(io.StringIO):
