@@ -166,7 +166,7 @@ class Walked:
     sheet: int
     """From 1."""
     patches: tuple[Patch, ...]
-    """Patches that the step marks, or the one that it photographs."""
+    """Patches that the step marks."""
 
 
 def sheet_of(config: RigConfig, protocol: ProtocolConfig) -> Sheet:
@@ -203,11 +203,9 @@ def walk(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Walked]:
             if step.kind in MARKING and len(used) == sheet.capacity:
                 number += 1
                 used.clear()
-            patches, shown = patches_of(step, sheet, used, number + 1), number
+            patches = patches_of(step, sheet, used, number + 1)
             used |= {patch.index for patch in patches}
-            if isinstance(step, CaptureStep):
-                patches, shown = (sheet.patch(step.press.patch or 0),), step.press.sheet or 0
-            yield Walked(step, shown + 1, patches)
+            yield Walked(step, number + 1, patches)
             step = generator.send(as_planned(step, number, patches[0].index if patches else 0))
 
 

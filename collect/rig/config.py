@@ -40,11 +40,6 @@ class RobotConfig(ArcsTable, frozen=True):
 
     limits: Limits
 
-    @property
-    def on_this_machine(self) -> bool:
-        """Whether its controller has a loopback address, as the loopback rig's has."""
-        return self.host in ("localhost", "::1") or self.host.startswith("127.")
-
 
 class CameraConfig(CameraTable, frozen=True):
     """The camera, and its lens."""
@@ -269,7 +264,9 @@ class RigConfig(Config):
         """Return a copy that decides the self-check if it was left out: on wherever real hardware may move."""
         if self.self_check.enabled is not None:
             return self
-        enabled = armed or not self.robot.on_this_machine
+        host = self.robot.host
+        on_this_machine = host in ("localhost", "::1") or host.startswith("127.")  # as the loopback rig is
+        enabled = armed or not on_this_machine
         return self.model_copy(update={"self_check": self.self_check.model_copy(update={"enabled": enabled})})
 
     @model_validator(mode="after")

@@ -187,7 +187,6 @@ class ReviewScreen(Screen[None]):
     DEFAULT_CSS = """
     ReviewScreen #captures { width: 34; height: 100%; border: none; padding: 0; }
     ReviewScreen #shown { width: 1fr; padding: 0 1; border-left: solid $foreground 40%; }
-    ReviewScreen #words { height: auto; }
     ReviewScreen #review-photo { margin-right: 1; }
     """
     BINDINGS: ClassVar[list[BindingType]] = [

@@ -104,21 +104,15 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
     RunScreen .pane {
         border-top: solid $foreground 40%; border-title-style: bold; border-title-color: $foreground; padding: 0 1;
     }
-    RunScreen #why { height: auto; }
     RunScreen #why-pane { display: none; height: auto; max-height: 60%; border: heavy $error; padding: 0 1; }
     RunScreen.-wrong #why-pane { display: block; }
-    RunScreen #body { height: 1fr; }
-    RunScreen #left { width: 1fr; }
     RunScreen #right { width: 45%; }
     RunScreen #top { height: auto; max-height: 70%; }
     RunScreen #grid { width: 1fr; height: auto; max-height: 100%; }
     RunScreen #sheet { width: auto; max-width: 40%; height: auto; min-width: 18; }
     RunScreen.-narrow.-wrong #sheet { display: none; }
-    RunScreen #log-pane { height: 1fr; }
-    RunScreen #capture { height: 1fr; }
     RunScreen #capture-words { height: auto; max-height: 50%; }
     RunScreen #capture-pictures { height: 1fr; min-height: 4; }
-    RunScreen #camera { height: 1fr; }
     RunScreen.-narrow #right { display: none; }
     RunScreen.-narrow.-capture #right, RunScreen.-narrow.-camera #right { display: block; width: 1fr; }
     RunScreen.-narrow.-capture #left, RunScreen.-narrow.-camera #left { display: none; }
@@ -181,7 +175,7 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
             yield self._figures
         with self._why_pane:
             yield self._why
-        with Horizontal(id="body"):
+        with Horizontal():
             with Vertical(id="left"):
                 with Horizontal(id="top"):
                     yield self._grid

@@ -104,7 +104,6 @@ class StartScreen(Screen[None]):
 
     AUTO_FOCUS = "#sessions"
     DEFAULT_CSS = """
-    StartScreen #start-body { height: 1fr; }
     StartScreen #sessions { width: 42%; height: 100%; border: none; padding: 0; }
     StartScreen.-empty #sessions { display: none; }
     StartScreen #standing { width: 1fr; height: 100%; padding: 0 1; border-left: solid $foreground 40%; }
@@ -138,7 +137,7 @@ class StartScreen(Screen[None]):
     def compose(self) -> ComposeResult:
         """Lay out sessions and standing, files, trouble, keys."""
         yield self._title
-        with Horizontal(id="start-body"):
+        with Horizontal():
             yield self._options
             with VerticalScroll(id="standing"):
                 yield self._standing
