@@ -102,7 +102,7 @@ class PlainApp(App[None]):
 
     def get_line_filters(self) -> Sequence[LineFilter]:
         """Add `PlainLines` after textual's own filters."""
-        return [*super().get_line_filters(), PlainLines()]
+        return [*super().get_line_filters(), PLAIN_LINES]
 
 
 class PlainLines(LineFilter):
@@ -111,6 +111,10 @@ class PlainLines(LineFilter):
     def apply(self, segments: list[Segment], background: Color) -> list[Segment]:
         """Filter one line."""
         return [part if part.control else Segment(inert(part.text), part.style) for part in segments]
+
+
+PLAIN_LINES = PlainLines()
+"""The same object each time: for another one, textual would draw every line again."""
 
 
 class _LostWrites(io.StringIO):
