@@ -92,10 +92,16 @@ class SocketcandServer(LoopbackServer):
         while (words := await _command(reader)) != ["rawmode"]:
             writer.write(b"< ok >" if words == ["open", LOOPBACK_CHANNEL] else b"< error could not open bus >")
         writer.write(b"< ok >")
+        # python-can takes rounds that arrive with the reply for a part of it, and the board of a killed run sends on.
+        await self._obey(reader)
         async with alongside(self._send_rounds(writer), "force rounds"):
             while True:
-                _send, can_id, _length, *data = await _command(reader)
-                self.board.obey(CanFrame(int(can_id, 16), bytes(int(byte, 16) for byte in data)))
+                await self._obey(reader)
+
+    async def _obey(self, reader: asyncio.StreamReader) -> None:
+        """Give the board the next frame of the client."""
+        _send, can_id, _length, *data = await _command(reader)
+        self.board.obey(CanFrame(int(can_id, 16), bytes(int(byte, 16) for byte in data)))
 
     async def _send_rounds(self, writer: asyncio.StreamWriter) -> None:
         loop = asyncio.get_running_loop()
