@@ -214,6 +214,10 @@ class CompareLoopRequest:
     """Named by the report as what made it."""
 
 
+PROTOCOL = "protocol-write.toml"
+"""Name of the protocol in the folder of a plan."""
+
+
 @dataclass(frozen=True, slots=True)
 class PlanRequest:
     """Plan characters: depth from the width of each stroke, heading along it, then refined until the image matches."""

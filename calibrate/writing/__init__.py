@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field, PlainSerializer, PlainValidator, ValidationError, model_validator
 
 from brushloop.calibrate.artefact import Frozen, SessionFit, made_by
-from brushloop.calibrate.commands import PlanRequest
+from brushloop.calibrate.commands import PROTOCOL, PlanRequest
 from brushloop.calibrate.compare import SIZE_PX, Image
 from brushloop.calibrate.errors import CalibrationError, invalid
 from brushloop.calibrate.files import Written
@@ -33,8 +33,8 @@ from brushloop.sessions.messages import decode_gray, encode_png
 from brushloop.sessions.records import Header
 from brushloop.sessions.terminal import Progress, unseen
 
-FILE, PROTOCOL = "plan.json", "protocol-write.toml"
-"""Names of the files of a plan; the protocol is written last: if it exists, so does the other."""
+FILE = "plan.json"
+"""Name of the file of a plan; its protocol is written last: if that exists, so does the plan."""
 PICTURE = "plan.png"
 SHIPPED_SOURCE = "hanzi-writer-data 2.0.1, from Make Me a Hanzi; outlines of Arphic PL fonts, ARPHIC PUBLIC LICENSE"
 STEP_MM = 2.0

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from brushloop.calibrate.commands import PROTOCOL as WRITE
 from brushloop.calibrate.commands import ValidateRequest, show_work
-from brushloop.calibrate.writing import PROTOCOL as WRITE
 from brushloop.collect.chains import DemoRequest, LoopRequest, WritingRequest
 from brushloop.collect.chains.loop import PAGE as LOOP_PAGE
 from brushloop.collect.chains.loop import PROTOCOL as REPLAY

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from brushloop.calibrate import writing
 from brushloop.calibrate.artefact import current
 from brushloop.calibrate.commands import (
+    PROTOCOL,
     CompareWrittenRequest,
     FitFootprintRequest,
     LearnRequest,
@@ -18,7 +18,6 @@ from brushloop.calibrate.commands import (
     PracticeRequest,
     show_work,
 )
-from brushloop.calibrate.writing import PROTOCOL, load_plan
 from brushloop.collect.chains import WritingRequest
 from brushloop.collect.engine import CollectRequest
 from brushloop.collect.engine.open_or_resume import check_fresh_sheet
@@ -48,6 +47,9 @@ class Writing:
         """
         request = self._request
         plan = self._first_plan()
+
+        from brushloop.calibrate.writing import load_plan  # slow to import
+
         for number in range(1, request.learn + 1):
             plan = self._learn(plan, number)
             if all(figure.settled for figure in load_plan(plan).figures):
@@ -64,6 +66,8 @@ class Writing:
             check_fresh_sheet(request.sessions, request.sheet)  # now, not after planning
         brush = load_rig(request.config).brush
 
+        from brushloop.calibrate.writing import plan as write_plan  # slow to import
+
         wanted = PlanRequest(
             request.what,
             plan,
@@ -75,7 +79,7 @@ class Writing:
             repeats=self._repeats(1),
         )
         say(f"write plan {request.what} --out {plan}")
-        show_work(writing.plan, wanted)
+        show_work(write_plan, wanted)
         return plan
 
     def _footprint(self) -> Path:

@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 
 from brushloop.calibrate import writing
-from brushloop.calibrate.commands import PlanRequest, PracticeRequest
+from brushloop.calibrate.commands import PROTOCOL, PlanRequest, PracticeRequest
 from brushloop.calibrate.compare import Alignment, Polarity, Tone
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.writing import (
     PICTURE,
-    PROTOCOL,
     Figure,
     FootprintArtefact,
     Plan,

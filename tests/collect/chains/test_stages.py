@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from brushloop.__main__ import app
 from brushloop.calibrate.commands import (
+    PROTOCOL,
     CompareWrittenRequest,
     FitFootprintRequest,
     LearnRequest,
@@ -22,7 +23,7 @@ from brushloop.calibrate.files import Written
 from brushloop.calibrate.validate import command
 from brushloop.calibrate.validate.command import ValidationOutput
 from brushloop.calibrate.writing import FILE as PLAN
-from brushloop.calibrate.writing import PROTOCOL, Figure, Plan, PlannedBy
+from brushloop.calibrate.writing import Figure, Plan, PlannedBy
 from brushloop.calibrate.writing.compare import ANOTHER, PLANNED, REFERENCE, SIMULATED, WrittenRecord
 from brushloop.collect.chains import LoopRequest, WritingRequest, demo, loop, writing
 from brushloop.collect.chains.loop import SETTINGS as FILE
