@@ -16,6 +16,7 @@ from pathlib import Path
 from statistics import fmean
 
 import numpy as np
+from filelock import FileLock, Timeout
 from rich.table import Table
 
 from brushloop.calibrate.artefact import FITS, current
@@ -42,6 +43,7 @@ from brushloop.sessions.records import Source
 from brushloop.sessions.terminal import Progress, unseen
 
 FOLDER = "validation"
+LOCK = ".lock"
 LOOP, WRITTEN = "loop", "written"
 """Folders of a session, where its loop and its characters are looked for; `written` also beside all sessions."""
 MAX_PICTURE_BYTES = 16 * 1024 * 1024
@@ -125,9 +127,15 @@ def validate(
         return ValidationOutput(folder, drags=drags, gates=request.gates)
     beside = find_beside(sessions)
     folder.mkdir(parents=True, exist_ok=True)
-    with cluster(request.scheduler) if request.scheduler else threads(request.workers) as scheduler:
-        outcome = validate_presses(sessions, request, scheduler, progress)
-        report = _write(outcome, folder, curves, beside)
+    try:
+        with (
+            FileLock(folder / LOCK, timeout=0),
+            cluster(request.scheduler) if request.scheduler else threads(request.workers) as scheduler,
+        ):
+            outcome = validate_presses(sessions, request, scheduler, progress)
+            report = _write(outcome, folder, curves, beside)
+    except Timeout:
+        raise CalibrationError(str(folder), "another validation is writing there") from None
     return ValidationOutput(folder, report, notes=tuple(beside.notes), gates=request.gates)
 
 

@@ -10,13 +10,14 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 from brushloop.calibrate import work
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.validate.command import open_session
 from brushloop.sessions.errors import SessionDamaged
 from tests.calibrate.given import CALIBRATION, photographed
-from tests.command import brushloop
+from tests.command import brushloop, refused
 from tests.waiting import PATIENCE_S, wait_until
 
 FILES = ("report.json", "report.html", "scores.csv", "summary.csv", "failures.csv", "scores.parquet")
@@ -50,6 +51,11 @@ def test_after_kill_9_the_same_command_gives_the_same_bytes_and_repeats_nothing(
     after = finished(killed)
     assert before.items() <= after.items()
     assert after.keys() == finished(whole).keys()
+
+
+def test_two_at_a_time_in_one_folder_are_refused(session: Path, tmp_path: Path) -> None:
+    with FileLock(tmp_path / ".lock"):
+        assert "another validation is writing there" in refused("validate", session, "--out", tmp_path)
 
 
 def test_a_recording_that_is_not_the_one_its_journal_closed_is_damaged(session: Path, tmp_path: Path) -> None:
