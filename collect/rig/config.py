@@ -243,6 +243,12 @@ class QualityConfig(Config):
     bent_deg: Annotated[float, Field(gt=0.0, lt=90.0)] = 5.5
     """Angle between the heading and the direction of the mark from its head to its tip."""
 
+    @model_validator(mode="after")
+    def _ordered(self) -> QualityConfig:
+        if self.dark_level >= self.bright_level:
+            raise ValueError(f"dark_level = {self.dark_level:g} must be less than bright_level = {self.bright_level:g}")
+        return self
+
 
 class RigConfig(Config):
     """`rig.toml`, with the overrides of the environment."""

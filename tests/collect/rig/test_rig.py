@@ -55,6 +55,7 @@ def rig_file(tmp_path: Path, old: str = "", new: str = "") -> Path:
         ("port = 30004", f"port = {'9' * 10_000}", r"is not TOML"),
         ("stale_ms = 100.0", "stale_ms = 3000.0", r"force: stale_ms = 3000: must be from 20 to 2000;"),
         ("[motion]", '[touch]\nmethod = "camera"\npoints_mm = [[4.0, 4.0]]\n[motion]', r"touch: .*by camera three are"),
+        ("[motion]", "[quality]\ndark_level = 200.0\nbright_level = 150.0\n[motion]", r"quality: .*dark_level"),
     ],
 )
 def test_a_bad_rig_is_refused_in_one_line(tmp_path: Path, old: str, new: str, message: str) -> None:
