@@ -223,7 +223,7 @@ class PlanRequest:
     """Plan characters: depth from the width of each stroke, heading along it, then refined until the image matches."""
 
     what: Annotated[str, Argument(help="Characters; 字 子 永 are shipped.")]
-    out: Annotated[Path, Option(help="Folder for protocol-write.toml and plan.png.")] = Path("write-plan")
+    out: Annotated[Path, Option(help=f"Folder for {PROTOCOL} and plan.png.")] = Path("write-plan")
     data: CharacterData = None
     radius_mm: Annotated[float, Option(min=0.5, max=50, help="Radius R of the brush.")] = 6.0
     length_mm: Length = 48.0
@@ -251,7 +251,7 @@ class PracticeRequest:
     They go no deeper than 0.3 of the brush's length.
     """
 
-    out: Annotated[Path, Option(help="Folder for protocol-write.toml.")] = Path("practice")
+    out: Annotated[Path, Option(help=f"Folder for {PROTOCOL}.")] = Path("practice")
     radius_mm: float = 6.0
     length_mm: Length = 48.0
     cell_mm: Patch = 70.0

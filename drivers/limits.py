@@ -17,8 +17,6 @@ REST_SLACK_MM, REST_SLACK_DEG = 0.1, 0.2
 """An arm that was sent to a limit may rest a little beyond it."""
 ALONG_DEG = 1.0
 """Angle from the tool axis up to which a line counts as along it."""
-
-
 TURN_DEG_S = 45.0
 """Fastest turn of the tool: a short line with a large turn would otherwise whip the wrist round."""
 MOST = 1e6

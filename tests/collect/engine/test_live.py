@@ -67,13 +67,13 @@ class Viewer:
         if message.type is aiohttp.WSMsgType.BINARY:
             number, log_ns = struct.unpack_from("<IQ", message.data, 1)
             return self.channels[number], log_ns, message.data[13:]
-        told = json.loads(message.data)
-        if told["op"] == "advertise":
-            self.channels |= {channel["id"]: channel for channel in told["channels"]}
-            await self._subscribe(channel["id"] for channel in told["channels"])
-        if told["op"] == "status" and told["message"].startswith("Unknown channel"):
+        answer = json.loads(message.data)
+        if answer["op"] == "advertise":
+            self.channels |= {channel["id"]: channel for channel in answer["channels"]}
+            await self._subscribe(channel["id"] for channel in answer["channels"])
+        if answer["op"] == "status" and answer["message"].startswith("Unknown channel"):
             # foxglove-sdk advertises a channel a moment before it can be subscribed to.
-            await self._subscribe([int(told["message"].split()[-1])])
+            await self._subscribe([int(answer["message"].split()[-1])])
         return None
 
     async def _subscribe(self, numbers: Iterable[int]) -> None:
