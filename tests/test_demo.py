@@ -1,61 +1,91 @@
-"""The demo with a kill -9 in its second collection: every stroke is there exactly once, and Table 1 is complete."""
+"""The demo with a kill -9 in its second collection: every stroke is there exactly once, and Table 1 is complete.
+
+Here its rig is small and needs neither wires nor time; `make soak` runs the demo as it is.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import AsyncMock
 
 import pytest
 
 from brushloop.calibrate.validate.tables import Report, table_1
+from brushloop.collect.chains import DemoRequest, demo
+from brushloop.drivers.sim import rig
+from brushloop.drivers.sim.config import SimConfig
 from brushloop.sessions.recording import Recording
+from brushloop.sessions.store import SessionStore
 from brushloop.sessions.verify import verify_session
+from tests.blocks import ROOT
+from tests.command import brushloop
 from tests.journal_lines import read_lines
-from tests.waiting import wait_until
+from tests.rigs import SHARP_VIEW, SMALL_TABLE, wireless_lab
 
-SMALL = """
-import sys
-from pathlib import Path
-from brushloop.collect.chains import DemoRequest
-from brushloop.collect.chains.demo import Demo, Size
-
-size = Size((11.0, 20.0), (0.0, 8.0), again=1, writings=0, repeats=1)
-Demo(DemoRequest(Path(sys.argv[1])), size).run()
-"""
-"""`brushloop demo` with as few presses as tell depth and tilt to the fit."""
-
-
+SIZE = demo.Size((11.0, 20.0), (0.0, 8.0), again=1, writings=0, repeats=1)
+"""As few presses as tell depth and tilt to the fit."""
 PRESSED = 4
-"""Zero touch, board, dip, press: the photograph is still to come."""
+"""Steps of the second collection until its press: zero touch, board, dip, press. The photograph is still to come."""
 
 
-def again_steps_done(out: Path) -> int:
-    journals = list(out.glob("sessions/*-replay-*/journal.jsonl"))
-    return journals[0].read_bytes().count(b'"event":"done"') if journals else 0
-
-
-@pytest.mark.timeout(900)
-def test_killed_in_mid_collection_the_same_command_ends_with_every_stroke_exactly_once(tmp_path: Path) -> None:
-    out = tmp_path / "demo"
-    command = [sys.executable, "-c", SMALL, str(out)]
-    # however late a busy machine draws and takes pictures
-    late = os.environ | {"BRUSHLOOP_CAMERA__MAX_DELAY_MS": "10000", "BRUSHLOOP_CAMERA__MAX_JITTER_MS": "10000"}
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": late}
-    with subprocess.Popen(command, start_new_session=True, **quiet) as first:
-        try:
-            wait_until(lambda: again_steps_done(out) >= PRESSED, f"{PRESSED} steps", process=first, timeout_s=500.0)
-        finally:
-            os.killpg(first.pid, signal.SIGKILL)
-
-    for _ in range(4):  # on a busy machine the camera may still be late; the same command continues
-        ran = subprocess.run(command, capture_output=True, text=True, check=False, env=late)
-        if ran.returncode == 0:
-            break
+def asked_for(config: Path, options: tuple[str, ...]) -> SimConfig:
+    """The rig that `brushloop sim` serves with these options."""
+    served: list[SimConfig] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rig.LoopbackRig, "__init__", lambda _, config: served.append(config))
+        patch.setattr(rig, "serve", AsyncMock())
+        ran = brushloop("sim", "--write-rig", config, *options)
     assert ran.returncode == 0, ran.stderr
+    return served[0]
+
+
+def run_demo(out: Path) -> None:
+    """Run the demo with the rig in this process."""
+    with contextlib.ExitStack() as stack:
+
+        def start(config: Path, _log: Path, *options: str, detached: bool) -> SimpleNamespace:
+            assert detached, "Ctrl-C is for the collection"
+            small = replace(asked_for(config, options), view=SHARP_VIEW, table=SMALL_TABLE)
+            lab = stack.enter_context(wireless_lab(out, small))
+            config.write_text(lab.rig.toml(), encoding="utf-8")
+            return SimpleNamespace(config=config, fresh_sheet=lab.rig.world.fresh_sheet, end=stack.close)
+
+        stack.enter_context(pytest.MonkeyPatch.context()).setattr(demo, "start", start)
+        demo.Demo(DemoRequest(out), SIZE).run()
+
+
+def run_demo_and_die(out: Path) -> None:
+    """The same, until this process kills itself in the second collection."""
+    finish: Callable[..., None] = SessionStore.done
+
+    def done(store: SessionStore, *step: object) -> None:
+        finish(store, *step)
+        if "replay" in store.folder.name and len(store.state.files) == PRESSED:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(SessionStore, "done", done)
+        run_demo(out)
+
+
+def test_killed_in_mid_collection_the_same_command_ends_with_every_stroke_exactly_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "demo"
+    program = "import sys, pathlib, tests.test_demo; tests.test_demo.run_demo_and_die(pathlib.Path(sys.argv[1]))"
+    killed = subprocess.run([sys.executable, "-c", program, out], cwd=ROOT, capture_output=True, check=False)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    run_demo(out)
+    printed = capsys.readouterr().out
 
     session, again = sorted((out / "sessions").iterdir())
     for folder in (session, again):
@@ -70,15 +100,15 @@ def test_killed_in_mid_collection_the_same_command_ends_with_every_stroke_exactl
     assert len(repeated) == 1
     assert repeated < {stroke.stroke_id for stroke in strokes}
 
-    printed = re.search(r"Report: (\S+report\.html)\nMCAP:   (\S+\.mcap)", ran.stdout)
-    assert printed is not None
-    page = Path(printed[1]).read_text()
+    paths = re.search(r"Report: (\S+report\.html)\nMCAP:   (\S+\.mcap)", printed)
+    assert paths is not None
+    page = Path(paths[1]).read_text()
     assert '<span class="source">loopback rig, brush made to agree with the paper&#39;s Table 2: no evidence' in page
     assert "not a result on paper" in page
-    assert Path(printed[2]).is_file()
+    assert Path(paths[2]).is_file()
     assert "pix2len" in (out / "demo.log").read_text()  # what the steps print does not drown the answer
-    assert "pix2len" not in ran.stdout
-    report = Report.read(Path(printed[1]).with_name("report.json"))
+    assert "pix2len" not in printed
+    report = Report.read(Path(paths[1]).with_name("report.json"))
     rows = {row.label: row.scores for row in table_1(report)}
     assert rows.pop("another press") is rows.pop("ceiling") is None  # no condition was pressed twice
     assert set(rows) == {"CCD-BSM", "CCD-BSMG", "robot writing", "CCD-BSM calibrated"}
