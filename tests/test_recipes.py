@@ -7,40 +7,40 @@ import importlib.util
 import sys
 import time
 import tomllib
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 
 from brushloop.collect.engine import CollectRequest
-from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.open_or_resume import Opening
 from brushloop.collect.photograph.measure import Mark
 from brushloop.collect.protocols.steps import PressStep
 from brushloop.collect.rig.config import InkConfig, QualityConfig, RigConfig
+from brushloop.collect.rig.devices import Rig
 from brushloop.collect.walk import walk
 from brushloop.drivers.camera import CameraTable, OpenCvCamera
 from brushloop.drivers.devices import Stamp
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.ink.simulator import Well
 from brushloop.drivers.sim import scene
-from brushloop.drivers.sim.config import SimConfig, View
+from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.faults import ALWAYS, KINDS, Device, Fault
 from brushloop.drivers.sim.rig import LoopbackRig, rig_toml
 from brushloop.model import strokes
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.raster import coverage
 from brushloop.model.strokes import stroke_models
-from tests.rigs import SHARP_VIEW, SMALL_TABLE, in_thread
-from tests.runs import wait_for_end
+from tests.rigs import BARE, SHARP, SMALL_TABLE, sharp, wireless_lab
+from tests.runs import SteppedEngine, wait_for_end
 
 RECIPES = Path(__file__).resolve().parent.parent / "examples" / "recipes"
-
-SMALL = View(width_px=512, height_px=384, px_per_mm=1.56)
 
 
 def recipe(name: str) -> ModuleType:
@@ -88,23 +88,21 @@ def test_a_quality_check_is_a_function_of_the_mark() -> None:
     assert "Wipe the brush" in flooded(replace(mark, tone=0.99), QualityConfig()).reason
 
 
-@asynccontextmanager
-async def syringe(well: Well) -> AsyncIterator[int]:
-    """The port of a simulated syringe pump that fills this well."""
-
-    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        while line := (await reader.readline()).decode().strip():
-            if line != "WHO":
-                well.add(float(line.removeprefix("DOSE ")))
-            writer.write(b"syringe 3\n" if line == "WHO" else b"OK\n")
-        writer.close()
-        await writer.wait_closed()
-
-    async with await asyncio.start_server(serve, "127.0.0.1", 0) as server:
-        yield server.sockets[0].getsockname()[1]
+SYRINGE = "127.0.0.1", "4000"
 
 
-def test_an_ink_device_is_a_table_and_a_driver_and_the_engine_inks_a_brush_with_it(tmp_path: Path) -> None:
+async def serve_syringe(well: Well, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    """Fill this well as a syringe pump does."""
+    while line := (await reader.readline()).decode().strip():
+        if line != "WHO":
+            well.add(float(line.removeprefix("DOSE ")))
+        writer.write(b"syringe 3\n" if line == "WHO" else b"OK\n")
+    writer.close()
+
+
+def test_an_ink_device_is_a_table_and_a_driver_and_the_engine_inks_a_brush_with_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     table = recipe("driver").SyringeTable
 
     class InkWithSyringe(InkConfig):
@@ -113,17 +111,21 @@ def test_an_ink_device_is_a_table_and_a_driver_and_the_engine_inks_a_brush_with_
     class RigWithSyringe(RigConfig):
         ink: InkWithSyringe  # type: ignore[assignment]
 
-    config = SimConfig(rate=60.0, table=SMALL_TABLE, view=SHARP_VIEW, force_sensor=False, ink_device="none")
-    with in_thread(LoopbackRig(config)) as (lab, _), in_thread(syringe(lab.world.well)) as (port, _):
-        lab.world.well.ml = 0.0
-        rig_path, protocol_path = tmp_path / "rig.toml", tmp_path / "protocol.toml"
-        rig_path.write_text(lab.toml().replace("latency_ms = 250.0", "latency_ms = 100.0"), encoding="utf-8")
-        protocol_path.write_text('kind = "grid"\ndepths_mm = [15.0]\ntilts_deg = [0.0]\nrepeats = 1\n', "utf-8")
-        opening, clock = Opening.load(CollectRequest(rig_path, protocol_path, tmp_path / "sessions")), HostClock()
-        fields = tomllib.loads(lab.toml())
-        fields["ink"]["device"] = {"kind": "syringe", "port": f"127.0.0.1:{port}", "dose_ml": 2.0}
-        rig = RigWithSyringe(**fields)
-        engine = Engine(replace(opening, rig=rig), None, clock)
+    with wireless_lab(tmp_path, replace(SHARP, force_sensor=False, ink_device="none")) as lab:
+        well, opened = lab.rig.world.well, lab.rig.connected
+
+        @asynccontextmanager
+        async def connected(*of: Any) -> AsyncGenerator[Rig]:
+            async with await asyncio.start_server(partial(serve_syringe, well), *SYRINGE), opened(*of) as rig:
+                yield rig
+
+        monkeypatch.setattr("brushloop.collect.engine.engine.connected", connected)
+        sharp(lab)
+        well.ml = 0.0
+        fields = tomllib.loads((tmp_path / "rig.toml").read_text(encoding="utf-8"))
+        fields["ink"]["device"] = {"kind": "syringe", "port": ":".join(SYRINGE), "dose_ml": 2.0}
+        opening = Opening.load(CollectRequest(tmp_path / "rig.toml", tmp_path / "protocol.toml", lab.sessions))
+        engine = SteppedEngine(replace(opening, rig=RigWithSyringe(**fields)), None, lab.rig.time)
         engine.start()
         wait_for_end(engine)
     assert engine.snapshot().strokes_done == 1, "its ink was judged"
@@ -133,7 +135,7 @@ async def test_a_fault_is_a_kind_and_what_it_does(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(scene, "SPOILED", spoiled := dict(scene.SPOILED))
     monkeypatch.setitem(KINDS, Device.CAMERA, KINDS[Device.CAMERA])
     recipe("fault").add()
-    async with LoopbackRig(SimConfig(force_sensor=False, ink_device="none", view=SMALL)) as rig:
+    async with LoopbackRig(replace(BARE, table=SMALL_TABLE)) as rig:
         url = f"http://127.0.0.1:{rig.camera.port}/stream.mjpg"
         camera = OpenCvCamera(CameraTable(kind="opencv", source=url), HostClock())
         await camera.connect()

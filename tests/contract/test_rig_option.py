@@ -17,8 +17,11 @@ from unittest.mock import AsyncMock, Mock
 
 import pytest
 
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.rig import LoopbackRig
 from tests.contract import conftest
-from tests.waiting import PATIENCE_S, wait_until
+from tests.rigs import in_thread
+from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 QUESTION = "May the arm move? [y/N]"
@@ -26,17 +29,13 @@ QUESTION = "May the arm move? [y/N]"
 CHOSEN = "a_move_arrives or who_answers or agree_on_an_arm"
 
 
-@pytest.fixture(scope="module")
-def rig_toml(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A loopback rig in a process of its own, as `brushloop sim --write-rig` serves it."""
-    path = tmp_path_factory.mktemp("rig") / "rig.toml"
-    command = [sys.executable, "-m", "brushloop", "sim", "--write-rig", str(path), "--rate", "5"]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as sim:
-        try:
-            wait_until(path.exists, "rig.toml", process=sim)
-            yield path
-        finally:
-            sim.terminate()
+@pytest.fixture
+def rig_toml(tmp_path: Path) -> Iterator[Path]:
+    """Of a loopback rig that serves."""
+    with in_thread(LoopbackRig(SimConfig(rate=5.0, force_sensor=False, ink_device="none"))) as (rig, _):
+        path = tmp_path / "rig.toml"
+        path.write_text(rig.toml(), encoding="utf-8")
+        yield path
 
 
 def on_a_terminal(rig_toml: Path, answer: str) -> tuple[int, str]:
