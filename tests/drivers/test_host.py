@@ -1,15 +1,21 @@
-"""The clock of the host, and what is said when the computer is too busy."""
+"""The host: its clock, its serial ports with the ink station behind them, and what is said when it is too busy."""
 
 from __future__ import annotations
 
+import asyncio
 import os
 import time
+from collections.abc import AsyncIterator
+from pathlib import Path
 
 import pytest
 
 from brushloop.collect.errors import CameraLate, describe
-from brushloop.drivers.errors import DeviceTimeout, Stale
+from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, Stale
 from brushloop.drivers.host import HostClock
+from brushloop.drivers.ink.simulator import PtyLine, StationFirmware
+from brushloop.drivers.ink.station import InkStation, InkStationConfig
+from tests.waiting import until
 
 
 def test_the_host_clock_goes_on_when_wall_time_is_set_back(monkeypatch: pytest.MonkeyPatch):
@@ -36,3 +42,71 @@ def test_what_comes_late_on_a_loaded_computer_says_so(late: type[Exception], mon
     monkeypatch.setattr(os, "getloadavg", lambda: (23.0, 9.0, 3.0))
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     assert "This computer is too busy (load 23.0 on 2 cores)" in describe(late())
+
+
+def station_at(path: str) -> InkStation:
+    return InkStation(InkStationConfig(kind="ink-station", port=path, dose_ml=2.0, light=0.5), HostClock())
+
+
+@pytest.fixture
+async def line() -> AsyncIterator[PtyLine]:
+    with PtyLine(StationFirmware()) as line:
+        yield line
+
+
+@pytest.fixture
+async def station(line: PtyLine) -> AsyncIterator[InkStation]:
+    station = station_at(line.path)
+    await station.connect()
+    yield station
+    await station.close()
+
+
+async def test_a_pulled_cable_is_a_lost_connection_at_once_and_leads_to_no_other_station(
+    line: PtyLine, station: InkStation
+):
+    line.next_fault = lambda: "unplug"
+    with pytest.raises(ConnectionLost, match=r"may be in the well.*Check cable") as lost:
+        await station.dose(1.0)
+    assert lost.value.op == "dose"
+    # the kernel gives the number of the closed terminal to the next one
+    with PtyLine(StationFirmware()), pytest.raises(ConnectionLost, match="cannot open"):
+        await station_at(line.path).connect()
+
+
+async def test_a_port_that_is_missing_or_held_by_somebody_else_is_not_opened(
+    tmp_path: Path, line: PtyLine, station: InkStation
+):
+    nowhere = station_at(str(tmp_path / "ttyUSB0"))
+    with pytest.raises(ConnectionLost, match=r"cannot open .*ttyUSB0"):
+        await nowhere.connect()
+    with pytest.raises(NotConnected):
+        await nowhere.light()
+    await nowhere.close()
+    with pytest.raises(ConnectionLost, match="lock"):
+        await station_at(line.path).connect()
+    await station.light()
+
+
+async def test_closing_ends_an_exchange_that_waits(line: PtyLine, station: InkStation, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("brushloop.drivers.ink.station.REPLY_S", 1000.0)
+    line.next_fault = lambda: "mute"
+    asking = asyncio.create_task(station.light())
+    await until(lambda: line.instrument.light == 0.5, "the request to arrive")  # type: ignore[attr-defined]
+    await station.close()
+    with pytest.raises(NotConnected):
+        await asking
+
+
+async def test_an_exchange_that_is_cancelled_ends_before_the_next_begins(line: PtyLine, station: InkStation):
+    on_the_line: list[str] = []
+    faults, reply = iter(["late"]), line._write
+    line.next_fault = lambda: (on_the_line.append("request"), next(faults, None))[1]
+    line._write = lambda data: (on_the_line.append("reply"), reply(data))[1]  # type: ignore[method-assign]
+    asking = asyncio.create_task(station.light())
+    await asyncio.sleep(0)
+    asking.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await asking
+    assert await station.level() == 0.5
+    assert on_the_line == ["request", "reply"] * 2

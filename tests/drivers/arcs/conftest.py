@@ -11,11 +11,13 @@ import pytest
 from brushloop.drivers.arcs.controller import Controller
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.arcs.settings import ArcsTable
+from brushloop.drivers.arcs.wire import RpcConnection
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.limits import Limits
-from brushloop.drivers.sim.arcs_server import ArcsServer
+from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 from brushloop.drivers.sim.rig import HOST
 from brushloop.drivers.sim.world import SimClock, World
 from tests.simulated_time import LoopClock, MemoryLoop
@@ -125,3 +127,22 @@ async def other(cabinet: Cabinet) -> AsyncIterator[Controller]:
     await client.open()
     yield client
     await client.close()
+
+
+def cut(connection: RpcConnection) -> None:
+    """End the connection from this side, as a pulled cable does."""
+    assert connection._stream is not None
+    connection._stream[1].transport.abort()
+
+
+def mute(server: ArcsServer | RtdeServer) -> None:
+    """Requests are neither carried out nor answered; nothing is pushed."""
+    if isinstance(server, RtdeServer):
+        server.faults.hang(Fault(device=Device.TELEMETRY, kind="mute", count=ALWAYS))
+    else:
+        server.faults.hang(Fault(device=Device.ROBOT, kind="deaf", count=ALWAYS))
+
+
+def mute_to(server: ArcsServer, method: str) -> None:
+    """Requests of this method are carried out, but never answered."""
+    server.faults.hang(Fault(device=Device.ROBOT, kind="mute", on=method, count=ALWAYS))

@@ -20,8 +20,7 @@ from brushloop.drivers.errors import (
     RobotNotSafe,
 )
 from brushloop.drivers.geometry import brush_pose, distance
-from tests.drivers.arcs.conftest import LIMITS, Cabinet
-from tests.drivers.failing import cut
+from tests.drivers.arcs.conftest import LIMITS, Cabinet, cut
 
 WAY = {"speed_mm_s": 40.0, "acc_mm_s2": 800.0}
 SLOW = {**WAY, "speed_mm_s": 3.0}

@@ -23,8 +23,7 @@ from brushloop.drivers.errors import (
 )
 from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
-from tests.drivers.arcs.conftest import Cabinet, MakeArm, enabled
-from tests.drivers.failing import cut, mute
+from tests.drivers.arcs.conftest import Cabinet, MakeArm, cut, enabled, mute
 
 X_MM, Y_MM = 250.0, -230.0
 HOME, TOP, DEEP = (brush_pose(X_MM, Y_MM, z_mm) for z_mm in (260.0, 300.0, 200.0))

@@ -24,8 +24,7 @@ from brushloop.drivers.errors import (
 )
 from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.sim.faults import ALWAYS, Fault
-from tests.drivers.arcs.conftest import NEAR, QUICK, Cabinet, MakeArm
-from tests.drivers.failing import mute_to
+from tests.drivers.arcs.conftest import NEAR, QUICK, Cabinet, MakeArm, mute_to
 from tests.waiting import until
 
 FAR = brush_pose(250.0, -30.0, 260.0)  # 200 mm from home: two seconds of the fast clock

@@ -19,9 +19,8 @@ from brushloop.drivers.arcs.wire import RpcConnection, answer_in
 from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation
 from brushloop.drivers.sim.faults import Device, Fault
 from brushloop.drivers.sim.rig import HOST
-from tests.drivers.arcs.conftest import Cabinet
+from tests.drivers.arcs.conftest import Cabinet, mute_to
 from tests.drivers.arcs.transcript import Archive, Replayed
-from tests.drivers.failing import mute_to
 
 REPORTS = sorted((Path(__file__).parent / "reports").glob("*.zip"))
 MODE, SAFETY = "rob1.RobotState.getRobotModeType", "rob1.RobotState.getSafetyModeType"

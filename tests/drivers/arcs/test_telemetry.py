@@ -21,8 +21,8 @@ from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.sim.arcs_server import RtdeServer, topic_of
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 from brushloop.drivers.sim.rig import HOST
-from tests.drivers.arcs.conftest import NEAR, QUICK, Cabinet, MakeArm
-from tests.drivers.failing import SetClock, mute
+from tests.drivers.arcs.conftest import NEAR, QUICK, Cabinet, MakeArm, mute
+from tests.simulated_time import SimulatedTime
 from tests.waiting import until
 
 GREETING = b'{"protocol":"rtde","version":1,"output":{"R1_actual_TCP_pose":1021,"R1_actual_q":1006}}\n\n'
@@ -249,7 +249,7 @@ def lag_ms(
 
     `shown` is the path of the poses that arrive, if it is another one.
     """
-    clock, rng = SetClock(), random.Random(7)
+    clock, rng = SimulatedTime(), random.Random(7)
     meter = LagMeter(clock)
     for tick in range(round((4.0 + lag_s) * 100)):
         t_s = 0.01 * tick
@@ -257,7 +257,7 @@ def lag_ms(
             meter.arrived(PoseSample(Stamp(round(1e9 * (100.0 + t_s))), (shown or path)(t_s - lag_s)))
     for tick in range(160):
         t_s = tick / 40 + rng.uniform(0.0, 0.01)
-        clock.s = 100.0 + t_s + rng.uniform(0.0, answer_s)
+        clock.now_s = 100.0 + t_s + rng.uniform(0.0, answer_s)
         meter.asked(path(t_s), answer_s)
     return meter.lag_ms()
 
