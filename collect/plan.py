@@ -15,7 +15,7 @@ from brushloop.calibrate.report import picture_grid, printable
 from brushloop.collect.motion import Move, Region, park_move
 from brushloop.collect.motion import Path as MotionPath
 from brushloop.collect.protocols.config import ProtocolConfig
-from brushloop.collect.protocols.steps import Drawn, DrawStep, PressStep
+from brushloop.collect.protocols.steps import Drawn, PressStep
 from brushloop.collect.rig.check import BLUE, GREY, ORANGE, Axes, finish, from_above, outline
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import limits_of
@@ -102,7 +102,7 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
         took_s, here = step_s(config, here, moves)
         seconds[kind] = seconds.get(kind, 0.0) + took_s
         dips += moves.dips
-        if isinstance(step, PressStep | DrawStep):
+        if isinstance(step, PressStep):
             if placed and walked.sheet != sheets:
                 changes.append(step.press.stroke_id)
             sheets = walked.sheet

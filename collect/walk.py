@@ -35,7 +35,6 @@ from brushloop.collect.protocols.steps import (
     CaptureStep,
     DipStep,
     Drawn,
-    DrawStep,
     Planned,
     PressStep,
     ReviewStep,
@@ -55,7 +54,7 @@ from brushloop.drivers.arcs.wire import numbers
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import LimitExceeded, ProtocolViolation
 from brushloop.drivers.geometry import from_wire, inverse, product, to_wire, turned
-from brushloop.sessions.events import PressResult, StepKind, StepResult
+from brushloop.sessions.events import PressResult, StepResult
 from brushloop.sessions.records import Condition
 
 
@@ -100,8 +99,10 @@ def moves_of(
             return StepMoves(photograph_moves(config), captures=1)
         case CaptureStep():
             return StepMoves([*photograph_moves(config), inking_moves(config, dips)[0]], captures=1)
-        case PressStep(press=press, dwell_s=dwell_s):
+        case PressStep(press=press, dwell_s=dwell_s, drawn=drawn):
             [patch] = patches
+            if drawn is not None:
+                return _figure(config, plane, drawn, patch, dips)
             before, pressing = press_moves(config, plane, patch, press.condition, dwell_s)
             return StepMoves([*before, *pressing])
         case SelfCheckStep():
@@ -111,9 +112,6 @@ def moves_of(
                 for move in (*inking_moves(config, dips + number), *mark_moves(config, plane, *place_mm))
             ]
             return StepMoves([*photograph_moves(config), *moves, *photograph_moves(config)], dips=3, captures=2)
-        case DrawStep(drawn=drawn):
-            [patch] = patches
-            return _figure(config, plane, drawn, patch, dips)
 
 
 def touch_of(config: RigConfig, step: ZeroTouchStep) -> TouchConfig:
@@ -176,10 +174,9 @@ def sheet_of(config: RigConfig, protocol: ProtocolConfig) -> Sheet:
 
 def as_planned(step: Step, sheet: int, patch: int) -> StepResult | None:
     """The result of a step that makes its press there, as commanded; None for a step that makes none."""
-    if not isinstance(step, PressStep | DrawStep):
+    if not isinstance(step, PressStep):
         return None
-    kind = StepKind.PRESS if isinstance(step, PressStep) else StepKind.DRAW
-    return PressResult(kind=kind, press=step.press.model_copy(update={"sheet": sheet, "patch": patch}))
+    return PressResult(press=step.press.model_copy(update={"sheet": sheet, "patch": patch}))
 
 
 def patches_of(step: Step, sheet: Sheet, used: set[int], number: int) -> tuple[Patch, ...]:
@@ -302,10 +299,8 @@ def step_poses(rig: RigConfig, plane: PaperPlane, step: Step, patches: Sequence[
 def _moved(step: Step) -> object:
     """What the moves of a step depend on, beside its kind: steps alike in this are checked once."""
     match step:
-        case PressStep(press=press):
-            return press.condition
-        case DrawStep(drawn=drawn):
-            return repr(drawn)
+        case PressStep(press=press, drawn=drawn):
+            return press.condition if drawn is None else repr(drawn)
         case CaptureStep():
             return None
         case _:

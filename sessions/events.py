@@ -25,8 +25,7 @@ class StepKind(StrEnum):
     ZERO_TOUCH = "zero_touch"
     BOARD = "board"
     DIP = "dip"
-    PRESS = "press"
-    DRAW = "draw"  # a figure: all strokes of one character on one patch; if interrupted, all of it is done again
+    PRESS = "press"  # once, or all strokes of a figure
     CAPTURE = "capture"
     REVIEW = "review"  # read which captures a person has marked bad; nothing moves
     SELF_CHECK = "self_check"  # press an uneven triangle of marks, which shows a mirrored, turned or stretched rig
@@ -131,7 +130,7 @@ class DipResult(Value):
 class PressResult(Value):
     """A press that was made, or a figure that was drawn."""
 
-    kind: Literal[StepKind.PRESS, StepKind.DRAW] = StepKind.PRESS
+    kind: Literal[StepKind.PRESS] = StepKind.PRESS
     press: Press
     peak_force_n: Number | None = None
     depths_mm: tuple[Number, ...] = ()

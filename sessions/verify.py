@@ -35,7 +35,7 @@ from brushloop.sessions.records import HEADER_FILE, Stroke, Topic
 from brushloop.sessions.store import closed
 from brushloop.sessions.terminal import Progress, counted, unseen
 
-MARKING = (StepKind.PRESS, StepKind.DRAW, StepKind.SELF_CHECK)
+MARKING = (StepKind.PRESS, StepKind.SELF_CHECK)
 """Kinds of steps that use patches."""
 UNKNOWN_PATCH = "does not say which patch it pressed, on which sheet"
 

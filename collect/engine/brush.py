@@ -9,14 +9,14 @@ from brushloop.collect.engine.recorder import StepContext, within_limits
 from brushloop.collect.errors import StepError
 from brushloop.collect.motion import TOUCH_TOLERANCE_MM
 from brushloop.collect.operator import Choice, Prompt
-from brushloop.collect.protocols.steps import DrawStep, PressStep, ZeroTouchStep
+from brushloop.collect.protocols.steps import PressStep, ZeroTouchStep
 from brushloop.collect.touch.force import ForceTap
 from brushloop.collect.touch.heights import plane_of
 from brushloop.collect.touch.measure import measure_plane
 from brushloop.collect.touch.selfcheck import self_check, triangle_on
 from brushloop.collect.walk import all_poses, step_poses, touch_of
 from brushloop.drivers.devices import PoseSample
-from brushloop.sessions.events import DipResult, PressResult, SelfCheckResult, StepKind, ZeroTouchResult
+from brushloop.sessions.events import DipResult, PressResult, SelfCheckResult, ZeroTouchResult
 from brushloop.sessions.records import InkState, Topic
 
 STALE_INK_S = 5.0
@@ -43,9 +43,9 @@ async def fill_brush(context: StepContext) -> InkState | None:
     return state
 
 
-async def mark(context: StepContext, step: PressStep | DrawStep) -> PressResult:
-    """The PRESS step, or the DRAW step: every stroke of a figure, with a dip before each."""
-    run, [patch] = context.run, context.patches
+async def mark(context: StepContext, step: PressStep) -> PressResult:
+    """The PRESS step: one press, or every stroke of a figure, with a dip before each."""
+    run, [patch], drawn = context.run, context.patches, step.drawn
     procedures, paper = run.procedures, run.rig.config.paper
     left_ns: int | None = None
     waits_s: list[float] = []
@@ -65,14 +65,14 @@ async def mark(context: StepContext, step: PressStep | DrawStep) -> PressResult:
         context.recorder.log("dip again before the press")
         await fill_brush(context)
     context.recorder.listeners.append(touched)
-    for number in range(len(step.drawn.strokes) if isinstance(step, DrawStep) else 1):
+    for number in range(1 if drawn is None else len(drawn.strokes)):
         if number > 0:
             await fill_brush(context)
         left_ns = run.left_ink_ns
-        if isinstance(step, DrawStep):
-            stroke = procedures.stroke(patch, step.drawn, number)
-        else:
+        if drawn is None:
             stroke = procedures.press(patch, step.press.condition, step.dwell_s)
+        else:
+            stroke = procedures.stroke(patch, drawn, number)
         depths_mm.append(await context.guard.guarded(stroke))
         peaks_n.append(context.guard.peak_n)
     made = {
@@ -82,10 +82,9 @@ async def mark(context: StepContext, step: PressStep | DrawStep) -> PressResult:
         "dip_to_touch_s": round(max(waits_s), 3) if waits_s else None,
     }
     return PressResult(
-        kind=StepKind.DRAW if isinstance(step, DrawStep) else StepKind.PRESS,
         press=step.press.model_copy(update=made),
         peak_force_n=None if run.rig.force is None else max(peaks_n),
-        depths_mm=tuple(depths_mm) if isinstance(step, DrawStep) else (),
+        depths_mm=() if drawn is None else tuple(depths_mm),
     )
 
 

@@ -63,9 +63,9 @@ def decide(step: Step, error: StepError | DeviceError, failures: int) -> Action:
         case _, ArmMoved() | SettingsChanged() | NotPowered() | PathDisturbed():
             return Action.ASK
         # If the arm was stopped because the sensor fell silent, and it still is, the next press fails at once.
-        case StepKind.PRESS | StepKind.DRAW, StepVoid() | DeviceTimeout(device="force"):
+        case StepKind.PRESS, StepVoid() | DeviceTimeout(device="force"):
             return again
-        case StepKind.PRESS | StepKind.DRAW | StepKind.SELF_CHECK, BadPicture():
+        case StepKind.PRESS | StepKind.SELF_CHECK, BadPicture():
             return Action.ASK  # another try would use up another patch
         case _, BadPicture():
             return again

@@ -287,7 +287,7 @@ class Run(RunContext):
                 return await capture.board(context)
             case steps.DipStep():
                 return await brush.dip(context)
-            case steps.PressStep() | steps.DrawStep():
+            case steps.PressStep():
                 return await brush.mark(context, step)
             case steps.CaptureStep():
                 return await capture.capture(context, step)

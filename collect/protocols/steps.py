@@ -97,7 +97,7 @@ class DipStep(StepBase):
 
 @dataclass(frozen=True, slots=True)
 class PressStep(StepBase):
-    """Press once, on the next free patch."""
+    """Press once, or draw a figure, on the next free patch. If it is cut short, all of it is done again."""
 
     kind: ClassVar[StepKind] = StepKind.PRESS
     press: Press
@@ -105,15 +105,8 @@ class PressStep(StepBase):
     """Time at full depth."""
     again_of: str | None = None
     """The stroke of another session that this one repeats."""
-
-
-@dataclass(frozen=True, slots=True)
-class DrawStep(StepBase):
-    """Draw a figure on the next free patch."""
-
-    kind: ClassVar[StepKind] = StepKind.DRAW
-    press: Press
-    drawn: Drawn
+    drawn: Drawn | None = None
+    """The figure; None for a press."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,9 +127,9 @@ class ReviewStep(StepBase):
     kind: ClassVar[StepKind] = StepKind.REVIEW
 
 
-Step = ZeroTouchStep | BoardStep | SelfCheckStep | DipStep | PressStep | DrawStep | CaptureStep | ReviewStep
+Step = ZeroTouchStep | BoardStep | SelfCheckStep | DipStep | PressStep | CaptureStep | ReviewStep
 _ADAPTERS = {step.kind: TypeAdapter[Any](step) for step in get_args(Step)}
-MARKING = frozenset({StepKind.PRESS, StepKind.DRAW, StepKind.SELF_CHECK})
+MARKING = frozenset({StepKind.PRESS, StepKind.SELF_CHECK})
 """Steps that leave ink on a paper patch of their own."""
 
 Protocol = Generator[Step, StepResult | None, None]
@@ -146,7 +139,7 @@ planned and has nothing to tell."""
 
 def press_of(step: Step) -> Press | None:
     """The press that a step makes or photographs; None for the other kinds."""
-    return step.press if isinstance(step, PressStep | DrawStep | CaptureStep) else None
+    return step.press if isinstance(step, PressStep | CaptureStep) else None
 
 
 AGAIN = "-again"
@@ -185,15 +178,13 @@ def with_review(plan: Iterable[Planned], reviewed: ReviewResult) -> list[Planned
 
 
 def takes(stroke: Planned) -> Protocol:
-    """Steps of one stroke: dip, press or draw, capture; repeated while the capture asks for a retake."""
+    """Steps of one stroke: dip, press, capture; repeated while the capture asks for a retake."""
     index, drawn, again_of = stroke.index, stroke.drawn, stroke.again_of
     for take in itertools.count(1):
         dipped = yield DipStep(index, take)
         if isinstance(dipped, DipResult) and dipped.skipped is not None:
             break
-        press = stroke.press(take)
-        step = PressStep(index, press, stroke.dwell_s, again_of) if drawn is None else DrawStep(index, press, drawn)
-        marked = yield step
+        marked = yield PressStep(index, stroke.press(take), stroke.dwell_s, again_of, drawn)
         assert isinstance(marked, PressResult)
         seen = yield CaptureStep(index, marked.press, again_of, drawn is not None)
         if not (isinstance(seen, CaptureResult) and seen.retake):

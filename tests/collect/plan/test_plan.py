@@ -16,7 +16,7 @@ from brushloop.collect.motion import Path as MotionPath
 from brushloop.collect.motion import Procedures, inking_moves, stroke_moves
 from brushloop.collect.plan import make_plan, path_s
 from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
-from brushloop.collect.protocols.steps import MARKING, Drawn, DrawStep, Step, StepKind
+from brushloop.collect.protocols.steps import MARKING, Drawn, PressStep, Step, StepKind
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.rig.devices import Rig, limits_of
 from brushloop.collect.rig.paper import PaperPlane, Sheet
@@ -129,14 +129,15 @@ def test_a_sheet_that_leans_is_checked_as_it_lies(tmp_path: Path, config: RigCon
 
 def test_a_drawn_stroke_goes_through_its_points_at_its_depths(config: RigConfig) -> None:
     wanted = example("protocol-write.toml")
-    draw, again = [w for w in walk(config, wanted) if w.step.kind == StepKind.DRAW]
-    assert isinstance(draw.step, DrawStep)
-    assert isinstance(again.step, DrawStep)
+    draw, again = [w for w in walk(config, wanted) if isinstance(w.step, PressStep)]
+    assert isinstance(draw.step, PressStep)
+    assert isinstance(again.step, PressStep)
     assert (draw.step.press.stroke_id, again.step.press.stroke_id) == ("shi-r01", "shi-r02")
     assert draw.step.press.condition.depth_mm == 9.0, "the deepest of its points"
     moves = moves_of(config, PaperPlane(config.paper.touch_z_mm), draw.step, draw.patches)
     ways = [part for part in moves.segments if isinstance(part, MotionPath)]
     drawn = draw.step.drawn
+    assert drawn is not None
     assert [len(way.poses) for way in ways] == [len(stroke) - 1 for stroke in drawn.strokes]
     patch = sheet_of(config, wanted).patch(0)
     # paper x is base y, paper y is base -x
@@ -238,7 +239,8 @@ PLANE = PaperPlane(120.0)
 
 
 def first_drawn(config: RigConfig) -> Drawn:
-    return next(w.step.drawn for w in walk(config, example("protocol-write.toml")) if isinstance(w.step, DrawStep))
+    steps = (walked.step for walked in walk(config, example("protocol-write.toml")))
+    return next(step.drawn for step in steps if isinstance(step, PressStep) and step.drawn is not None)
 
 
 def test_a_stroke_may_come_down_on_its_way(config: RigConfig) -> None:
