@@ -11,7 +11,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from brushloop.calibrate.board.detect import find_board
 from brushloop.calibrate.board.lens import GOOD_VIEWS, fit_lens, guidance, held, nominal_normals
@@ -21,14 +20,13 @@ from brushloop.calibrate.files import read_gray
 from brushloop.collect.commission.visit import NO, YES, Notebook, Step, Taught, Visit, choice_of, line_of, number_of
 from brushloop.collect.errors import NotAccepted
 from brushloop.collect.operator import Prompt
-from brushloop.collect.photograph.frames import gray
+from brushloop.collect.photograph.frames import Gray
 from brushloop.collect.rig.devices import identified
 from brushloop.drivers.camera import CameraTable, Locked, OpenCvCamera, found_settings
 from brushloop.drivers.devices import Stamp
 from brushloop.drivers.errors import DeviceError
 from brushloop.drivers.host import Clock, alongside
 
-Gray = NDArray[np.uint8]
 LATE_MS = 2500.0
 """Until the delay is measured, a picture counts as taken this long before it came: no useful camera is slower."""
 SETTLE_S, LIVE_S = 2.0, 0.3
@@ -232,8 +230,8 @@ def taught_camera(visit: Visit) -> AbstractAsyncContextManager[OpenCvCamera]:
 
 
 async def still(camera: OpenCvCamera, clock: Clock) -> Gray:
-    """A gray picture that was taken after now, however late the camera is."""
-    return gray((await camera.fresh(Stamp(clock.now_ns()))).image)
+    """A picture that was taken after now, however late the camera is."""
+    return (await camera.fresh(Stamp(clock.now_ns()))).image
 
 
 @contextlib.asynccontextmanager
@@ -246,7 +244,7 @@ async def shown_live(visit: Visit, camera: OpenCvCamera) -> AsyncGenerator[None]
             while True:
                 frame = await camera.fresh(after)
                 after = Stamp(frame.exposed_after_ns + 1)
-                visit.live = gray(frame.image)
+                visit.live = frame.image
                 await asyncio.sleep(LIVE_S)
 
     try:

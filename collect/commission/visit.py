@@ -208,7 +208,7 @@ def toml_value(value: Value) -> str:
 
 
 Picture = NDArray[np.uint8]
-"""(h, w) gray or (h, w, 3) BGR."""
+"""(h, w) gray."""
 ARM = Choice("a", "let it move: I look at the cell, my hand is at the emergency stop")
 STAY = Choice("x", "leave it where it is")
 YES, NO = Choice("y", "yes"), Choice("n", "no")

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from brushloop.collect.engine.snapshot import Picture
 from brushloop.collect.errors import ConfigError
-from brushloop.collect.photograph.frames import gray
 from brushloop.collect.photograph.measure import blur_px, busiest_tile
 from brushloop.drivers.devices import Camera, Frame, Stamp
 from brushloop.drivers.errors import DeviceError
@@ -59,8 +58,7 @@ def _no_wider(image: NDArray[np.uint8], width_px: int) -> NDArray[np.uint8]:
 
 def picture_of(frame: Frame) -> Picture:
     """What a screen shows of a frame of the camera."""
-    image = gray(frame.image)
-    return Picture(_no_wider(image, WIDTH_PX), blur_px(busiest_tile(image)))
+    return Picture(_no_wider(frame.image, WIDTH_PX), blur_px(busiest_tile(frame.image)))
 
 
 HOST = "127.0.0.1"

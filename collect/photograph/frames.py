@@ -1,4 +1,4 @@
-"""Photographs without colour and distortion; the camera's frames, each compared with the view without the arm."""
+"""Photographs without distortion; the camera's frames, each compared with the view without the arm."""
 
 from __future__ import annotations
 
@@ -24,21 +24,15 @@ CHANGED_LEVELS = 25.0
 """Difference in gray levels, corrected for the light, from which on a pixel counts as changed."""
 
 
-def gray(image: NDArray[np.uint8]) -> Gray:
-    """(h, w) of an (h, w) or (h, w, 3) BGR image."""
-    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
-
-
-def undistorted(camera: CameraConfig, photograph: NDArray[np.uint8]) -> Gray:
-    """An (h, w) or (h, w, 3) BGR photograph in gray, without the lens distortion that recordings keep.
+def undistorted(camera: CameraConfig, image: Gray) -> Gray:
+    """An (h, w) photograph without the lens distortion that recordings keep.
 
     Raises `StepError` if photographs no longer have the size at which the lens was calibrated.
     """
-    image = gray(photograph)
     lens = camera.optics
     if lens is None:
         return image
-    height, width = image.shape[:2]
+    height, width = image.shape
     if (width, height) != lens.size_px:
         raise StepError(
             f"the camera gives {width} x {height} px, its lens was calibrated at {lens.size_px[0]} x {lens.size_px[1]} "
@@ -47,11 +41,11 @@ def undistorted(camera: CameraConfig, photograph: NDArray[np.uint8]) -> Gray:
     return lens.undistort(image)
 
 
-def thumbnail(image: NDArray[np.uint8]) -> Thumbnail:
-    """(h, 160) gray levels of an (h, w) or (h, w, 3) BGR frame."""
-    height, width = image.shape[:2]
+def thumbnail(image: Gray) -> Thumbnail:
+    """(h, 160) gray levels of an (h, w) frame."""
+    height, width = image.shape
     size = (WIDTH_PX, max(1, round(height * WIDTH_PX / width)))
-    return gray(np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)).astype(np.float32)
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
 def changed_share(now: Thumbnail, before: Thumbnail) -> float:

@@ -25,7 +25,6 @@ from brushloop.collect.commission.visit import LeftOff, Tone, Visit, WentBack
 from brushloop.collect.engine.snapshot import REFRESH_S
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.operator import Prompt, stop_signals
-from brushloop.collect.photograph.frames import gray
 from brushloop.collect.tui.pictures import picture_widget
 from brushloop.collect.tui.terminal import PlainApp
 from brushloop.collect.tui.widgets import (
@@ -178,8 +177,7 @@ Page up and down turn the pages of what was found.
         """Draw what differs; `over`: the steps are done."""
         visit, prompt = self._visit, self._visit.asker.prompt
         self._title.show(f"First day   {one_line(str(visit.rig_path))}   {plain(visit.step)}")
-        picture = visit.picture if visit.live is None else visit.live
-        self._picture.show(None if picture is None else gray(picture))
+        self._picture.show(visit.picture if visit.live is None else visit.live)
         self._found.show(Content("\n").join(_finding(*finding) for finding in tuple(visit.findings)))
         if prompt is not self.prompt or over != self._over:
             self._over = over
