@@ -136,7 +136,7 @@ def compare(request: CompareLoopRequest, progress: Progress = unseen) -> Written
         raise CalibrationError(where, f"is {source}, the original {first.header.source}")
     repeated = _replayed(second.header)
     if repeated != first.header.session_id:
-        what = "is not a replay" if repeated is None else f"repeats {repeated}"
+        what = "repeats no session" if repeated is None else f"repeats {repeated}"
         raise CalibrationError(where, f"{what}, not {first.header.session_id}")
     model, fit = BrushFit.model_of(request.fit, first.header)
     refused: list[Refused] = []
@@ -218,10 +218,10 @@ def statistics_of(scores: Scores) -> Iterator[Stat]:
 
 
 def _replayed(header: Header) -> str | None:
-    """The session that a replay protocol repeats; None for any other."""
+    """The session whose presses the protocol repeats; None where it repeats none."""
     try:
-        protocol: Any = json.loads(header.protocol)
-        return str(protocol["of"]) if protocol["kind"] == "replay" else None
+        of: Any = json.loads(header.protocol)["of"]
+        return None if of is None else str(of)
     except (ValueError, KeyError, TypeError, RecursionError):
         return None
 

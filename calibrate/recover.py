@@ -158,14 +158,18 @@ def recover(request: RecoverRequest, progress: Progress = unseen) -> Recovered:
 def _protocol(recovered: Recovered, request: RecoverRequest) -> str:
     """The protocol that presses each recovered stroke, in an order drawn with `seed`."""
     header = recovered.session.header
+    presses = "".join(
+        f"    {{stroke_id = {json.dumps(row.stroke_id, ensure_ascii=False)}, depth_mm = {row.depth_mm:.3f}, "
+        f"tilt_deg = {row.tilt_deg:.3f}}},\n"
+        for row in recovered.rows
+    )
     return (
         f"# Recovered by {recovered.model} from {header.session_id} ({header.source}), "
         f"recording sha256 {recovered.session.sha256}.\n"
-        'kind = "replay"\n'
+        'kind = "list"\n'
         f"of = {json.dumps(header.session_id, ensure_ascii=False)}\n"
-        f"file = {json.dumps(recovered.out.name, ensure_ascii=False)}\n"
-        "repeats = 1\n"
         f"seed = {request.seed}\n"
+        f"presses = [\n{presses}]\n"
     )
 
 

@@ -16,20 +16,13 @@ from typing import Annotated, TypeVar
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from brushloop.collect.errors import ConfigError
-from brushloop.collect.protocols.kinds import (
-    MAX_STROKES,
-    FewStrokesConfig,
-    GridConfig,
-    ListConfig,
-    ReplayConfig,
-    WriteConfig,
-)
+from brushloop.collect.protocols.kinds import MAX_STROKES, FewStrokesConfig, GridConfig, ListConfig, WriteConfig
 from brushloop.collect.rig.config_file import read_text, read_toml, refusal
 from brushloop.sessions.disk import MAX_SNAPSHOT_BYTES, as_text, number
 
 MAX_PROTOCOL_BYTES = 4 * 1024 * 1024
 MAX_TABLE_BYTES = 4 * 1024 * 1024
-ProtocolConfig = GridConfig | FewStrokesConfig | ListConfig | ReplayConfig | WriteConfig
+ProtocolConfig = GridConfig | FewStrokesConfig | ListConfig | WriteConfig
 TaggedProtocol = Annotated[ProtocolConfig, Field(discriminator="kind")]
 _PROTOCOL: TypeAdapter[ProtocolConfig] = TypeAdapter(TaggedProtocol)
 _R = TypeVar("_R", bound=BaseModel)

@@ -1,4 +1,4 @@
-"""The kinds of protocol: `grid`, `few-strokes`, `list` and `replay` press; `write` draws.
+"""The kinds of protocol: `grid`, `few-strokes` and `list` press; `write` draws.
 
 A kind with rounds says what one round presses or draws; `RoundsConfig` makes the order of all rounds.
 """
@@ -11,9 +11,9 @@ import random
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Annotated, ClassVar, Literal, Self, TypeVar, cast
+from typing import Annotated, Literal, Self, TypeVar, cast
 
-from pydantic import AfterValidator, AliasChoices, BaseModel, ConfigDict, Field, ValidationInfo, model_validator
+from pydantic import AfterValidator, AliasChoices, BaseModel, Field, ValidationInfo, model_validator
 
 from brushloop.collect.protocols.steps import (
     BoardStep,
@@ -218,88 +218,51 @@ class PressRow(Config):
     """If left out, it is made from the row's number, H and alpha."""
 
 
-class _TableConfig(RoundsConfig):
-    """Presses one by one, from a CSV next to `protocol.toml` or written out in it as `presses`."""
+class ListConfig(RoundsConfig):
+    """Presses one by one, from a CSV next to `protocol.toml` or written out in it as `presses`.
 
-    row: ClassVar[type[BaseModel]]
-    """Model of one press."""
+    The CSV has a column `depth_mm` and optionally `tilt_deg`, `dwell_s` and `stroke_id`.
+    """
 
+    kind: Literal["list"]
     file: FileName | None = None
     """CSV with a column for each field of a press."""
     dwell_s: DwellS = 0.2
     """Time at full depth of presses that have no `dwell_s` of their own."""
+    of: StrokeId | None = None
+    """Id of the session whose presses these repeat, under the ids that they had there, to compare mark with mark."""
+    presses: Annotated[tuple[PressRow, ...], Field(min_length=1, max_length=MAX_STROKES)]
+    """The presses. Read from `file` where one is named."""
 
     @model_validator(mode="before")
     @classmethod
     def _from_file(cls, values: object, info: ValidationInfo) -> object:
-        return _with_rows(values, info, "presses", cls.row)
+        return _with_rows(values, info, "presses", PressRow)
 
-
-class ListConfig(_TableConfig):
-    """Presses one by one. The CSV has a column `depth_mm` and optionally `tilt_deg`, `dwell_s` and `stroke_id`."""
-
-    row = PressRow
-
-    kind: Literal["list"]
-    presses: Annotated[tuple[PressRow, ...], Field(min_length=1, max_length=MAX_STROKES)]
-    """The presses. Read from `file` where one is named."""
+    @model_validator(mode="after")
+    def _named(self) -> Self:
+        if self.of is not None and any(row.stroke_id is None for row in self.presses):
+            raise ValueError(f"presses: every press that repeats one of {self.of} needs its stroke_id")
+        return self
 
     def round(self, repeat: int) -> list[Planned]:
         """The presses of round `repeat`, counted from 1.
 
         A press without an id is named after its number in the list, H and alpha, as `003-H15-a5-r01`. A given id gets
-        `-r02` and so on from the second round on.
+        `-r02` and so on from the second round on. `H13-a5-r02` of another session is `H13-a5-r02~1`, then `~2`: an id
+        may hold a `~` but not begin with one, so everything before the last `~` is the original's id.
         """
         ending, strokes = f"-r{repeat:02d}", list[Planned]()
         for number, row in enumerate(self.presses, 1):
             name = f"{number:03d}-H{row.depth_mm:g}-a{row.tilt_deg:g}{ending}"
             if row.stroke_id is not None:
                 name = row.stroke_id + (ending if repeat > 1 else "")
+            again_of = None if self.of is None else row.stroke_id
+            if again_of is not None:
+                name = f"{again_of}~{repeat}"
             dwell_s = self.dwell_s if row.dwell_s is None else row.dwell_s
-            strokes.append(Planned(name, Condition(row.depth_mm, row.tilt_deg), dwell_s=dwell_s))
+            strokes.append(Planned(name, Condition(row.depth_mm, row.tilt_deg), dwell_s=dwell_s, again_of=again_of))
         return strokes
-
-
-class ReplayRow(Config):
-    """One stroke as an inversion recovered it; other columns of the CSV are ignored."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-    stroke_id: StrokeId
-    """Its id in the original session."""
-    depth_mm: DeepMm = Field(validation_alias=EARLIER_DEPTH)
-    tilt_deg: TiltDeg
-
-
-class ReplayConfig(_TableConfig):
-    """Press again what an inversion recovered from the images of an earlier session, to compare mark with mark.
-
-    The CSV has the columns `stroke_id`, `depth_mm` and `tilt_deg`.
-    """
-
-    row = ReplayRow
-
-    kind: Literal["replay"]
-    of: StrokeId
-    """Id of the session that the strokes are from."""
-    presses: Annotated[tuple[ReplayRow, ...], Field(min_length=1, max_length=MAX_STROKES)]
-    """The presses, under the ids that the strokes had. Read from `file` where one is named."""
-
-    def round(self, repeat: int) -> list[Planned]:
-        """The presses of round `repeat`: `H13-a5-r02` pressed again is `H13-a5-r02~1`, then `~2` and so on.
-
-        An id may hold a `~` but not begin with one: everything before the last `~` is the original's id, which is also
-        `again_of` in the step's parameters.
-        """
-        return [
-            Planned(
-                f"{row.stroke_id}~{repeat}",
-                Condition(row.depth_mm, row.tilt_deg),
-                dwell_s=self.dwell_s,
-                again_of=row.stroke_id,
-            )
-            for row in self.presses
-        ]
 
 
 # Figures

@@ -27,7 +27,7 @@ from brushloop.calibrate.recover import (
     with_model_error,
 )
 from brushloop.collect.protocols.config import load_protocol
-from brushloop.collect.protocols.kinds import ReplayConfig
+from brushloop.collect.protocols.kinds import ListConfig
 from brushloop.model.ccdbsm import Brush, ccdbsm
 from brushloop.model.raster import coverage
 from brushloop.sessions.records import Condition
@@ -68,7 +68,7 @@ def test_a_session_is_inverted_and_can_be_replayed(tmp_path: Path) -> None:
     assert "3 of 3 intervals (95 %) hold the command" in words
     assert "warning: the intervals of 3 presses leave out the error of the model" in words
     protocol = load_protocol(out.with_name(PROTOCOL))
-    assert isinstance(protocol, ReplayConfig)
+    assert isinstance(protocol, ListConfig)
     assert protocol.of == "shots"
     assert [press.stroke_id for press in protocol.presses] == ["p0", "p1", "p2"]
     with out.open() as file:

@@ -89,7 +89,7 @@ SOFT = "max_depth_mm = 22.0", "max_depth_mm = 9.5"
 FAR_POT = MOTION, "\n[ink.wash]\npot_mm = [360.0, 20.0]\ndip_z_mm = 125.0\nevery_dips = 2\n" + MOTION
 NARROWER = "y_mm = [-260.0, 260.0]", "y_mm = [-260.0, 240.0]"
 LISTED = 'kind = "list"\npresses = [{depth_mm = 9.0}]\n'
-REPLAYED = 'kind = "replay"\nof = "s"\npresses = [{stroke_id = "b", depth_mm = 23.0, tilt_deg = 1.0}]\n'
+REPLAYED = 'kind = "list"\nof = "s"\npresses = [{stroke_id = "b", depth_mm = 23.0, tilt_deg = 1.0}]\n'
 
 
 @pytest.mark.parametrize(

@@ -23,8 +23,6 @@ from brushloop.collect.protocols.kinds import (
     GridConfig,
     ListConfig,
     PressRow,
-    ReplayConfig,
-    ReplayRow,
     WriteConfig,
 )
 from brushloop.collect.protocols.steps import (
@@ -71,9 +69,7 @@ protocols: st.SearchStrategy[ProtocolConfig] = st.one_of(
         board_every=st.none() | st.integers(1, 9),
     ),
     several(ListConfig, "list", presses=some(PressRow, depth_mm=heights, tilt_deg=tilts)),
-    several(
-        ReplayConfig, "replay", of=names, presses=some(ReplayRow, stroke_id=names, depth_mm=heights, tilt_deg=tilts)
-    ),
+    several(ListConfig, "list", of=names, presses=some(PressRow, stroke_id=names, depth_mm=heights, tilt_deg=tilts)),
     several(
         WriteConfig,
         "write",
@@ -192,7 +188,7 @@ def test_the_first_four_presses_are_the_corners_of_the_grid_and_more_continue_th
 
 GRID_FILE = 'kind = "grid"\ndepths_mm = [11.0]\ntilts_deg = [0.0]\n'
 LIST = 'kind = "list"\nfile = "p.csv"\n'
-REPLAY = 'kind = "replay"\nof = "old"\nfile = "p.csv"\n'
+REPLAY = 'kind = "list"\nof = "old"\nfile = "p.csv"\n'
 WRITE = 'kind = "write"\ncell_mm = [60.0, 60.0]\n[[figures]]\nname = "a"\n[[figures.strokes]]\n'
 POINTS = "points = [[10.0, 10.0, 5.0, 0.0, 0.0], [20.0, 10.0, 5.0, 0.0, 0.0]]\n"
 
@@ -229,7 +225,7 @@ def load(folder: Path, protocol: str, csv: str | bytes | None = None):
         (LIST.replace('"p.csv"', "3"), None, r"file: must be the plain name"),
         (LIST + "presses = []\n", "depth_mm\n11\n", r"presses: a file is named too"),
         ('kind = "list"\n', None, r"protocol.toml: presses: Field required"),
-        (REPLAY, "stroke_id,depth_mm\na,11\n", r"line 2: tilt_deg: Field required"),
+        (REPLAY, "stroke_id,depth_mm\na,11\n,12\n", r"every press that repeats one of old needs its stroke_id"),
         (REPLAY.replace("old", "a b"), "stroke_id,depth_mm,tilt_deg\na,11,0\n", r"of: a name has no spaces"),
         (WRITE + 'file = "p.csv"\n' + POINTS, None, r"figures.0.strokes.0: points: a file is named too"),
         (WRITE + 'file = "p.csv"\n', "x_mm,y_mm,depth_mm\n1,1,3\n70,1,3\n", r"the point \[70, 1\] lies outside"),
@@ -239,7 +235,7 @@ def load(folder: Path, protocol: str, csv: str | bytes | None = None):
         (WRITE + POINTS.replace("20.0", "nan"), None, r"figures.0.strokes.0.points.1.0: "),
         ('kind = "write"\ncell_mm = [60.0, 60.0]\nfigures = 3\n', None, r"figures: "),
         (GRID_FILE + "board_evry = 3\n", None, r"board_evry: unknown field; did you mean board_every"),
-        ('kind = "teapot"\n', None, r"kind: 'teapot' is not one of 'grid', 'few-strokes', 'list', 'replay', 'write'$"),
+        ('kind = "teapot"\n', None, r"kind: 'teapot' is not one of 'grid', 'few-strokes', 'list', 'write'$"),
         (GRID_FILE + "hurry = 3\n", None, r"hurry: unknown field; known are board_every, .*, depths_mm, .*, kind$"),
         (GRID_FILE + "repeats = 0\n", None, r"repeats: .*1 \(given: 0\)$"),
         (GRID_FILE.replace("11.0", "11.0, 11.0"), None, r"depths_mm: 11.0 occurs twice"),
