@@ -13,7 +13,7 @@ from brushloop.collect.protocols.steps import Drawn, TrajectoryPoint
 from brushloop.collect.rig.config import RigConfig, WashConfig
 from brushloop.collect.rig.devices import Rig, limits_of
 from brushloop.collect.rig.paper import PaperPlane, Patch, to_base
-from brushloop.drivers.devices import Frame, Pose, QueuedLine
+from brushloop.drivers.devices import Pose, QueuedLine
 from brushloop.drivers.geometry import brush_pose, interpolate, lean
 from brushloop.sessions.records import Condition
 
@@ -358,7 +358,3 @@ class Procedures:
         depth_mm = -self.plane.above_mm(self._config.paper, await self.rig.robot.where())
         await self.go(path, lift, up)
         return depth_mm
-
-    async def capture(self) -> Frame:
-        """Park, and return the first frame exposed after the camera has shown the arm gone."""
-        return await self.photographer.photograph()

@@ -29,7 +29,7 @@ from brushloop.sessions.records import BareName
 from brushloop.sessions.terminal import say
 
 SETTINGS, RECOVERED, PROTOCOL, PAGE = "settings.json", "recovered.csv", "protocol-replay.toml", "loop.html"
-LEAST_HEIGHT_MM = 2.0
+LEAST_DEPTH_MM = 2.0
 MAX_CSV_BYTES = 8 * 1024 * 1024
 
 
@@ -55,7 +55,7 @@ def run_loop(request: LoopRequest) -> Path:
         original=header.session_id,
         original_sha256=recording.sha256,
         fit=fit.stem,
-        depth_range_mm=(LEAST_HEIGHT_MM, rig.brush.max_depth_mm),
+        depth_range_mm=(LEAST_DEPTH_MM, rig.brush.max_depth_mm),
         tilt_range_deg=(0.0, rig.robot.limits.tilt_deg),
         presses=request.presses,
         seed=request.seed,

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from brushloop.collect.commission.visit import Notebook, Step, Taught, Visit, line_of
+from brushloop.collect.commission.visit import Notebook, Step, Taught, Visit
+from brushloop.collect.operator import Prompt
 from brushloop.collect.rig.check import tool_length
 from brushloop.collect.rig.doctor import Finding, write_report
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, Controller, only_asking
@@ -37,7 +38,7 @@ def address_of(text: str) -> tuple[str, int]:
 
 
 ADDRESS = "aside.address"
-ASK_ADDRESS = line_of(
+ASK_ADDRESS = Prompt(
     f"Address of the cabinet (pendant: Settings, Network), as 192.0.2.7 or 192.0.2.7:{ARCS_PORT}",
     read=lambda line: "{}:{}".format(*address_of(line)),
 )

@@ -12,7 +12,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from brushloop.collect.commission.sheet import inside_corners
-from brushloop.collect.commission.visit import Notebook, Step, Taught, Visit, choice_of, line_of, number_of
+from brushloop.collect.commission.visit import Notebook, Step, Taught, Visit, choice_of, number_of
 from brushloop.collect.errors import NotAccepted
 from brushloop.collect.operator import Choice, Prompt
 from brushloop.collect.rig.check import brush_shorter_than_tool, deepest_press
@@ -53,7 +53,7 @@ def _line_named(line: str) -> str:
     return line
 
 
-ASK_PORT = line_of("Its serial line, such as /dev/serial/by-id/usb-…", read=_line_named)
+ASK_PORT = Prompt("Its serial line, such as /dev/serial/by-id/usb-…", read=_line_named)
 DELIVERY = number_of("Delivery per revolution, by weighing ten of them", 0.001, 10.0, "ml")
 
 
@@ -71,7 +71,7 @@ class BrushStep(Step):
         ask = ask_length(visit.notebook.get("robot.tcp_offset_mm"))
         length_mm = await visit.value("brush.length_mm", ask, LENGTH_SIGMA_MM)
         await visit.value("brush.max_depth_mm", ask_depth(length_mm))
-        await visit.value("brush.name", line_of("Name of the brush, for the record", "brush"))
+        await visit.value("brush.name", Prompt("Name of the brush, for the record", default="brush", read=str))
         kind = await visit.value("aside.ink", choice_of("What keeps the ink well filled?", (NONE, STATION, PUMP)))
         if kind != NONE.key and "ink.device.kind" not in visit.notebook.values:
             port = await visit.value("ink.device.port", ASK_PORT)
@@ -81,7 +81,7 @@ class BrushStep(Step):
                 device = ModbusPumpConfig(kind="modbus-pump", port=port, ml_per_revolution=ml)
             await self._primed(visit, device)
             visit.keep({"ink.device.kind": Taught(device.kind, "answered on its line")})
-        await visit.value("ink.name", line_of("Name of the ink, for the record", "ink"))
+        await visit.value("ink.name", Prompt("Name of the ink, for the record", default="ink", read=str))
 
     async def _primed(self, visit: Visit, config: InkTable) -> None:
         visit.working(f"asking {config.port} who it is")
@@ -120,7 +120,7 @@ def _bus(line: str) -> str:
     return line
 
 
-ASK_BUS = line_of("CAN bus of the force sensor: can0, or HOST:PORT/can0 of a gateway; Enter: no sensor", read=_bus)
+ASK_BUS = Prompt("CAN bus of the force sensor: can0, or HOST:PORT/can0 of a gateway; Enter: no sensor", read=_bus)
 REST_S = 1.0
 """How long the sensor is listened to with nothing touching, before the push and after it."""
 LEAST_PUSH_N, MOST_PUSH_N = 0.3, 60.0

@@ -17,20 +17,19 @@ from brushloop.calibrate.board.lens import GOOD_VIEWS, fit_lens, guidance, held,
 from brushloop.calibrate.board.spec import BoardSpec, BoardView, describe
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_gray
-from brushloop.collect.commission.visit import NO, YES, Notebook, Step, Taught, Visit, choice_of, line_of, number_of
+from brushloop.collect.commission.visit import NO, YES, Notebook, Step, Taught, Visit, choice_of, number_of
 from brushloop.collect.errors import NotAccepted
 from brushloop.collect.operator import Prompt
-from brushloop.collect.photograph.frames import Gray
+from brushloop.collect.photograph.frames import Gray, each_frame
 from brushloop.collect.rig.devices import identified
 from brushloop.drivers.camera import CameraTable, Locked, OpenCvCamera, found_settings
-from brushloop.drivers.devices import Stamp
-from brushloop.drivers.errors import DeviceError
-from brushloop.drivers.host import Clock, alongside
+from brushloop.drivers.devices import Frame, Stamp
+from brushloop.drivers.host import Clock
 
 LATE_MS = 2500.0
 """Until the delay is measured, a picture counts as taken this long before it came: no useful camera is slower."""
-SETTLE_S, LIVE_S = 2.0, 0.3
-"""How long a device may take to choose its settings, and time between pictures for a person who guides something."""
+SETTLE_S = 2.0
+"""How long a device may take to choose its settings."""
 VIEW = "aside.lens_view_"
 """Beginning of the fields for the photographs of the held board: the names of their files."""
 MOST_VIEWS = 20
@@ -62,7 +61,7 @@ def _squares(line: str) -> list[float]:
     return [int(across), int(along)]
 
 
-ASK_SQUARES = line_of(
+ASK_SQUARES = Prompt(
     "Squares of the print of `brushloop camera board`, along its longer and its shorter side, as 26x20", read=_squares
 )
 SQUARE = number_of("Side of a square (ten of them by calipers, divided by ten)", 2.0, 100.0, "mm")
@@ -85,7 +84,7 @@ class CameraStep(Step):
         square_mm = await visit.value("board.square_mm", SQUARE)
         marker = number_of("Side of a marker", 1.0, 100.0, "mm", f"{MARKER_SHARE * square_mm:g}")
         await visit.value("board.marker_mm", marker)
-        await visit.value("board.dictionary", line_of("Markers of the print", "DICT_5X5_1000"))
+        await visit.value("board.dictionary", Prompt("Markers of the print", default="DICT_5X5_1000", read=str))
         with visit.asked_again_if_refused(*PRINTED):
             try:
                 board_of(visit.notebook)
@@ -238,17 +237,11 @@ async def still(camera: OpenCvCamera, clock: Clock) -> Gray:
 async def shown_live(visit: Visit, camera: OpenCvCamera) -> AsyncGenerator[None]:
     """Show what the camera sees until the block ends."""
 
-    async def look() -> None:
-        after = Stamp(0)
-        with contextlib.suppress(DeviceError):
-            while True:
-                frame = await camera.fresh(after)
-                after = Stamp(frame.exposed_after_ns + 1)
-                visit.live = frame.image
-                await asyncio.sleep(LIVE_S)
+    def show(frame: Frame) -> None:
+        visit.live = frame.image
 
     try:
-        async with alongside(look(), "live picture"):
+        async with each_frame(camera, [show]):
             yield
     finally:
         visit.live = None

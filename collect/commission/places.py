@@ -12,7 +12,7 @@ from brushloop.calibrate.files import read_gray
 from brushloop.collect.commission.arm import Point, tips, touch
 from brushloop.collect.commission.camera import shown_live, still, taught_camera
 from brushloop.collect.commission.sheet import corners_of
-from brushloop.collect.commission.visit import YES, Notebook, Step, Taught, Visit, number_of, rig_of, yes_of
+from brushloop.collect.commission.visit import NO, YES, Notebook, Step, Taught, Visit, choice_of, number_of, rig_of
 from brushloop.collect.errors import ConfigError, NotAccepted
 from brushloop.collect.photograph.frames import ARM_SHARE, Thumbnail, changed_share, thumbnail
 from brushloop.collect.rig.check import draw_rig, places_of
@@ -40,8 +40,8 @@ AWAY = {
 }
 PARKED = "aside.parked"
 INK = ("well-rim", "well", "wash-rim", "wash-pot")
-WIPE = yes_of("Shall each dip end with a wipe across the rim of the well, which takes the drop off?")
-WASH = yes_of("Is there a pot of water to wash the brush in?")
+WIPE = choice_of("Shall each dip end with a wipe across the rim of the well, which takes the drop off?", (YES, NO))
+WASH = choice_of("Is there a pot of water to wash the brush in?", (YES, NO))
 MARGIN_MM = 25.0
 """Room beside what was taught: a brush lifted along a tool axis that leans by 15 deg moves aside by as much."""
 BELOW_MM = 2.0

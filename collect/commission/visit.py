@@ -230,16 +230,6 @@ def choice_of(question: str, choices: tuple[Choice, ...], default: str = "") -> 
     return Prompt(question, choices, default, answers={"enter": default} if default else {})
 
 
-def yes_of(question: str) -> Prompt:
-    """A question for yes or no; Enter is neither."""
-    return choice_of(question, (YES, NO))
-
-
-def line_of(question: str, default: str = "", read: Callable[[str], Value] = str) -> Prompt:
-    """A question for a line, which `read` may refuse by a ValueError that is worded for the person."""
-    return Prompt(question, default=default, read=read)
-
-
 def number_of(
     question: str, low: float, high: float, unit: str, default: str = "", check: Callable[[float], Check] | None = None
 ) -> Prompt:
@@ -343,7 +333,7 @@ class Visit:
 
     async def yes(self, question: str) -> bool:
         """Ask for yes or no; Enter is neither."""
-        return await self.ask(yes_of(question)) == YES.key
+        return await self.ask(choice_of(question, (YES, NO))) == YES.key
 
     async def brought(self, thing: str, how: str, *, may_skip: bool = False) -> bool:
         """Ask the person to bring a thing somewhere; False if it is skipped, where it `may_skip`."""

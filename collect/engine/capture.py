@@ -198,7 +198,7 @@ async def photograph(context: StepContext) -> Gray:
 async def _fresh_frame(context: StepContext) -> Frame:
     run, photographer = context.run, context.run.procedures.photographer
     known = photographer.delay
-    frame = await run.procedures.capture()
+    frame = await photographer.photograph()
     if photographer.delay is not known:
         context.recorder.log(f"camera delay: {photographer.delay}")
         run.progress.log(f"camera delay: {photographer.delay}")

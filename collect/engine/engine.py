@@ -17,7 +17,7 @@ from collections.abc import Callable, Generator
 from pathlib import Path
 
 from brushloop.collect.engine.control import FINAL, State
-from brushloop.collect.engine.live import each_frame, picture_of
+from brushloop.collect.engine.live import picture_of
 from brushloop.collect.engine.open_or_resume import Opening, find_resumable, open_store
 from brushloop.collect.engine.policy import resume_question
 from brushloop.collect.engine.recorder import uninterrupted
@@ -32,6 +32,7 @@ from brushloop.collect.errors import (
     rest_is_unknown,
 )
 from brushloop.collect.operator import Asker, Choice, OperatorRequest, Prompt
+from brushloop.collect.photograph.frames import each_frame
 from brushloop.collect.rig.devices import Rig, connected
 from brushloop.collect.walk import check_protocol, sheet_of
 from brushloop.drivers.devices import Frame

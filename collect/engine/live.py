@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import threading
-from collections.abc import Callable, Sequence
-from contextlib import AbstractAsyncContextManager
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -17,9 +13,7 @@ from numpy.typing import NDArray
 from brushloop.collect.engine.snapshot import Picture
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.photograph.measure import blur_px, busiest_tile
-from brushloop.drivers.devices import Camera, Frame, Stamp
-from brushloop.drivers.errors import DeviceError
-from brushloop.drivers.host import alongside
+from brushloop.drivers.devices import Frame
 from brushloop.sessions.mcap_writer import Outgoing, channel_of, encoded
 from brushloop.sessions.messages import image_message
 from brushloop.sessions.records import Event, Topic
@@ -28,26 +22,7 @@ if TYPE_CHECKING:
     from foxglove import Channel
     from google.protobuf.message import Message
 
-FRAME_PERIOD_S = 0.2
-"""Time between two pictures of the camera."""
 WIDTH_PX = 320
-
-
-def each_frame(camera: Camera, shows: Sequence[Callable[[Frame], None]]) -> AbstractAsyncContextManager[None]:
-    """Within the block pass the newest frame to each of `shows`, in a thread, every `FRAME_PERIOD_S`.
-
-    Never slows the run. Without `shows`, the camera is not asked for frames.
-    """
-
-    async def watch() -> None:
-        while shows:
-            with contextlib.suppress(DeviceError):  # the run finds out when it takes a photograph itself
-                frame = await camera.fresh(Stamp(0))
-                for show in shows:
-                    await asyncio.to_thread(show, frame)
-            await asyncio.sleep(FRAME_PERIOD_S)
-
-    return alongside(watch(), "camera picture")
 
 
 def _no_wider(image: NDArray[np.uint8], width_px: int) -> NDArray[np.uint8]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncGenerator, Callable
+from collections.abc import AsyncGenerator, Callable, Sequence
+from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
 
 import cv2
@@ -14,7 +15,8 @@ from numpy.typing import NDArray
 from brushloop.collect.errors import StepError
 from brushloop.collect.rig.config import CameraConfig
 from brushloop.drivers.devices import Camera, Frame, Stamp
-from brushloop.drivers.host import alongside
+from brushloop.drivers.errors import DeviceError
+from brushloop.drivers.host import alongside, finished
 
 Gray = NDArray[np.uint8]
 Thumbnail = NDArray[np.float32]
@@ -54,6 +56,27 @@ def changed_share(now: Thumbnail, before: Thumbnail) -> float:
         return 1.0
     light = float(np.median((now + 1.0) / (before + 1.0)))
     return float(np.mean(np.abs(now - light * before) > CHANGED_LEVELS))
+
+
+FRAME_PERIOD_S = 0.2
+"""Time between two pictures for a person who watches."""
+
+
+def each_frame(camera: Camera, shows: Sequence[Callable[[Frame], None]]) -> AbstractAsyncContextManager[None]:
+    """Within the block pass the newest frame to each of `shows`, in a thread, every `FRAME_PERIOD_S`.
+
+    Never slows a run; nothing is shown after the block. Without `shows`, the camera is not asked for frames.
+    """
+
+    async def watch() -> None:
+        while shows:
+            with contextlib.suppress(DeviceError):  # whoever takes a photograph finds out
+                frame = await camera.fresh(Stamp(0))
+                for show in shows:
+                    await finished(asyncio.to_thread(show, frame))
+            await asyncio.sleep(FRAME_PERIOD_S)
+
+    return alongside(watch(), "camera picture")
 
 
 Series = list[tuple[float, float]]

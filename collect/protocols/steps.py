@@ -103,8 +103,6 @@ class PressStep(StepBase):
     press: Press
     dwell_s: float = 0.0
     """Time at full depth."""
-    again_of: str | None = None
-    """The stroke of another session that this one repeats."""
     drawn: Drawn | None = None
     """The figure; None for a press."""
 
@@ -117,6 +115,7 @@ class CaptureStep(StepBase):
     press: Press
     """As it was made, with its sheet and patch: a capture of another patch is another step."""
     again_of: str | None = None
+    """The stroke of another session that this one repeats."""
     drawn: bool = False
 
 
@@ -184,7 +183,7 @@ def takes(stroke: Planned) -> Protocol:
         dipped = yield DipStep(index, take)
         if isinstance(dipped, DipResult) and dipped.skipped is not None:
             break
-        marked = yield PressStep(index, stroke.press(take), stroke.dwell_s, again_of, drawn)
+        marked = yield PressStep(index, stroke.press(take), stroke.dwell_s, drawn)
         assert isinstance(marked, PressResult)
         seen = yield CaptureStep(index, marked.press, again_of, drawn is not None)
         if not (isinstance(seen, CaptureResult) and seen.retake):

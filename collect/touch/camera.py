@@ -236,7 +236,7 @@ class FirstInkTouch:
 
     async def _photograph(self) -> Frame:
         if self._last is None:
-            self._last = await self._procedures.capture()
+            self._last = await self._procedures.photographer.photograph()
         return self._last
 
     async def _inked(self, before: Frame, touched: list[Spot]) -> NDArray[np.bool_]:

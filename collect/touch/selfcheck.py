@@ -92,13 +92,13 @@ async def self_check(procedures: Procedures, places_mm: Triangle, dip: Dip) -> S
     rig, plane = procedures.rig, procedures.plane
     config, commanded = rig.config.self_check, np.array(places_mm, np.float64)
     async with procedures.lifted_after():
-        before = await procedures.capture()
+        before = await procedures.photographer.photograph()
         for x_mm, y_mm in places_mm:
             await dip()
             above, near, *pressing = mark_moves(rig.config, plane, x_mm, y_mm)
             await procedures.go(above, near)
             await procedures.queue(pressing)
-        after = await procedures.capture()
+        after = await procedures.photographer.photograph()
     found_mm = await asyncio.to_thread(_find, rig, before, after)
     return judge(commanded, found_mm, config)
 

@@ -130,12 +130,13 @@ class BenchHands(Procedures):
     def __init__(self, bench: Bench) -> None:
         super().__init__(bench.rig)
         self._well = bench.world.well
+        self.photographer.photograph = self._photograph
 
     async def dip(self) -> None:
         self._well.add(5.0)
         await super().dip()
 
-    async def capture(self) -> Frame:
+    async def _photograph(self) -> Frame:
         """Without wires no picture is late: there is no delay to measure."""
         await self.go(*photograph_moves(self.rig.config))
         return await self.rig.camera.fresh(Stamp(self.rig.clock.now_ns()))
