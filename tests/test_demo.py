@@ -69,7 +69,7 @@ def run_demo_and_die(out: Path) -> None:
 
     def done(store: SessionStore, *step: object) -> None:
         finish(store, *step)
-        if "replay" in store.folder.name and len(store.state.files) == PRESSED:
+        if "-list-" in store.folder.name and len(store.state.files) == PRESSED:
             os.kill(os.getpid(), signal.SIGKILL)
 
     with pytest.MonkeyPatch.context() as patch:
