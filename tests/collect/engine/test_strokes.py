@@ -25,6 +25,7 @@ from brushloop.collect.engine.recorder import RunContext, meanwhile
 from brushloop.collect.engine.snapshot import LastCapture, Progress
 from brushloop.collect.errors import BadPicture, CollectAborted, ConfigError, NeedsOperator, Parked, StepError
 from brushloop.collect.motion import Procedures, dip_moves, wash_moves
+from brushloop.collect.photograph.photographer import Photographer
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.tui.review_screen import Review
 from brushloop.drivers.sim.brush.footprint import Flaw
@@ -57,20 +58,21 @@ def screen(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def went(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """What the arm did, one after the other."""
     names: list[str] = []
-    for name in ("set_out", "dip", "press", "capture"):
-        method = getattr(Procedures, name)
+    doers = (Procedures, "set_out"), (Procedures, "dip"), (Procedures, "press"), (Photographer, "photograph")
+    for doer, name in doers:
+        method = getattr(doer, name)
 
         async def noted(*arguments: Any, _name: str = name, _method: Any = method) -> Any:
             names.append(_name)
             return await _method(*arguments)
 
-        monkeypatch.setattr(Procedures, name, noted)
+        monkeypatch.setattr(doer, name, noted)
     return names
 
 
 def test_nobody_looks_at_the_paper_between_dip_and_press(sharp_lab: Lab, went: list[str], screen: list[str]) -> None:
     sharp_lab.run()
-    assert went[went.index("dip") :] == ["dip", "press", "capture"]
+    assert went[went.index("dip") :] == ["dip", "press", "photograph"]
     assert screen[screen.index("dip") :][:4] == ["dip", "check that the sheet is blank", "dip", "press H13-a0-r01"]
     [wait_s] = [made.press.dip_to_touch_s for made in sharp_lab.state.results(PressResult)]
     assert wait_s is not None
@@ -110,7 +112,8 @@ def test_the_arm_sets_out_for_the_next_dip_while_a_capture_is_judged_and_dips_af
     monkeypatch.setattr(capturing, "_looked_at", once_under_way)
     engine.start()
     wait_for_end(engine)
-    first, last = ["dip", "press", "capture", "set_out", "judged"], ["dip", "press", "capture", "judged"]
+    first = ["dip", "press", "photograph", "set_out", "judged"]
+    last = ["dip", "press", "photograph", "judged"]
     assert went[went.index("dip") :] == first + last, "nor does the arm set out after the last stroke"
     assert engine.snapshot().parked
 
