@@ -17,7 +17,7 @@ import io
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -53,9 +53,9 @@ TORN_BAND_SHARE = 0.02
 """Share of the rows, at the bottom, that are uniform if the decoder ran out of data."""
 BURST_SHARE = 0.5
 """Frames that arrive within less than this share of the usual period are a backlog."""
-PERIODS_KEPT = 31
+PERIODS_KEPT = 32
 PERIODS_LEARNED = 3
-"""Number of gaps from which the usual period is taken."""
+"""Fewest gaps from which the usual period is taken: pauses count too, so a period that was misjudged is soon known."""
 
 Fault = Literal["black", "saturated", "torn", "frozen", "late"]
 """What is wrong with a frame."""
@@ -95,35 +95,16 @@ def looked_at(picture: Picture) -> NDArray[np.uint8] | Fault:
     return image
 
 
-class Backlog:
-    """Tells frames that had waited in a buffer by the times at which the frames of one camera arrive."""
+def is_late(gaps_ns: Sequence[int], latency_ns: int) -> bool:
+    """Whether a frame had waited in a buffer, by the gaps between the newest arrivals, of which its own is the last.
 
-    def __init__(self, latency_ns: int) -> None:
-        self._latency_ns = latency_ns
-        self._last_ns: int | None = None
-        self._periods: deque[int] = deque(maxlen=PERIODS_KEPT)
-        self._waiting = 0
-        """Number of coming frames that may have waited in a buffer."""
-
-    def is_late(self, arrival_ns: int) -> bool:
-        """True for a frame that had waited in a buffer: its arrival says nothing about its exposure."""
-        gap_ns = arrival_ns - self._last_ns if self._last_ns is not None else 0
-        self._last_ns = arrival_ns
-        if len(self._periods) < PERIODS_LEARNED:
-            self._periods.append(gap_ns)
-            return False
-        usual_ns = max(sorted(self._periods)[len(self._periods) // 2], 1)
-        stalled = gap_ns > max(3 * usual_ns, self._latency_ns)
-        if stalled:
-            self._waiting = gap_ns // usual_ns  # no more frames can have waited than came in the gap
-        elif self._waiting and gap_ns < BURST_SHARE * usual_ns:
-            self._waiting -= 1
-            return True
-        else:
-            self._waiting = 0
-        # A pause counts as a period too: where every frame comes after one, it is the period that was misjudged.
-        self._periods.append(gap_ns)
-        return stalled
+    It comes after a stall, or right behind another frame. Its arrival says nothing about its exposure.
+    """
+    *before_ns, gap_ns = gaps_ns
+    if len(before_ns) < PERIODS_LEARNED:
+        return False
+    usual_ns = sorted(before_ns)[len(before_ns) // 2]
+    return gap_ns > max(3 * usual_ns, latency_ns) or gap_ns < BURST_SHARE * usual_ns
 
 
 # ---------------------------------------------------------------- the driver
@@ -247,7 +228,7 @@ class OpenCvCamera:
         """Read until the source ends; late, repeated and patched frames are skipped."""
         self._settings, self._simulated = source.settings, source.simulated
         latency_ns = round(self._table.latency_ms * 1e6)
-        backlog, before = Backlog(latency_ns), None
+        before, gaps_ns, last_ns = None, deque[int](maxlen=PERIODS_KEPT), opening_ns
         while not self._closing.is_set():
             picture = source.read()
             arrival_ns = self._clock.now_ns()
@@ -255,7 +236,10 @@ class OpenCvCamera:
                 return
             # The first frame was read to learn the format, and waited until the capture was open.
             exposed_ns = (opening_ns if before is None else arrival_ns) - latency_ns
-            late, repeated = backlog.is_late(arrival_ns), is_repeated(picture, before)
+            if before is not None:
+                gaps_ns.append(arrival_ns - last_ns)
+            last_ns = arrival_ns
+            late, repeated = bool(gaps_ns) and is_late(gaps_ns, latency_ns), is_repeated(picture, before)
             torn = source.patches and not repeated and is_patched(picture, before)
             before = picture
             if late or repeated:
