@@ -70,11 +70,8 @@ class LiveView:
         except RuntimeError as error:
             raise ConfigError("--live", "", f"cannot listen on {HOST}:{port}: {error}") from None
         self.port = int(self._server.port)
-
-    @property
-    def url(self) -> str:
+        self.url = f"ws://{HOST}:{self.port}"
         """Address to enter at "Open connection" in Foxglove."""
-        return f"ws://{HOST}:{self.port}"
 
     def offer(self, outgoing: Outgoing) -> None:
         """Show a message that is being recorded. Stills are not sent: `frame` shows what the camera sees."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 from enum import StrEnum
 
 from brushloop.calibrate.board.pix2len import WORST_RMS_PX
@@ -18,7 +17,7 @@ from brushloop.collect.errors import (
     describe,
 )
 from brushloop.collect.operator import Choice, Prompt
-from brushloop.collect.protocols.steps import Step, ZeroTouchStep
+from brushloop.collect.protocols.steps import Step
 from brushloop.collect.rig.config import RigConfig
 from brushloop.drivers.errors import (
     ArmMoved,
@@ -120,14 +119,9 @@ TITLES = {
     StepKind.ZERO_TOUCH: "Zero touch and plane",
     StepKind.SELF_CHECK: "Self-check",
 }
-"""Steps of the set-up, in their order."""
+"""Steps of the set-up, in their order; the board is also looked at, and the paper found, between strokes."""
 NAME, SIGNS = 20, {True: "✓", False: "!", None: " "}
 """Columns of a fact's name; what stands before it if it is within its limit, if not, and if it has none."""
-
-
-def in_set_up(step: Step) -> bool:
-    """Whether this is a step of the set-up: the board is also looked at between strokes, and the paper found again."""
-    return step.kind in TITLES and step.index == 0
 
 
 Fact = tuple[str, str, bool | None]
@@ -152,11 +146,6 @@ def accept_question(result: StepResult, config: RigConfig) -> Prompt:
     if isinstance(result, ZeroTouchResult):
         choices += [BY_JOG, *([BY_FORCE] if config.force is not None else [])]
     return Prompt("\n".join([verdict, *lines]), (*choices, STOP), STOP.key)
-
-
-def by_method(step: Step, answer: str) -> Step:
-    """Return the same step; a zero touch by the method that the answer names, if any."""
-    return replace(step, method=METHODS[answer]) if isinstance(step, ZeroTouchStep) and answer in METHODS else step
 
 
 def _within(name: str, value: float, limit: float, shown: str) -> Fact:

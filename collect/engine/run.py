@@ -8,29 +8,13 @@ import asyncio
 import contextlib
 import itertools
 from collections.abc import Generator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from brushloop.collect.engine import brush, capture
 from brushloop.collect.engine.control import State
-from brushloop.collect.engine.policy import (
-    GO_ON,
-    STOP,
-    Action,
-    accept_question,
-    by_method,
-    decide,
-    in_set_up,
-    question,
-)
+from brushloop.collect.engine.policy import GO_ON, METHODS, STOP, TITLES, Action, accept_question, decide, question
 from brushloop.collect.engine.recorder import ForceGuard, Recorder, RunContext, StepContext, uninterrupted
-from brushloop.collect.errors import (
-    NeedsOperator,
-    Parked,
-    SheetFull,
-    StepError,
-    arm_at_fault,
-    describe,
-)
+from brushloop.collect.errors import NeedsOperator, Parked, SheetFull, StepError, arm_at_fault, describe
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
 from brushloop.collect.protocols import steps
 from brushloop.collect.protocols.steps import MARKING, Protocol, Step, press_of, takes
@@ -91,7 +75,7 @@ class Run(RunContext):
         known = self.store.state.done.get(step.key)
         if known is not None and (not step.run_scoped or step.key in self.done):
             return known.result
-        failures, asked = 0, self.opening.request.guided and in_set_up(step)
+        failures, asked = 0, self.opening.request.guided and step.kind in TITLES and step.index == 0
         while True:
             await self._between(step)
             try:
@@ -105,7 +89,8 @@ class Run(RunContext):
                     self.done.add(step.key)
                     return result
                 self.procedures.photographer.forget()
-                step = by_method(step, answer)
+                if isinstance(step, steps.ZeroTouchStep) and answer in METHODS:
+                    step = replace(step, method=METHODS[answer])
             except (StepError, DeviceError) as error:
                 if isinstance(error, NeedsOperator) and self.control.park_wanted:
                     await self._park()  # a question of this step was left open

@@ -16,7 +16,7 @@ from pydantic import Field, ValidationError, model_validator
 from brushloop.calibrate.board.lens import Lens, read_lens
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.collect.errors import ConfigError
-from brushloop.collect.rig.config_file import Config, PaperSide, Positive, place, read_toml, refusal
+from brushloop.collect.rig.config_file import Config, PaperSide, Positive, read_toml, refusal
 from brushloop.drivers.arcs.settings import ArcsTable
 from brushloop.drivers.camera import CameraTable
 from brushloop.drivers.force.sri_m8123 import ForceTable
@@ -314,18 +314,18 @@ def overrides() -> dict[tuple[str, ...], str]:
 
 def _override(values: dict[str, Any], path: tuple[str, ...], name: str) -> None:
     """Set the field at this path to what the variable holds: lists and tables as JSON, all else as it is."""
-    table = values
+    table, variable = values, f"environment variable {name}"
     for part in path[:-1]:
         inner: Any = table.setdefault(part, {})
         if not isinstance(inner, dict):
-            raise ConfigError(place(name), ".".join(path), "lies in no table of rig.toml")
+            raise ConfigError(variable, ".".join(path), "lies in no table of rig.toml")
         table = cast("dict[str, Any]", inner)
     text = os.environ[name]
     try:
         table[path[-1]] = json.loads(text) if text.startswith(("[", "{")) else text
     except (ValueError, RecursionError):
         shown = text if len(text) <= 80 else f"{text[:77]}..."
-        raise ConfigError(place(name), ".".join(path), f"is not JSON, as [40.0, 24.0] is (given: {shown!r})") from None
+        raise ConfigError(variable, ".".join(path), f"is not JSON, as [40.0, 24.0] is (given: {shown!r})") from None
 
 
 def load_rig(path: Path) -> RigConfig:

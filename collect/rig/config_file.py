@@ -30,11 +30,6 @@ class Config(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
 
-def place(name: str) -> str:
-    """How an error message names an environment variable."""
-    return f"environment variable {name}"
-
-
 def read_text(path: Path, max_bytes: int, encoding: str = "utf-8") -> str:
     """The text of a plain file. Raises `ConfigError` that names the file."""
     try:
@@ -74,7 +69,7 @@ def refusal(
     where: Path | str = path
     for set_at, variable in (environment or {}).items():
         if tuple(loc[: len(set_at)]) == set_at and all(isinstance(part, int) for part in loc[len(set_at) :]):
-            where = place(variable)
+            where = f"environment variable {variable}"
         elif tuple(loc) == set_at[: len(loc)] and set_at[-1] in what:
             more += f"; the environment sets {variable}"
     return ConfigError(where, ".".join(str(part) for part in loc), what + more)
