@@ -34,14 +34,7 @@ from brushloop.calibrate.report import (
 )
 from brushloop.calibrate.scores import MEASURES, Stat
 from brushloop.calibrate.stats import CEILING, NEAR_POINTS, Floats, Interval, Summary, is_near
-from brushloop.calibrate.validate.run import (
-    BEZIER_REFITTED,
-    FITTED_HELD_OUT,
-    HELD_OUT,
-    PRESSES,
-    ModelInfo,
-    Outcome,
-)
+from brushloop.calibrate.validate.run import BEZIER_REFITTED, FITTED_HELD_OUT, HELD_OUT, PRESSES, ModelInfo, Outcome
 from brushloop.calibrate.validate.tables import (
     NORMAL,
     STRICT,

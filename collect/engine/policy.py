@@ -7,15 +7,7 @@ from collections.abc import Iterator
 from enum import StrEnum
 
 from brushloop.calibrate.board.pix2len import WORST_RMS_PX
-from brushloop.collect.errors import (
-    BadPicture,
-    ForceTooHigh,
-    NeedsOperator,
-    SheetFull,
-    StepError,
-    StepVoid,
-    describe,
-)
+from brushloop.collect.errors import BadPicture, ForceTooHigh, NeedsOperator, SheetFull, StepError, StepVoid, describe
 from brushloop.collect.operator import Choice, Prompt
 from brushloop.collect.protocols.steps import Step
 from brushloop.collect.rig.config import RigConfig

@@ -16,17 +16,7 @@ import numpy as np
 from brushloop.calibrate.board.pix2len import Plane
 from brushloop.calibrate.stroke.preprocess import PX_PER_MM, Gray, rectify
 from brushloop.collect.photograph import measure
-from brushloop.collect.photograph.measure import (
-    Ink,
-    Mark,
-    Point,
-    around,
-    measure_mark,
-    mm2,
-    on_sheet,
-    take,
-    tell_apart,
-)
+from brushloop.collect.photograph.measure import Ink, Mark, Point, around, measure_mark, mm2, on_sheet, take, tell_apart
 from brushloop.collect.rig.config import QualityConfig
 from brushloop.collect.rig.paper import Patch
 from brushloop.sessions.records import Check

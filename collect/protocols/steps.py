@@ -12,15 +12,7 @@ from typing import Annotated, Any, ClassVar, get_args
 
 from pydantic import Field, TypeAdapter
 
-from brushloop.sessions.events import (
-    CaptureResult,
-    DipResult,
-    Press,
-    PressResult,
-    ReviewResult,
-    StepKind,
-    StepResult,
-)
+from brushloop.sessions.events import CaptureResult, DipResult, Press, PressResult, ReviewResult, StepKind, StepResult
 from brushloop.sessions.records import Condition
 
 MEASURED = {"reached_mm", "dip_to_touch_s"}

@@ -22,15 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BaseModel, Field, model_validator
 
 from brushloop.drivers.devices import ForceSample, Identity, Stamp
-from brushloop.drivers.errors import (
-    ConnectionLost,
-    DeviceError,
-    DeviceTimeout,
-    NotConnected,
-    Stale,
-    Stuck,
-    too_busy,
-)
+from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected, Stale, Stuck, too_busy
 from brushloop.drivers.host import Clock
 
 if TYPE_CHECKING:

@@ -1,1 +1,4 @@
-"""Characters: strokes of a font or a hand to trajectories of the brush, and trajectories to an image."""
+"""Characters: strokes of a font or a hand to trajectories of the brush, and trajectories to an image.
+
+Used by `calibrate.writing` alone.
+"""

@@ -19,16 +19,7 @@ from brushloop.calibrate.compare import (
     similarity,
     simulated,
 )
-from brushloop.calibrate.loop import (
-    AGAIN,
-    ANOTHER,
-    SIMULATED,
-    LoopRecord,
-    Pair,
-    pair_up,
-    score_pairs,
-    statistics_of,
-)
+from brushloop.calibrate.loop import AGAIN, ANOTHER, SIMULATED, LoopRecord, Pair, pair_up, score_pairs, statistics_of
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.scores import Scores, find_stat, similarities
 from brushloop.calibrate.validate.run import score_job

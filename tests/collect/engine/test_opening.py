@@ -10,13 +10,7 @@ from typing import Any
 import pytest
 
 from brushloop.collect.engine import engine
-from brushloop.collect.engine.open_or_resume import (
-    CollectRequest,
-    Opening,
-    find_resumable,
-    open_sessions,
-    put_in_sheet,
-)
+from brushloop.collect.engine.open_or_resume import CollectRequest, Opening, find_resumable, open_sessions, put_in_sheet
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.protocols.steps import StepKind
 from brushloop.collect.tui.start_screen import SessionBrowser

@@ -25,14 +25,7 @@ from brushloop.collect.protocols.kinds import (
     PressRow,
     WriteConfig,
 )
-from brushloop.collect.protocols.steps import (
-    MARKING,
-    CaptureStep,
-    PressStep,
-    Step,
-    StepKind,
-    press_of,
-)
+from brushloop.collect.protocols.steps import MARKING, CaptureStep, PressStep, Step, StepKind, press_of
 from brushloop.collect.rig.config import PaperConfig
 from brushloop.collect.rig.paper import Sheet
 from brushloop.collect.walk import as_planned

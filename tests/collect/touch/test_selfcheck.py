@@ -20,14 +20,7 @@ from numpy.typing import NDArray
 from brushloop.collect.errors import StepError
 from brushloop.collect.rig.config import PaperConfig, SelfCheckConfig
 from brushloop.collect.rig.paper import Sheet, to_base
-from brushloop.collect.touch.selfcheck import (
-    LEGS_MM,
-    Triangle,
-    judge,
-    partners,
-    self_check,
-    triangle_on,
-)
+from brushloop.collect.touch.selfcheck import LEGS_MM, Triangle, judge, partners, self_check, triangle_on
 from brushloop.drivers.devices import Pose
 from brushloop.sessions.events import SelfCheckResult
 

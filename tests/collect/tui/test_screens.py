@@ -21,16 +21,7 @@ from brushloop.collect.tui.pictures import CellPicture, look_for_pixels, picture
 from brushloop.collect.tui.run_screen import RunScreen
 from brushloop.collect.tui.widgets import AskScreen
 from brushloop.sessions.recording import remarks_of
-from tests.collect.tui.fake import (
-    FakeBrowser,
-    FakeEngine,
-    a_review,
-    app_of,
-    full_picture,
-    picture,
-    settled,
-    watched,
-)
+from tests.collect.tui.fake import FakeBrowser, FakeEngine, a_review, app_of, full_picture, picture, settled, watched
 
 
 async def test_what_comes_from_outside_is_shown_as_it_is() -> None:

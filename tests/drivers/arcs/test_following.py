@@ -12,13 +12,7 @@ from brushloop.drivers.arcs import motion as queueing
 from brushloop.drivers.arcs.motion import as_sent
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.devices import Pose, QueuedLine
-from brushloop.drivers.errors import (
-    ConnectionLost,
-    MotionFailed,
-    MotionRefused,
-    ProtocolViolation,
-    RobotNotSafe,
-)
+from brushloop.drivers.errors import ConnectionLost, MotionFailed, MotionRefused, ProtocolViolation, RobotNotSafe
 from brushloop.drivers.geometry import brush_pose, distance
 from tests.drivers.arcs.conftest import LIMITS, Cabinet, cut
 

@@ -22,18 +22,7 @@ from brushloop.model.characters.plan import (
     resampled,
 )
 from brushloop.model.characters.presses import Stamps, depth_of
-from brushloop.model.drag import (
-    NAMES,
-    START,
-    DragModel,
-    Drawings,
-    Footprint,
-    fit_each,
-    inked,
-    lagging,
-    marks,
-    sampled,
-)
+from brushloop.model.drag import NAMES, START, DragModel, Drawings, Footprint, fit_each, inked, lagging, marks, sampled
 from brushloop.model.raster import coverage
 from brushloop.model.strokes import stroke_model
 
