@@ -40,7 +40,6 @@ from brushloop.model.presses import DepthTilt, Grid, Presses
 
 SPREAD_MM = 0.15
 """Variation of an edge from press to press (scale of a logistic)."""
-
 ALL = tuple(range(len(NAMES)))
 SCALE = tuple(NAMES.index(name) for name in ("lam", "heel_gain", "tip_gain", "origin_mm"))
 """Size and place of the marks."""
@@ -50,7 +49,6 @@ STEP = 1e-4
 """Step of a derivative, as a share of the parameter's spread."""
 STRAYS = {"lam": 0.09, "origin_mm": 0.3, "heel_gain": 0.3, "tip_gain": 0.04}
 """Standard deviations by which single presses of a brush differ: about 5 % of width and lengths, 0.3 mm of place."""
-
 TERM_SCALE = (1.0, 1.0, 0.8, 0.8, 0.8, 0.8)
 """Expected sizes of the terms: the first in units of the constant's scale, the rest in units of the others' scale."""
 CONSTANT = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)

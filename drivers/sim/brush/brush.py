@@ -47,10 +47,8 @@ MAX_DEPTH = 0.9
 
 Descent = tuple[SpineShape, ...]
 """The spine after each load step on the way down; the last is final."""
-
 LIE, PAPER, TROUBLE = range(3)
 """Streams of random numbers of a press, so that the paper does not change with the number of bristles."""
-
 REMEMBERED_SPINES = 64
 REMEMBERED_STANCES = 8
 

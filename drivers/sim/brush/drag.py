@@ -24,7 +24,6 @@ from brushloop.drivers.sim.brush.mechanics import SpineShape, Vector
 
 STEP_MM = 0.3
 """Longest distance that the commanded tip travels between two moments of a drag."""
-
 SHORTEST = 0.3
 """Length of a patch that is pulled square across, as a share of its full length."""
 
@@ -100,14 +99,11 @@ def _samples(path: Sequence[Waypoint]) -> tuple[Vector, Vector, Vector]:
 
 INK_PER_MM = 0.005
 """Share of a full brush that one mm of a drag uses, on top of what landing uses."""
-
 DEPTH_STEP_MM = 0.2
 LOAD_STEP = 0.02
 """Patches of nearly equal depth and load are drawn once."""
-
 WET_MM = 0.3
 """Hairs this near the paper are part of the patch."""
-
 STAMP_MARGIN_MM = 1.5
 
 

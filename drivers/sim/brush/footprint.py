@@ -23,46 +23,32 @@ Image = NDArray[np.float32]
 
 PX_PER_MM = 10.0
 """Scale of the sheet, and of the marks that are laid on it."""
-
 TEXTURE_PX_PER_MM = 10.0
 """Paper texture is drawn at this scale and resized, so that fibres keep their size on any raster."""
-
 DRY_WICK_MM = 0.04
 """Capillary spread of the last ink of a brush."""
-
 HAIR_MM = 0.1
 """Spread of ink around one wet hair."""
-
 FULL_PER_MM2 = 20.0
 """Deposit points per area that fill the ink film."""
-
 CLEFT_RAD = math.radians(13.0)
 """Angle at which each half of a fully split tuft leaves the axis."""
-
 BEND_RAD = math.radians(55.0)
 """How far a fully bent tip has turned sideways at its end."""
-
 BENT_SHARE = 1.0 / 3.0
 """Share of the bundle, from the tip, that a bend runs over."""
-
 DRY_SHARE = 0.9
 """Share of the hairs without an ink film when a brush is fully dry."""
-
 SPENT = 0.7
 """Share of the ink that the other hairs of a fully dry brush lack."""
-
 PALE = 0.75
 """Share of the tone that is missing in fully faint ink."""
-
 COHESIVE_LOAD = 0.7
 """Ink load above which the film between the hairs always holds the tip together."""
-
 SPLIT_CHANCE = 0.6
 """Chance that an empty brush splits in a press."""
-
 SPLIT_DEPTH_MM = 3.0
 """Shallower presses do not push the hairs apart."""
-
 BLANK_LOAD = 0.02
 """Ink load below which a brush leaves no mark."""
 
@@ -243,7 +229,6 @@ def _fibre_kernel(angle_rad: float) -> Image:
 
 STATION_MM = 0.25
 """Spacing of deposit points along a bristle."""
-
 CLUMPS = 36
 """Wet hairs stick together and run dry together."""
 
@@ -286,10 +271,8 @@ def grow_bristles(spec: BrushSpec, rng: np.random.Generator) -> Bristles:
 
 MARGIN_MM = 3.0
 """Blank border around the mark."""
-
 DRY_FILM_MM = 0.12
 """Height over the paper within which a hair gives ink when the brush is all but empty."""
-
 TRAIL_STEPS = 2
 """Load steps between the moments at which the sliding bundle is printed: about 1 mm of descent."""
 

@@ -21,22 +21,16 @@ Vector = NDArray[np.float64]
 
 LOAD_STEP_MM = 0.5
 """Largest descent per load step; friction makes the result depend on the path, so this is part of the rig."""
-
 SLIP_SMOOTHING_MM = 0.02
 """Slip at which friction reaches 0.7 of its Coulomb value; Newton needs the corner rounded."""
-
 HARD_CORE = 0.8
 """Squash, as a fraction of the local radius, beyond which the packed hairs turn stiff."""
-
 PACKED_N_PER_MM2 = 1.0
 """Stiffness of the packed bundle: force per mm of length and mm of further squash."""
-
 UPRIGHT_SMOOTHING = 0.01
 """Rounds the kink of |sin phi| so that an upright spine may fall to either side."""
-
 MENISCUS_MM = 0.8
 """Gap over which a meniscus still bridges bundle and paper."""
-
 MAX_NEWTON = 60
 ANGLE_TOLERANCE_RAD = 1e-6
 
