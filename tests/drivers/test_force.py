@@ -1,4 +1,4 @@
-"""The force driver against a board on a virtual bus: what it reads, what it refuses, and how it ends."""
+"""The force driver against a board on a bus in memory: what it reads, what it refuses, and how it ends."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import random
 import re
 import threading
 import time
-from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from collections import deque
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from functools import partial
 from itertools import count, pairwise
 
 import can
 import pytest
-from can.interfaces.virtual import VirtualBus
 
 from brushloop.drivers.devices import ForceSample
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected, Stale, Stuck
@@ -26,38 +26,37 @@ from brushloop.drivers.host import HostClock
 from tests.waiting import until
 
 WRENCH: Wrench = (1.0, -2.0, 3.5, 0.25, -0.5, 0.125)
-NUMBERS = count()
-RATE_HZ = 100.0
+PERIOD_S = 0.005
 
 
 @pytest.fixture(autouse=True)
-def lenient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a busy machine the simulated board may pause within a round; most boards here measure without noise."""
-    monkeypatch.setattr(sri_m8123, "ROUND_S", 0.2)
+def noiseless(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Most boards here measure without noise."""
     monkeypatch.setattr(sri_m8123, "STUCK_MS", math.inf)
 
 
-@contextmanager
-def served(channel: str, board: ForceBoard) -> Iterator[None]:
-    """Serve the board in a thread on python-can's `virtual` bus, which no other process can reach."""
-    bus, over = can.Bus(channel, "virtual", ignore_config=True), threading.Event()
+class Bus:
+    """As much of a `can.Bus` as the driver uses, with a board on it."""
 
-    def stream() -> None:
-        due_s = time.monotonic()
-        while not over.is_set():
-            if (message := bus.recv(max(0.0, due_s - time.monotonic()))) is not None:
-                board.obey(CanFrame(message.arbitration_id, bytes(message.data), message.is_error_frame))
-            elif time.monotonic() >= due_s:
-                due_s = max(due_s + 1.0 / RATE_HZ, time.monotonic())
-                for frame in board.round():
-                    bus.send(can.Message(0.0, frame.can_id, frame.error, False, frame.error, data=frame.data))
+    def __init__(self, board: ForceBoard) -> None:
+        self._board = board
+        self._frames: deque[CanFrame] = deque()
 
-    thread = threading.Thread(target=stream, daemon=True)
-    thread.start()
-    yield
-    over.set()
-    thread.join()
-    bus.shutdown()
+    def send(self, message: can.Message, timeout: float) -> None:
+        self._board.obey(CanFrame(message.arbitration_id, bytes(message.data)))
+
+    def recv(self, _timeout: float) -> can.Message | None:
+        if not self._frames:
+            time.sleep(PERIOD_S)
+            self._at_s = time.time()
+            self._frames.extend(self._board.round())
+        if not self._frames:
+            return None
+        frame = self._frames.popleft()
+        return can.Message(self._at_s, frame.can_id, frame.error, False, frame.error, data=frame.data)
+
+    def shutdown(self) -> None:
+        pass
 
 
 def sensor_on(channel: str, stale_ms: float = 1e6) -> SriM8123:
@@ -68,8 +67,9 @@ def sensor_on(channel: str, stale_ms: float = 1e6) -> SriM8123:
 @asynccontextmanager
 async def sensing(board: ForceBoard, stale_ms: float = 1e6) -> AsyncIterator[SriM8123]:
     """A sensor that is connected to the board."""
-    with served(channel := f"force-{next(NUMBERS)}", board):
-        sensor = sensor_on(channel, stale_ms)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(can, "Bus", lambda *_, **__: Bus(board))
+        sensor = sensor_on("a board", stale_ms)
         await sensor.connect()
         yield sensor
         await sensor.close()
@@ -90,14 +90,14 @@ def readers() -> int:
     return sum(t.name == "force reader" for t in threading.enumerate())
 
 
-async def test_connecting_starts_the_board_and_closing_stops_it(board: ForceBoard):
+async def test_connecting_starts_the_board_and_closing_stops_it(board: ForceBoard, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(can, "Bus", lambda *_, **__: Bus(board))
     sensor = sensor_on("a board")
-    with served("a board", board):
-        identity = await sensor.connect()
-        assert (identity.model, identity.simulated) == ("SRI M8123B2 on virtual a board", True)
-        assert (sensor.latest().force_n, sensor.latest().torque_nm) == (WRENCH[:3], WRENCH[3:])
-        await sensor.close()
-        await until(lambda: not board.streaming, "the driver")
+    identity = await sensor.connect()
+    assert (identity.model, identity.simulated) == ("SRI M8123B2 on virtual a board", True)
+    assert (sensor.latest().force_n, sensor.latest().torque_nm) == (WRENCH[:3], WRENCH[3:])
+    await sensor.close()
+    assert not board.streaming
     assert readers() == 0
     with pytest.raises(NotConnected):
         sensor.latest()
@@ -181,19 +181,13 @@ async def test_bus_off_is_a_lost_connection_that_says_what_to_do_and_a_bus_error
 
 
 @pytest.mark.parametrize("error", [can.CanOperationError("network is down", 100), OSError(19, "No such device")])
-async def test_an_adapter_that_goes_away_is_a_lost_connection(
-    error: Exception, sensor: SriM8123, monkeypatch: pytest.MonkeyPatch
-):
-    real = VirtualBus.recv
+async def test_an_adapter_that_goes_away_is_a_lost_connection(error: Exception, board: ForceBoard, sensor: SriM8123):
+    def gone() -> None:
+        raise error
 
-    def recv(bus: VirtualBus, timeout: float | None = None) -> can.Message | None:
-        if threading.current_thread().name == "force reader":
-            raise error
-        return real(bus, timeout)
-
-    monkeypatch.setattr(VirtualBus, "recv", recv)
+    board.next_fault = gone
     await until(lambda: readers() == 0, "the driver")
-    with pytest.raises(ConnectionLost, match=r"bus virtual force-\d+ failed: .*connect again"):
+    with pytest.raises(ConnectionLost, match=r"bus virtual a board failed: .*connect again"):
         sensor.latest()
 
 
@@ -219,7 +213,7 @@ async def test_an_adapter_that_is_not_there_is_a_lost_connection(interface: str)
 async def test_a_bias_is_subtracted_from_now_on():
     load: list[Wrench] = [WRENCH]
     async with sensing(ForceBoard(lambda: load[0], noise_n=0.02, noise_nm=0.002)) as sensor:
-        await sensor.bias(0.4)
+        await sensor.bias(0.2)
         assert sensor.bias_wrench == pytest.approx(WRENCH, abs=0.02)
         seen: list[ForceSample] = []
         load[0] = (1.0, -2.0, 8.5, 0.25, -0.5, 0.125)
@@ -245,8 +239,8 @@ async def test_a_bias_while_something_moves_is_refused(axis: int, size: float, s
 async def test_a_bias_over_silence_is_refused_and_closing_ends_one(board: ForceBoard, sensor: SriM8123):
     board.next_fault = lambda: "silence"
     with pytest.raises(DeviceTimeout):
-        await sensor.bias(0.4)
-    averaging = asyncio.create_task(sensor.bias(1.0))
+        await sensor.bias(0.2)
+    averaging = asyncio.create_task(sensor.bias(0.3))
     await asyncio.sleep(0)
     await sensor.close()
     with pytest.raises(NotConnected, match="closed"):

@@ -257,14 +257,14 @@ def decoded(chunks: Iterable[bytes]) -> tuple[list[bytes], bool]:
 def test_any_stream_is_the_same_payloads_or_a_violation_wherever_it_is_cut(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(wire, "MAX_BYTES", 150)  # so that a message can be too long
     rng, taken, count = random.Random(1), 0, 0
-    for stream in hostile([*SOF, *BARE, SOF[0] + BARE[0] + PING + SOF[1]], 6000):
+    for stream in hostile([*SOF, *BARE, SOF[0] + BARE[0] + PING + SOF[1]], 2000):
         *coarser, finest = (decoded(chunks) for chunks in pieces(stream, rng))
         for payloads, refused in coarser:
             assert refused == finest[1], stream
             # a piece that holds a violation hands nothing over: what came before shows only in smaller pieces
             assert payloads == (finest[0][: len(payloads)] if refused else finest[0]), stream
         taken, count = taken + (not finest[1]), count + 1
-    assert 500 < taken < count - 500, "neither all sound nor all broken"
+    assert 200 < taken < count - 200, "neither all sound nor all broken"
 
 
 @pytest.mark.parametrize("stream", [b"X", b"GET / HTTP/1.0\r\n", b"SOF\x02\x00\x00\x00\x01x", b"1", b'{"a":1}}'])
@@ -275,8 +275,8 @@ def test_bytes_that_belong_to_neither_framing_are_refused_at_once(stream: bytes)
 ENDLESS: dict[str, tuple[bytes, bytes]] = {
     "a length of 4 GB": (b"SOF\x01\xff\xff\xff\xff", b""),
     "pings": (PING * 100_000 + b"SOF\x02", b""),
-    "arrays in arrays": (b"[", b"[" * 300),
-    "a string": (b'{"a":"', b"\\" * 300),
+    "arrays in arrays": (b"[", b"[" * 3000),
+    "a string": (b'{"a":"', b"\\" * 3000),
 }
 
 

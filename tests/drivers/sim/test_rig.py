@@ -10,11 +10,13 @@ import itertools
 import json
 import math
 import re
+import signal
 import stat
 import threading
 import time
 import tomllib
 from collections.abc import AsyncIterator, Awaitable, Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,14 +40,15 @@ from brushloop.drivers.sim.rig import HOST, ControlServer, LoopbackRig, serve
 from brushloop.drivers.sim.scene import MjpegServer, Scene, board
 from brushloop.drivers.sim.world import World, tool_of
 from tests.command import brushloop
+from tests.rigs import BARE, BENT_VIEW, SMALL_TABLE
 from tests.waiting import until
 
-SMALL = SimConfig(rate=20.0, view=View(width_px=640, height_px=480, px_per_mm=1.95))
+SMALL = replace(BARE, table=SMALL_TABLE)
 
 
 @pytest.fixture
 async def rig() -> AsyncIterator[LoopbackRig]:
-    """Everything that a rig has, 20 times faster than life."""
+    """One without ink device and force sensor, fast."""
     async with LoopbackRig(SMALL) as it:
         yield it
 
@@ -61,8 +64,13 @@ async def test_a_taken_port_leaves_no_half_a_rig():
 
 
 async def test_serving_ends_by_itself_and_leaves_a_rig_toml_unless_another_file_stands_there(tmp_path: Path):
-    target, lines = tmp_path / "rig.toml", list[str]()
-    await serve(LoopbackRig(SMALL), lines.append, write_rig=target, idle_exit_s=0.2)
+    rig, target, lines = LoopbackRig(SMALL), tmp_path / "rig.toml", list[str]()
+    sheet = rig.world.paper
+    serving = asyncio.create_task(serve(rig, lines.append, write_rig=target, idle_exit_s=0.2))
+    await until(target.exists, "the rig")
+    signal.raise_signal(signal.SIGUSR1)
+    await serving
+    assert rig.world.paper is not sheet
     assert tomllib.loads(target.read_text())["robot"]["host"] == HOST == "127.0.0.1"
     assert [p.name for p in tmp_path.iterdir()] == ["rig.toml"]
     assert str(target) in lines[0]
@@ -214,7 +222,7 @@ def test_where_no_rig_answers_it_is_said_in_one_line(tmp_path: Path):
 
 
 def test_corners_of_the_board_lie_where_the_optics_say_through_a_lens_that_distorts():
-    config = SimConfig(view=View(k1=-0.08))
+    config = SimConfig(view=BENT_VIEW)
     table, scene = config.table, Scene(World(config))
     corners, ids, _, _ = cv2.aruco.CharucoDetector(board(table)).detectBoard(scene.render())
     on_board = np.array(board(table).getChessboardCorners(), np.float64)[ids.ravel().astype(np.intp), :2]
@@ -230,7 +238,7 @@ def test_corners_of_the_board_lie_where_the_optics_say_through_a_lens_that_disto
 
 async def test_no_late_picture_overtakes_another_and_the_server_notices_that_its_client_has_gone():
     view = View(width_px=320, height_px=240, px_per_mm=0.9, fps=50.0, delay_s=0.05, delay_jitter_s=0.2)
-    async with LoopbackRig(SimConfig(force_sensor=False, ink_device="none", view=view)) as rig:
+    async with LoopbackRig(replace(SMALL, view=view)) as rig:
         rig.faults.hang(Fault(device=Device.CAMERA, kind="frozen", count=ALWAYS))  # numbers its pictures
         reader, writer = await asyncio.open_connection(HOST, rig.camera.port)
         writer.write(b"GET /stream.mjpg HTTP/1.0\r\n\r\n")

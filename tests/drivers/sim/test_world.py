@@ -181,7 +181,7 @@ def test_every_press_is_on_the_answer_sheet_and_takes_ink_that_a_dip_gives(press
     assert run([*SCRIPT, *dip()]).ink_load == 1.0
 
 
-@pytest.mark.parametrize(("step_s", "rate"), [(0.003, 1.0), (0.05, 50.0), (0.71, 1000.0)])
+@pytest.mark.parametrize(("step_s", "rate"), [(0.01, 1.0), (0.71, 1000.0)])
 def test_the_result_depends_neither_on_who_looks_nor_on_the_rate(pressed: World, step_s: float, rate: float):
     watched = run(SCRIPT, np.arange(0.0, 12.0, step_s).tolist(), rate=rate)
     assert watched.presses == pressed.presses
