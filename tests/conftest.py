@@ -49,6 +49,8 @@ FIRST = (
 """The longest tests and groups, longest first, so that no worker is left alone with one of them at the end."""
 
 TOGETHER = {
+    "tests/test_demo.py": "comparing",
+    "tests/test_foreign_text.py": "comparing",
     "tests/calibrate/validate/": "comparing",
     "tests/calibrate/test_scores.py": "comparing",
     "tests/calibrate/test_recover.py": "comparing",

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import asyncio
 import importlib.util
 import json
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import pytest
 
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import LoopbackRig
+from tests.rigs import in_thread
 from tests.waiting import PATIENCE_S
 
 pytestmark = [
@@ -31,41 +32,23 @@ TRIES = 4
 it. Only a death by signal is tried again, never a wrong answer."""
 
 
-async def run_session() -> dict[str, Any]:
-    for _ in range(TRIES):
-        returncode, text, pings = await one_session()
-        if returncode >= 0:
-            break
-    assert returncode == 0, text
-    return {**json.loads(text.strip().splitlines()[-1]), "pings": pings}
-
-
-async def one_session() -> tuple[int, str, int]:
-    """(exit code, negative for a signal; everything it printed; RTDE pings that the server saw)."""
-    async with LoopbackRig(SimConfig(rate=5.0)) as rig:
-        process = await asyncio.create_subprocess_exec(
-            sys.executable,
-            str(SESSION),
-            str(rig.arcs.port),
-            str(rig.rtde.port),
-            stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.STDOUT,
-        )
-        try:
-            async with asyncio.timeout(PATIENCE_S):
-                output, _ = await process.communicate()
-        except TimeoutError:
-            process.kill()
-            await process.communicate()
-            raise
-        assert process.returncode is not None
-        return process.returncode, output.decode(errors="replace"), rig.rtde.pings
+def one_session() -> tuple[subprocess.CompletedProcess[str], int]:
+    """The client's process, and how many RTDE pings the server saw."""
+    with in_thread(LoopbackRig(SimConfig(rate=5.0))) as (rig, _):
+        command = [sys.executable, str(SESSION), str(rig.arcs.port), str(rig.rtde.port)]
+        ran = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+        return ran, rig.rtde.pings
 
 
 @pytest.fixture(scope="module")
 def seen() -> dict[str, Any]:
     """What one whole session saw; run once for all tests."""
-    return asyncio.run(run_session())
+    for _ in range(TRIES):
+        ran, pings = one_session()
+        if ran.returncode >= 0:
+            break
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    return {**json.loads(ran.stdout.strip().splitlines()[-1]), "pings": pings}
 
 
 ANSWERS: dict[str, Any] = {

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import json
 import re
+import zipfile
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,14 @@ from typing import Any
 import pytest
 
 from brushloop.drivers.arcs.controller import survey
-from brushloop.drivers.arcs.wire import RpcConnection, answer_in
+from brushloop.drivers.arcs.wire import Framing, RpcConnection, answer_in
 from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation
+from brushloop.drivers.sim.arcs_server import ArcsServer
+from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.faults import Device, Fault
 from brushloop.drivers.sim.rig import HOST
+from brushloop.drivers.sim.world import World
 from tests.drivers.arcs.conftest import Cabinet, mute_to
-from tests.drivers.arcs.transcript import Archive, Replayed
 
 REPORTS = sorted((Path(__file__).parent / "reports").glob("*.zip"))
 MODE, SAFETY = "rob1.RobotState.getRobotModeType", "rob1.RobotState.getSafetyModeType"
@@ -74,15 +77,12 @@ async def test_a_call_without_a_good_answer_fails_and_calls_work_again_on_a_conn
     assert await client.call(SAFETY) == "Normal"
 
 
-@pytest.mark.parametrize("reply", [[1, 2], {"id": 7, "result": 0}, {"id": True, "result": 0}, {"result": 0}])
-def test_what_has_not_the_id_of_the_call_does_not_answer_it(reply: object):
-    assert answer_in(json.dumps(reply).encode(), 1, "getRobotNames") is None
-
-
 @pytest.mark.parametrize("reply", [b"hello", b"[" * 100_000, b'{"id": 1}', b'{"id": 1, "error": "bad"}'])
-def test_a_reply_that_makes_no_sense_is_a_violation(reply: bytes):
+def test_a_reply_that_makes_no_sense_is_a_violation_and_one_with_another_id_is_none(reply: bytes):
     with pytest.raises(ProtocolViolation):
         answer_in(reply, 1, "getRobotNames")
+    for other in (b"[1, 2]", b'{"id": 7, "result": 0}', b'{"id": true, "result": 0}', b'{"result": 0}'):
+        assert answer_in(other, 1, "getRobotNames") is None
 
 
 async def test_closing_wakes_the_caller_that_still_waits(cabinet: Cabinet, client: RpcConnection):
@@ -99,6 +99,31 @@ async def test_a_cabinet_that_does_not_answer_the_login_is_asked_all_the_same(ca
     refused, first, *_ = await survey(HOST, cabinet.port, "sof")
     assert refused["answer"] == {"silence": "no reply in 1 s"}
     assert (first["method"], first["answer"]) == ("SystemInfo.getInterfaceVersionCode", {"result": 24000})
+
+
+class Archive:
+    """What `brushloop doctor --report` wrote."""
+
+    def __init__(self, path: Path) -> None:
+        with zipfile.ZipFile(path) as archive:
+            self.framing: Framing = json.loads(archive.read("report.json"))["framing"]
+            self.lines: list[dict[str, Any]] = [json.loads(line) for line in archive.read("arcs.jsonl").splitlines()]
+            """Each has method, params and answer."""
+
+
+class Replayed(ArcsServer):
+    """Gives the answers of an archive, in their order, whatever is asked."""
+
+    def __init__(self, archive: Archive) -> None:
+        super().__init__(World(SimConfig()))
+        self._left = [line["answer"] for line in archive.lines]
+
+    def _answer(self, request: dict[str, Any]) -> bytes:
+        answer = self._left.pop(0)
+        if "silence" in answer or "lost" in answer:
+            self.faults.hang(Fault(device=Device.ROBOT, kind="mute" if "silence" in answer else "drop"))
+        body = {key: value for key, value in answer.items() if key in ("result", "error")}  # of `refused`: neither
+        return json.dumps({"id": request["id"], "jsonrpc": "2.0", **body}).encode()
 
 
 @pytest.mark.parametrize("path", REPORTS, ids=lambda path: path.stem)

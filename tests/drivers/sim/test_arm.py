@@ -172,7 +172,7 @@ class Bench:
         self.world = World(SimConfig(), SimClock(real_s=self.time.seconds))
         self.cabinet = Cabinet(self.world)
         self.table = methods(self.cabinet)
-        self.ask("RobotConfig.setTcpOffset", offset=tool(180.0))
+        self.ask("RobotConfig.setTcpOffset", offset=[0.0, 0.0, 0.18, 0.0, 0.0, 0.0])
 
     def ask(self, method: str, **params: Any) -> Any:
         name = method if method.split(".")[0] in CABINETS_OWN else f"rob1.{method}"
@@ -260,38 +260,3 @@ def test_only_a_person_ends_a_stop_that_drops_the_path(on: Bench, mode: SafetyMo
     assert (on.safety, on.exec_id) == ("Normal", -1)
     assert on.off_mm(NEAR) > 10.0
     assert on.line(NEAR) == 0
-
-
-SHEET = brush_pose(460.0 - 80.0, -110.0 + 100.0, 160.0)
-
-
-def tool(length_mm: float, x_mm: float = 0.0) -> list[float]:
-    return [x_mm / 1e3, 0.0, length_mm / 1e3, 0.0, 0.0, 0.0]
-
-
-def press(on: Bench, depth_mm: float) -> None:
-    """As an operator would teach it: down to the paper and `depth_mm` deeper, by the configured tool."""
-    z_mm = on.world.config.table.paper_z_mm
-    for z in (SHEET.z_mm, z_mm - depth_mm, SHEET.z_mm):
-        on.line(brush_pose(SHEET.x_mm, SHEET.y_mm, z), v=0.2)
-        on.time.pass_s(10.0)
-    on.world.tool()  # the world goes on when someone looks
-
-
-@pytest.mark.parametrize(("configured_mm", "depth_mm"), [(180.0, 10.0), (175.0, 15.0)])
-def test_an_offset_that_is_too_short_presses_deeper_by_as_much(on: Bench, configured_mm: float, depth_mm: float):
-    assert on.ask("RobotConfig.setTcpOffset", offset=tool(configured_mm)) == 0
-    press(on, 10.0)
-    [pressed] = on.world.presses
-    assert pressed.depth_mm == pytest.approx(depth_mm, abs=1e-6)
-
-
-def test_the_tip_goes_round_a_wrong_tool_centre_point(on: Bench):
-    """A turn about the configured point swings a tip that is elsewhere."""
-    on.ask("RobotConfig.setTcpOffset", offset=tool(180.0, x_mm=10.0))
-    here = from_wire(on.ask("RobotState.getTcpPose"))
-    before = on.world.tool()
-    assert on.line(brush_pose(*here.position_mm, heading_deg=90.0), v=1.0) == 0
-    on.time.pass_s(20.0)
-    assert distance(from_wire(on.ask("RobotState.getTcpPose")), here)[0] < 1e-6
-    assert distance(on.world.tool(), before)[0] == pytest.approx(10.0 * math.sqrt(2.0))
