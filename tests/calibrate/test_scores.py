@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterable
 
@@ -148,16 +149,17 @@ def test_a_mark_drawn_by_a_model_is_recognised_by_it(model: str, depth_mm: float
 
 
 @pytest.mark.parametrize(
-    ("images", "command", "strict"),
+    ("depth_mm", "off_px", "commanded_mm", "strict"),
     [
-        (np.roll(images_of(15.0, 0.0), 3, axis=1), (15.0, 0.0), 0.95),  # a millimetre off
-        (images_of(20.0, 0.0), (10.0, 0.0), 0.8),  # twice as deep as commanded
+        (15.0, 3, 15.0, 0.95),  # a millimetre off
+        (20.0, 0, 10.0, 0.8),  # twice as deep as commanded
     ],
 )
 def test_a_wrong_place_or_size_is_forgiven_when_normalised_but_not_in_mm(
-    images: np.ndarray, command: tuple[float, float], strict: float
+    depth_mm: float, off_px: int, commanded_mm: float, strict: float
 ) -> None:
-    values = scores_of(images, *command)["ccd-bsm"][:, 0]
+    images = np.roll(images_of(depth_mm, 0.0), off_px, axis=1)
+    values = scores_of(images, commanded_mm, 0.0)["ccd-bsm"][:, 0]
     assert values[KEYS.index(NORMAL)] > 0.985
     assert values[KEYS.index(MM)] < strict
 
@@ -200,21 +202,23 @@ def press(name: str, shown: tuple[float, float], asked: tuple[float, float], of:
     return drawn_press(stroke, MODEL, *shown)
 
 
-def paired(originals: Iterable[Press], again: Iterable[Press]) -> tuple[list[Pair], dict[str, str]]:
+def paired(of: Iterable[Press], again: Iterable[Press]) -> tuple[list[Pair], dict[str, str]]:
     """Pairs, and why presses are in none."""
     refused: list[tuple[str, str]] = []
-    return pair_up(list(originals), list(again), MODEL, refused), dict(refused)
+    return pair_up(list(of), list(again), MODEL, refused), dict(refused)
 
 
-ORIGINALS = [
-    press("a-r01", (14.6, 5.0), (15.0, 5.0)),
-    press("a-r02", (15.4, 5.0), (15.0, 5.0)),
-    press("b-r01", (19.0, 0.0), (19.0, 0.0)),
-]
+@functools.cache
+def originals() -> list[Press]:
+    return [
+        press("a-r01", (14.6, 5.0), (15.0, 5.0)),
+        press("a-r02", (15.4, 5.0), (15.0, 5.0)),
+        press("b-r01", (19.0, 0.0), (19.0, 0.0)),
+    ]
 
 
 def record_of(again: Iterable[Press]) -> LoopRecord:
-    scores = score_pairs(paired(ORIGINALS, again)[0], ORIGINALS)
+    scores = score_pairs(paired(originals(), again)[0], originals())
     return loop_record("grid", "ab", stats=tuple(statistics_of(scores)))
 
 
@@ -225,7 +229,7 @@ def test_a_press_made_again_beats_the_other_press_of_its_condition_and_what_repe
         press("x~1", (15.0, 5.0), (15.0, 5.0), "x"),
         press("y", (15.0, 5.0), (15.0, 5.0)),
     ]
-    pairs, refused = paired(ORIGINALS, again)
+    pairs, refused = paired(originals(), again)
     names = [(pair.original.stroke.stroke_id, pair.again.stroke.stroke_id) for pair in pairs]
     assert names == [("a-r01", "a-r01~1"), ("a-r02", "a-r02~1")]
     assert refused == {
@@ -233,7 +237,7 @@ def test_a_press_made_again_beats_the_other_press_of_its_condition_and_what_repe
         "y": "repeats no stroke: it has no original that can be used",
         "b-r01": "was not pressed again",
     }
-    scores = score_pairs(pairs, ORIGINALS)
+    scores = score_pairs(pairs, originals())
     csim = {what: scores.of_key(what, MM)[:, 0] for what in scores.models}
     assert csim[AGAIN].min() == pytest.approx(1.0)
     assert csim[ANOTHER].max() < 0.98
