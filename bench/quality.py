@@ -105,7 +105,7 @@ class Bench:
             origin_mm=table.board_origin_mm,
         )
         self.still = self._scene.render(self._away)
-        self.plane = see_board(self.still, self._board)
+        self.plane = see_board(self.still, self._board).plane
         self._presses = 0
 
     def samples(self) -> Iterator[Sample | Blank]:
@@ -223,7 +223,7 @@ class Bench:
         aimed = dataclasses.replace(view, centre_mm=(x, y), turn_deg=0.0, keystone=0.0)
         image = self._render(aimed)
         # The plane as it was taken with the camera like this: nothing moved since, the stroke never was in view.
-        plane = see_board(image, self._board)
+        plane = see_board(image, self._board).plane
         now, self.world.paper.density = self.world.paper.density, already
         before = self._render(aimed)
         self.world.paper.density = now

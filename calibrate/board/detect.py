@@ -162,34 +162,23 @@ def _why_no_board(image: Gray, inner: tuple[int, int]) -> str:
     return f"shows no complete board of {columns} x {rows} inner corners; a plain checkerboard must be fully visible"
 
 
-def _gap_px(pixels: Floats, board_mm: Floats, gap_mm: float) -> float:
-    """Length of `gap_mm` in pixels, where the board is smallest in the photograph."""
-    apart_mm = np.linalg.norm(board_mm[:, None] - board_mm[None], axis=2)
-    apart_px = np.linalg.norm(pixels[:, None] - pixels[None], axis=2)
-    apart_mm[np.diag_indices(len(pixels))] = np.inf
-    nearest = np.argmin(apart_mm, axis=1)
-    rows = np.arange(len(pixels))
-    return float((apart_px[rows, nearest] / apart_mm[rows, nearest]).min()) * gap_mm
-
-
 def _refined(image: Gray, pixels: Floats, board_mm: Floats, square_mm: float, gap_mm: float) -> Floats:
-    gap_px = _gap_px(pixels, board_mm, gap_mm)
+    """(n, 2) corners moved to where their edges cross; `gap_mm` lies between an edge and the nearest marker or edge."""
+    to_image, _ = cv2.findHomography(board_mm, pixels, cv2.LMEDS)
+    if to_image is None:  # pyright: ignore[reportUnnecessaryComparison]
+        return pixels
+    to_px = np.asarray(to_image, np.float64)
+    here = apply(to_px, board_mm)
+    right, down = (apply(to_px, board_mm + step) - here for step in square_mm * np.eye(2))
+    # Where the board is smallest in the photograph.
+    gap_px = gap_mm / square_mm * float(np.linalg.norm([right, down], axis=2).min())
     window = int(np.clip(round(WINDOW_SHARE * gap_px), 2, MOST_WINDOW_PX))
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-4)
     start = pixels.astype(np.float32).reshape(-1, 1, 2).copy()
     fine = np.asarray(cv2.cornerSubPix(image, start, (window, window), (-1, -1), criteria), np.float64).reshape(-1, 2)
     # A corner that moved beyond the window has settled on something else.
     walked = np.linalg.norm(fine - pixels, axis=1) > window
-    fine = np.where(walked[:, None], pixels, fine)
-    to_image, _ = cv2.findHomography(board_mm, fine, cv2.LMEDS)
-    if to_image is None:  # pyright: ignore[reportUnnecessaryComparison]
-        return fine
-    there = apply(np.asarray(to_image, np.float64), board_mm)
-    right, down = (
-        apply(np.asarray(to_image, np.float64), board_mm + step) - there
-        for step in (np.array([square_mm, 0.0]), np.array([0.0, square_mm]))
-    )
-    return on_edges(image, fine, right, down, gap_px)
+    return on_edges(image, np.where(walked[:, None], pixels, fine), right, down, gap_px)
 
 
 def on_edges(image: Gray, pixels: Floats, right_px: Floats, down_px: Floats, gap_px: float) -> Floats:
@@ -199,29 +188,19 @@ def on_edges(image: Gray, pixels: Floats, right_px: Floats, down_px: Floats, gap
     the distance from an edge to the nearest marker or edge.
     """
     across = min(MOST_ACROSS_PX, ACROSS_SHARE * gap_px)
-    if across < LEAST_ACROSS_PX or not len(pixels):
+    if across < LEAST_ACROSS_PX:
         return pixels
-    moved = pixels.copy()
-    first = _edge(image, pixels, right_px, across)
-    second = _edge(image, pixels, down_px, across)
-    for k, corner in enumerate(pixels):
-        rows = [
-            (normal[k] - slope[k] * direction[k], offset[k])
-            for direction, normal, offset, slope, seen in (first, second)
-            if seen[k]
-        ]
-        if len(rows) < 2:
-            continue
-        step = np.linalg.solve(np.array([row for row, _ in rows]), np.array([off for _, off in rows]))
-        if np.linalg.norm(step) <= MOST_WALK_PX:
-            moved[k] = corner + step
-    return moved
+    edges = (_edge(image, pixels, towards_px, across) for towards_px in (right_px, down_px))
+    rows, offsets, seen = (np.stack(both, axis=1) for both in zip(*edges, strict=True))
+    crossing = seen.all(axis=1)
+    rows[~crossing] = np.eye(2)
+    step = np.linalg.solve(rows, offsets[..., None])[..., 0]
+    good = crossing & (np.linalg.norm(step, axis=1) <= MOST_WALK_PX)
+    return np.where(good[:, None], pixels + step, pixels)
 
 
-def _edge(
-    image: Gray, pixels: Floats, towards_px: Floats, across: float
-) -> tuple[Floats, Floats, Floats, Floats, NDArray[np.bool_]]:
-    """Direction and normal (n, 2) of the edge through each corner; its offset, slope and whether it is seen (n,)."""
+def _edge(image: Gray, pixels: Floats, towards_px: Floats, across: float) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Normal (n, 2) of the edge near each corner, its distance along that and whether it is seen (n,)."""
     length = np.linalg.norm(towards_px, axis=1)
     direction = towards_px / length[:, None]
     normal = np.column_stack([-direction[:, 1], direction[:, 0]])
@@ -244,20 +223,16 @@ def _edge(
     contrast = steps.sum(axis=2)
     good = contrast > LEAST_EDGE_CONTRAST * float(np.median(contrast))
     offsets = (steps * between).sum(axis=2) / np.where(good, contrast, 1.0)
-    offset, slope = np.zeros(len(pixels)), np.zeros(len(pixels))
     seen = (good[:, t < 0].mean(axis=1) >= LEAST_SEEN) & (good[:, t > 0].mean(axis=1) >= LEAST_SEEN)
     # A lens bends edges, so a parabola is fitted; its value at the corner is the offset.
     terms = np.stack([np.ones_like(t), t, t * t], axis=1)
-    for k in np.flatnonzero(seen):
-        use = good[k]
-        found = _parabola(terms[use], offsets[k, use])
-        left = np.abs(offsets[k] - terms @ found)
-        use = use & (left < max(0.5, 3.0 * float(np.median(left[use]))))
-        found = _parabola(terms[use], offsets[k, use])
-        offset[k], slope[k] = found[0], found[1]
-    return direction, normal, offset, slope, seen
+    used = good | ~seen[:, None]  # an edge that is not seen gets some parabola, which nobody reads
+    left = np.abs(offsets - _parabolas(terms, offsets, used) @ terms.T)
+    typical = np.nanmedian(np.where(used, left, np.nan), axis=1, keepdims=True)
+    offset, slope, _ = _parabolas(terms, offsets, used & (left < np.maximum(0.5, 3.0 * typical))).T
+    return normal - slope[:, None] * direction, offset, seen
 
 
-def _parabola(terms: Floats, offsets: Floats) -> Floats:
-    found, *_rest = np.linalg.lstsq(terms, offsets, rcond=None)
-    return np.asarray(found, np.float64)
+def _parabolas(terms: Floats, offsets: Floats, used: NDArray[np.bool_]) -> Floats:
+    """(n, 3) the parabola through the used ones of each row of offsets."""
+    return (np.linalg.pinv(terms * used[..., None]) @ (offsets * used)[..., None])[..., 0]

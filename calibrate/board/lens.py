@@ -21,7 +21,6 @@ Gray = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 FITTED = "k1 fitted on the board"
 """Source of a lens where no lens file was given and none was needed."""
-Ways = NDArray[np.int64]
 LEAST_VIEWS = 4
 GOOD_VIEWS = 10
 GOOD_WAYS = 6
@@ -82,13 +81,9 @@ class Lens(Frozen):
         return np.asarray(bent, np.float64).reshape(-1, 2)
 
     def undistort(self, image: Gray) -> Gray:
-        """The photograph as a lens without distortion would have taken it, same size and camera matrix."""
+        """The photograph as a lens without distortion would have taken it. Raises `CaptureRefused` for another size."""
+        self.check_size(image, "the photograph")
         return cast("Gray", cv2.undistort(image, self.camera, np.array(self.distortion)))
-
-
-def rms(residuals: Floats) -> float:
-    """Root mean square of the lengths of (n, 2) residuals."""
-    return float(np.sqrt((residuals**2).sum(axis=1).mean()))
 
 
 def unknown_lens(size_px: tuple[int, int]) -> Lens:
@@ -101,8 +96,7 @@ def unknown_lens(size_px: tuple[int, int]) -> Lens:
 
 def apply(homography: Floats, points: Floats) -> Floats:
     """Map (n, 2) points through a (3, 3) homography."""
-    mapped = np.column_stack([points, np.ones(len(points))]) @ homography.T
-    return mapped[:, :2] / mapped[:, 2:]
+    return np.asarray(cv2.perspectiveTransform(points[None], homography)[0], np.float64)
 
 
 def homography(pixels: Floats, paper_mm: Floats, where: str) -> Floats:
@@ -262,7 +256,7 @@ def guidance(views: Sequence[BoardView], slants_deg: Sequence[float], ways: int 
     return tuple(wanted)
 
 
-def held(normals: Floats) -> Ways:
+def held(normals: Floats) -> NDArray[np.int64]:
     """(n,) index of each board's orientation, from the (n, 3) unit normals of the boards."""
     first, ways = list[Floats](), list[int]()
     for normal in normals:

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.board.detect import find_board
-from brushloop.calibrate.board.lens import Floats, Gray, Lens, apply, homography, rms, unknown_lens
+from brushloop.calibrate.board.lens import Floats, Gray, Lens, apply, homography, unknown_lens
 from brushloop.calibrate.board.spec import BoardSpec, BoardView
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.stats import student_95
@@ -38,6 +38,10 @@ NO_LENS_FILE = (
     "camera.lens_file in rig.toml, or with --lens"
 )
 OTHER_LENS = "distortion remains after the lens was corrected: the lens file is of another camera, or of another focus"
+SAMPLES = 21
+"""Rows and columns of pixels around a corner by which two photographs are compared."""
+LEAST_LIKENESS = 0.99
+"""Least correlation around a corner of a board that has not moved: noise leaves 0.998, half a pixel 0.985 to 0.99."""
 Matrix: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
 """A homography, row by row."""
 
@@ -93,19 +97,53 @@ class Plane(Frozen):
         return self.lens.distorted(apply(np.asarray(np.linalg.inv(self.homography), np.float64), paper_mm))
 
 
-def see_board(image: Gray, spec: BoardSpec, where: str = "camera", lens: Lens | None = None) -> Plane:
-    """Fit the paper plane in an undistorted photograph, or in one seen through a known lens, which is not refitted.
+@dataclass(frozen=True, slots=True)
+class SeenBoard:
+    """The board in an undistorted photograph of a camera that stays where it is."""
+
+    plane: Plane
+    image: Gray
+    corners_px: Floats
+    """(n, 2) that were seen."""
+    square_px: float
+    """Side of a square."""
+
+    def unmoved_in(self, image: Gray) -> bool:
+        """Whether a later photograph shows the same around every corner, in whatever light.
+
+        A board that moved by a pixel does not pass, nor one that is partly hidden, blurred, or another one.
+        """
+        if image.shape != self.image.shape:
+            return False
+        # Half a square to either side: by the markers, a board that moved by whole squares looks different too.
+        reach_px = np.linspace(-0.5, 0.5, SAMPLES) * self.square_px
+        places = self.corners_px[:, None] + np.stack(np.meshgrid(reach_px, reach_px), axis=-1).reshape(-1, 2)
+        columns, rows = np.clip(np.rint(places), 0, np.array(image.shape[::-1]) - 1).astype(np.int64).transpose(2, 0, 1)
+        before, now = (_normalised(each[rows, columns]) for each in (self.image, image))
+        return float((before * now).sum(axis=1).min()) >= LEAST_LIKENESS
+
+
+def _normalised(levels: Gray) -> Floats:
+    """(n, k) gray levels with average 0 and length 1 in each row: light and contrast are taken off."""
+    off = levels - levels.mean(axis=1, keepdims=True)
+    return off / np.maximum(np.linalg.norm(off, axis=1, keepdims=True), 1.0)
+
+
+def see_board(image: Gray, spec: BoardSpec, known: SeenBoard | None = None) -> SeenBoard:
+    """Find the board in an undistorted photograph, and fit the paper plane; `known` again if it has not moved since.
 
     Raises `CalibrationError`; if the lens distorts, the message says what to do about it.
     """
-    view, through = _find(image, spec, where, lens)
-    corners_mm = paper_mm(view, spec)
+    if known is not None and known.unmoved_in(image):
+        return known
+    view = find_board(image, spec, "camera")
+    corners, lens = (view.pixels, paper_mm(view, spec)), unknown_lens(view.size_px)
     try:
-        plane = fit_plane(view.pixels, corners_mm, through, where, radial_terms=0)
+        plane = fit_plane(*corners, lens, view.name, radial_terms=0)
     except CalibrationError:
-        _check_distortion(fit_plane(view.pixels, corners_mm, through, where), lens, where)
+        _check_distortion(fit_plane(*corners, lens, view.name), None, view.name)
         raise
-    return plane.model_copy(update={"flags": view.flags})
+    return SeenBoard(plane, image, view.pixels, spec.square_mm / plane.mm_per_px)
 
 
 def see_board_and_lens(
@@ -116,8 +154,10 @@ def see_board_and_lens(
     A sheet of `sheet_mm` may lie on the board. Raises `CalibrationError`, also for a lens that distorts more than is
     known.
     """
-    view, through = _find(image, spec, where, lens, sheet_mm)
-    plane = fit_plane(view.pixels, paper_mm(view, spec), through, where)
+    if lens is not None:
+        lens.check_size(image, where)
+    view = find_board(image, spec, where, None if sheet_mm is None else corners_beside(spec, sheet_mm))
+    plane = fit_plane(view.pixels, paper_mm(view, spec), lens or unknown_lens(view.size_px), where)
     _check_distortion(plane, lens, where)
     return view, plane.model_copy(update={"flags": view.flags})
 
@@ -140,21 +180,10 @@ def paper_mm(view: BoardView, spec: BoardSpec) -> Floats:
 def corners_beside(spec: BoardSpec, sheet_mm: tuple[float, float]) -> int:
     """Number of corners at least half a square outside a sheet that lies at the origin of the paper frame."""
     (columns, rows), side, (x_mm, y_mm) = spec.squares, spec.square_mm, spec.origin_mm
-    across = x_mm + side * np.arange(1, columns)
-    along = y_mm + side * np.arange(1, rows)
-    gap_mm = 0.5 * side
-    clear_x = (across <= -gap_mm) | (across >= sheet_mm[0] + gap_mm)
-    clear_y = (along <= -gap_mm) | (along >= sheet_mm[1] + gap_mm)
-    return int((clear_x[:, None] | clear_y[None, :]).sum())
-
-
-def _find(
-    image: Gray, spec: BoardSpec, where: str, lens: Lens | None, sheet_mm: tuple[float, float] | None = None
-) -> tuple[BoardView, Lens]:
-    if lens is not None:
-        lens.check_size(image, where)
-    view = find_board(image, spec, where, None if sheet_mm is None else corners_beside(spec, sheet_mm))
-    return view, lens or unknown_lens(view.size_px)
+    # Counted from the middle of the sheet.
+    across = np.abs(x_mm + side * np.arange(1, columns) - 0.5 * sheet_mm[0]) >= 0.5 * (sheet_mm[0] + side)
+    along = np.abs(y_mm + side * np.arange(1, rows) - 0.5 * sheet_mm[1]) >= 0.5 * (sheet_mm[1] + side)
+    return int((across[:, None] | along).sum())
 
 
 def fit_plane(pixels: Floats, paper_mm: Floats, lens: Lens, where: str, radial_terms: int = RADIAL_TERMS) -> Plane:
@@ -192,7 +221,8 @@ def fit_plane(pixels: Floats, paper_mm: Floats, lens: Lens, where: str, radial_t
     reach = student_95(free) * spread
     refined, image_to_paper = model.parts(fitted.x)
     undistorted = lens.undistorted(pixels[kept])
-    flat_rms_px = rms(apply(homography(paper_mm[kept], undistorted, where), paper_mm[kept]) - undistorted)
+    flat = apply(homography(paper_mm[kept], undistorted, where), paper_mm[kept]) - undistorted
+    flat_rms_px = float(np.sqrt(2.0 * np.mean(flat**2)))
     return Plane(
         image_to_paper=cast("Matrix", tuple(image_to_paper.ravel().tolist())),
         mm_per_px=float(np.exp(scale)),

@@ -63,7 +63,7 @@ async def decide(
 def _around(run: RunContext, image: Gray, patch: Patch) -> Gray:
     """The patch and a margin around it, seen from above."""
     window_mm = around(patch.rect_mm, PICTURE_MARGIN_MM, None)
-    return rectify(image, run.view.homography, window_mm, PICTURE_PX_PER_MM)
+    return rectify(image, run.board.plane.homography, window_mm, PICTURE_PX_PER_MM)
 
 
 def marked_bad(run: RunContext) -> list[str]:
@@ -113,17 +113,17 @@ async def board(context: StepContext) -> BoardResult:
 
 def _board(run: RunContext, image: Gray) -> tuple[Plane, tuple[Check, ...]]:
     try:
-        plane = see_board(image, run.rig.config.board)
+        board = see_board(image, run.rig.config.board)
     except CalibrationError as error:
         raise StepError(f"the board is not seen: {error.what}") from None
     if (before := _before_first_mark(run)) is not None:
-        _check_view(before, image, plane, run.rig.config.paper)
-    run.view = plane
+        _check_view(before, image, board.plane, run.rig.config.paper)
+    run.board = board
     limits = run.rig.config.quality
-    frame = Photograph(image, plane, limits).check_frame()
+    frame = Photograph(image, board.plane, limits).check_frame()
     if limits.enabled and frame.cause is not None:
         raise BadPicture(frame.cause.reason)
-    return plane, frame.checks
+    return board.plane, frame.checks
 
 
 def _before_first_mark(run: RunContext) -> BoardResult | None:
@@ -280,7 +280,7 @@ def _judge(run: RunContext, step: CaptureStep, image: Gray, patch: Patch) -> Ver
 
 def _show(context: StepContext, step: CaptureStep, verdict: Verdict | None, image: Gray, patch: Patch) -> None:
     run = context.run
-    photo, binary = pictures_of(image, run.view, patch)
+    photo, binary = pictures_of(image, run.board.plane, patch)
     brush, press = run.rig.config.brush, step.press
     published = FittedPress(brush.radius_mm, brush.length_mm)
     model = None if step.drawn else mark_of(published, press.condition)

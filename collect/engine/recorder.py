@@ -15,7 +15,7 @@ from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
-from brushloop.calibrate.board.pix2len import Plane, see_board
+from brushloop.calibrate.board.pix2len import Plane, SeenBoard, see_board
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.stroke.preprocess import Gray
 from brushloop.collect.engine.control import RunControl
@@ -236,9 +236,9 @@ class RunContext:
     store: SessionStore = field(init=False)
     procedures: Procedures = field(init=False)
     sheet: Sheet = field(init=False)
-    view: Plane = field(init=False)
-    """Where the paper lies in the newest frame in which the board was seen. Set by the BOARD step that comes before the
-    first dip of every process, and raises if no board is seen."""
+    board: SeenBoard = field(init=False)
+    """The board, and with it the paper, where it was seen last. Set by the BOARD step that comes before the first dip
+    of every process, and raises if no board is seen."""
     left_ink_ns: int | None = None
     """Host time at which the brush left the ink; None if another step came since, or it may have lost its ink."""
     sound_frame: Gray | None = None
@@ -262,8 +262,8 @@ class RunContext:
     def image_plane(self, image: Gray) -> Plane:
         """Where the paper lies in this frame: from the board in it, else from the newest frame that showed one."""
         with contextlib.suppress(CalibrationError):
-            self.view = see_board(image, self.rig.config.board)
-        return self.view
+            self.board = see_board(image, self.rig.config.board, self.board)
+        return self.board.plane
 
     def fresh_sheet(self) -> None:
         """Record that a person has put a fresh sheet in."""

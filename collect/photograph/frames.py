@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from brushloop.calibrate.errors import CaptureRefused
 from brushloop.collect.errors import StepError
 from brushloop.collect.rig.config import CameraConfig
 from brushloop.drivers.devices import Camera, Frame, Stamp
@@ -26,21 +27,16 @@ CHANGED_LEVELS = 25.0
 """Difference in gray levels, corrected for the light, from which on a pixel counts as changed."""
 
 
-def undistorted(camera: CameraConfig, image: Gray) -> Gray:
+def undistorted(camera: CameraConfig, photograph: Gray) -> Gray:
     """An (h, w) photograph without the lens distortion that recordings keep.
 
     Raises `StepError` if photographs no longer have the size at which the lens was calibrated.
     """
-    lens = camera.optics
-    if lens is None:
-        return image
-    height, width = image.shape
-    if (width, height) != lens.size_px:
-        raise StepError(
-            f"the camera gives {width} x {height} px, its lens was calibrated at {lens.size_px[0]} x {lens.size_px[1]} "
-            "px: set camera.locked, or calibrate the lens at this size"
-        )
-    return lens.undistort(image)
+    try:
+        return photograph if camera.optics is None else camera.optics.undistort(photograph)
+    except CaptureRefused as error:
+        remedy = "set camera.locked, or calibrate the lens at this size"
+        raise StepError(f"the camera's picture {error.what}: {remedy}") from None
 
 
 def thumbnail(image: Gray) -> Thumbnail:

@@ -99,14 +99,15 @@ async def _asked(finding: Finding, device: Device, look: Callable[[], Awaitable[
 
 
 async def _camera(config: RigConfig, clock: Clock) -> Finding:
-    finding, notices = Finding("camera", config.camera.source), list[str]()
+    finding, notices, lens = Finding("camera", config.camera.source), list[str](), config.camera.optics
     camera = OpenCvCamera(config.camera, clock, notices.append)
 
     async def look() -> None:
         await camera.fresh(Stamp(clock.now_ns()))
         frame = await finding.timed(5, lambda: camera.fresh(Stamp(clock.now_ns())))
         try:
-            plane = await asyncio.to_thread(see_board, frame.image, config.board, lens=config.camera.optics)
+            image = frame.image if lens is None else lens.undistort(frame.image)
+            plane = (await asyncio.to_thread(see_board, image, config.board)).plane
         except CalibrationError as error:
             finding.problem = f"board: {error.what}"
             finding.remedy = "Put the configured board into view, in focus and evenly lit."

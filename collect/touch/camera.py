@@ -52,7 +52,7 @@ def new_marks(config: RigConfig, before: Frame, after: Frame, least_ink_mm2: flo
 
     first, second = (undistorted(config.camera, frame.image) for frame in (before, after))
     try:
-        image_to_paper = see_board(second, config.board).homography
+        image_to_paper = see_board(second, config.board).plane.homography
     except CalibrationError as error:
         raise StepError(f"the board is not seen: {error.what}") from None
     first, second = first.astype(np.float32), second.astype(np.float32)

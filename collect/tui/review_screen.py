@@ -20,7 +20,7 @@ from textual.screen import Screen
 from textual.widgets import Footer, OptionList
 
 from brushloop.calibrate.artefact import FITS, current
-from brushloop.calibrate.board.pix2len import Plane, see_board
+from brushloop.calibrate.board.pix2len import SeenBoard, see_board
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.command import BrushFit
 from brushloop.calibrate.session import rig_of
@@ -92,7 +92,7 @@ class Review:
         if not (folder / JOURNAL_NAME).is_file():
             raise InputError(folder, f"holds no {JOURNAL_NAME}: imported photographs are compared with `validate`")
         check_folder(folder)
-        self._plane: Plane | None = None
+        self._board: SeenBoard | None = None
         self._pictures: dict[int, LastCapture] = {}
         # As the session recorded it: lens files lie beside the rig's own rig.toml, not beside its snapshot here.
         self._rig = rig_of(folder)
@@ -169,14 +169,14 @@ class Review:
         whole = LastCapture(result.press, result.still, result.kept, verdict, image)
         if stroke is None or stroke.cell_mm is None:
             return whole  # a take that does not count has no stroke record
-        if self._rig.lens is not None:
-            image = self._rig.lens.undistort(image)
         try:
-            self._plane = see_board(image, self._rig.board)
+            if self._rig.lens is not None:
+                image = self._rig.lens.undistort(image)
+            self._board = see_board(image, self._rig.board, self._board)
         except CalibrationError:
-            if self._plane is None:
+            if self._board is None:
                 return whole
-        photo, binary = pictures_of(image, self._plane, Patch(0, *stroke.cell_mm))
+        photo, binary = pictures_of(image, self._board.plane, Patch(0, *stroke.cell_mm))
         return replace(whole, photo=photo, binary=binary)
 
 

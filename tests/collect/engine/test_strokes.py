@@ -6,19 +6,18 @@ from __future__ import annotations
 import asyncio
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 
+from brushloop.calibrate.board.pix2len import see_board
 from brushloop.calibrate.calibrated import calibrate_session
 from brushloop.calibrate.commands import CalibrateRequest
 from brushloop.calibrate.compare import KEYS, Alignment, Tone, simulated
-from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.engine import brush as brush_steps
 from brushloop.collect.engine import capture as capturing
-from brushloop.collect.engine import recorder
 from brushloop.collect.engine.capture import mark_of
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.recorder import RunContext, meanwhile
@@ -36,6 +35,7 @@ from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Condition, Topic
 from tests.calibrate.given import kept_lens
+from tests.calibrate.simulated_rigs import boards
 from tests.rigs import Lab
 from tests.runs import answered_alike, ended_by, until, wait_for_end
 
@@ -317,16 +317,19 @@ def test_what_is_no_lens_file_is_refused_in_one_line(bent_lab: Lab) -> None:
         load_rig(rig)
 
 
-def test_a_hidden_board_is_taken_from_the_newest_frame_that_showed_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    def see_board(image: str, _spec: object) -> str:
-        if image == "hidden":
-            raise CalibrationError("camera", "no board")
-        return f"seen in {image}"
-
-    monkeypatch.setattr(recorder, "see_board", see_board)
-    run: Any = SimpleNamespace(view="first seen", rig=SimpleNamespace(config=SimpleNamespace(board=None)))
-    planes = [RunContext.image_plane(run, cast(Any, image)) for image in ("hidden", "frame 2", "hidden")]
-    assert planes == ["first seen", "seen in frame 2", "seen in frame 2"]
+def test_a_board_that_moved_is_searched_again_and_one_that_is_hidden_lies_where_it_was_seen_last() -> None:
+    [shot] = boards(0, 1)
+    first = see_board(shot.image, shot.board)
+    run: Any = SimpleNamespace(board=first, rig=SimpleNamespace(config=SimpleNamespace(board=shot.board)))
+    hidden, dimmed = np.full_like(shot.image, 90), (0.7 * shot.image).astype(np.uint8)
+    assert [RunContext.image_plane(run, image) for image in (hidden, dimmed)] == 2 * [first.plane]
+    # By a square diagonally and by two to the side, corners lie on corners; only the markers differ.
+    square_px = round(first.square_px)
+    for right, down in ((1, 0), (0, -1), (square_px, square_px), (-2 * square_px, 0)):
+        moved = np.roll(shot.image, (down, right), axis=(0, 1))
+        [was, now] = (plane.to_image(np.zeros((1, 2))) for plane in (first.plane, RunContext.image_plane(run, moved)))
+        assert now - was == pytest.approx(np.array([[right, down]]), abs=0.1)
+        assert RunContext.image_plane(run, hidden) is run.board.plane
 
 
 # What a screen shows of a capture, without torch
