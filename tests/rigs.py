@@ -259,7 +259,7 @@ class WirelessRig(LoopbackRig):
             patch = stack.enter_context(pytest.MonkeyPatch.context())
             patch.setattr(devices, "OpenCvCamera", lambda table, clock, _: SceneCamera(self, table, clock))
             patch.setattr(devices, "SriM8123", lambda *arguments: LoopSensor(self, *arguments))
-            patch.setattr("serial.Serial", lambda *_, **__: MemoryLine(self))
+            patch.setattr("serial.Serial", lambda *_, **__: MemoryLine(self.ink and self.ink.instrument))
             for server, port in ((self.arcs, PORTS["arcs"]), (self.rtde, PORTS["rtde"])):
                 await server.start(self.address, port)
                 stack.push_async_callback(server.stop)
@@ -326,28 +326,32 @@ class LoopSensor(SriM8123):
 
 
 class MemoryLine:
-    """The serial line of the ink device: as much of pyserial's `Serial` as its driver uses."""
+    """The serial line of an ink device: as much of pyserial's `Serial` as its driver uses."""
 
-    def __init__(self, rig: WirelessRig) -> None:
-        assert rig.ink is not None
-        self._instrument = rig.ink.instrument
-        self._request, self._reply = bytearray(), b""
+    def __init__(self, instrument: Any) -> None:
+        self.instrument = instrument
+        self.came = b""
+        """What waits to be read."""
+        self._request = bytearray()
 
     @property
     def in_waiting(self) -> int:
-        return len(self._reply)
+        return len(self.came)
 
     def write(self, data: bytes) -> None:
         self._request += data
-        while (request := self._instrument.take(self._request)) is not None:
-            self._reply += self._instrument.answer(request) or b""
+        while (request := self.instrument.take(self._request)) is not None:
+            self.came += self._answered(request)
 
     def read(self, size: int) -> bytes:
-        taken, self._reply = self._reply[:size], self._reply[size:]
+        taken, self.came = self.came[:size], self.came[size:]
         return taken
 
     def close(self) -> None:
         pass
+
+    def _answered(self, request: bytes) -> bytes:
+        return self.instrument.answer(request) or b""
 
 
 @contextlib.contextmanager

@@ -11,6 +11,7 @@ import pytest
 
 from brushloop.drivers.ink import port, pump
 from brushloop.drivers.ink.simulator import GARBAGE
+from tests.rigs import MemoryLine
 from tests.simulated_time import MemoryLoop
 
 PORT = "/dev/ttyUSB0"
@@ -42,45 +43,35 @@ class Script:
         return reply
 
 
-class Line:
-    """As much of pyserial's `Serial` as the driver uses, over an instrument. Time passes while nothing is there."""
+class Line(MemoryLine):
+    """The line of an instrument, with faults. Time passes while nothing is there to be read."""
 
     def __init__(self, instrument: Any) -> None:
-        self.instrument = instrument
+        super().__init__(instrument)
         self.faults: list[str | None] = []
         """Of the next requests, one each: those of the loopback rig, or unplug."""
         self.requests = 0
-        self.came = b""
-        """What waits to be read."""
-        self._request, self._late = bytearray(), b""
-
-    @property
-    def in_waiting(self) -> int:
-        return len(self.came)
+        self._late = b""
 
     def write(self, data: bytes) -> None:
         self.came, self._late = self.came + self._late, b""
-        self._request += data
-        while (request := self.instrument.take(self._request)) is not None:
-            self.requests += 1
-            fault = self.faults.pop(0) if self.faults else None
-            if fault == "unplug":
-                self.faults.append(fault)
-                raise OSError(5, "Input/output error")
-            reply = b"" if fault == "deaf" else self.instrument.answer(request) or b""
-            if fault == "late":
-                self._late = reply  # once the next request is on the line
-            elif fault != "mute":
-                self.came += GARBAGE if reply and fault == "garbage" else reply
+        super().write(data)
 
     def read(self, size: int) -> bytes:
-        taken, self.came = self.came[:size], self.came[size:]
-        if not taken:
+        if not self.came:
             loop().simulated.pass_s(port.POLL_S)
-        return taken
+        return super().read(size)
 
-    def close(self) -> None:
-        pass
+    def _answered(self, request: bytes) -> bytes:
+        self.requests += 1
+        fault = self.faults.pop(0) if self.faults else None
+        if fault == "unplug":
+            self.faults.append(fault)
+            raise OSError(5, "Input/output error")
+        reply = b"" if fault == "deaf" else super()._answered(request)
+        if fault == "late":
+            self._late = reply  # comes once the next request is on the line
+        return {"mute": b"", "late": b"", "garbage": GARBAGE}.get(fault or "", reply)
 
 
 Plug = Callable[[Any], Line]
