@@ -359,8 +359,9 @@ def wireless_lab(folder: Path, config: SimConfig = COARSE) -> Iterator[Lab]:
     """A lab whose runs, within the block, need neither wires nor time; write its files with `coarse` or `sharp`."""
     rig = WirelessRig(config)
     with pytest.MonkeyPatch.context() as patch:
-        # nobody waits for a busy machine here
+        # nobody waits for a busy machine here, nor for its disk: nothing is killed
         patch.setattr(wire, "REPLY_S", 1.0)
+        patch.setattr("os.fsync", lambda _: None)
         patch.setattr("brushloop.collect.engine.engine.connected", rig.connected)
         patch.setattr(Engine, "new_event_loop", staticmethod(lambda: MemoryLoop(rig.time)))
         patch.setattr("brushloop.collect.engine.engine.HostClock", lambda: rig.time)
