@@ -23,7 +23,7 @@ from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.faults import Device, Fault
 from brushloop.drivers.sim.rig import rig_toml
 from tests.command import brushloop
-from tests.drivers.arcs.transcript import Archive
+from tests.drivers.arcs.test_rpc import Archive
 
 if TYPE_CHECKING:
     from tests.rigs import Lab
