@@ -222,8 +222,8 @@ def fault(
     options |= {"for_s": for_s, "late_s": late_s, "id": ident}
     fields = {name: value for name, value in options.items() if value is not None}
     request = {"do": what, **fields}
-    if kind is not None:
-        request = {"do": "add", "fault": {"device": what, "kind": kind, **fields}}
+    if kind is not None or what not in ("list", "clear", "state", "release", "fresh-sheet"):
+        request = {"do": "add", "fault": {"device": what, "kind": kind or "", **fields}}
     answer = ask(control, request)
     say(*(dumps(answer, indent=2).split("\n") if answer else ["done"]))
 

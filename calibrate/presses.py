@@ -91,7 +91,7 @@ def uncommanded(press: Press) -> str:
 
 def cut(press: Press) -> str:
     """Refuse a press of which a part is missing."""
-    return "is cut by the edge of its photograph, patch or field" if press.cut else ""
+    return "is cut by the edge of its photograph, of its patch or of the crop around its touch" if press.cut else ""
 
 
 def too_thin(press: Press) -> str:
@@ -142,7 +142,8 @@ def read_for_fit(place: Path | Recording, progress: Progress = unseen) -> tuple[
     session, refused = open_session(place, "press"), list[Refused]()
     usable = list(read_presses(session, refused, uncommanded, cut, progress=progress))
     if not usable:
-        raise CalibrationError(str(session.recording.path), "holds no press that can be used for a fit")
+        why = ", first: {} {}".format(*refused[0]) if refused else ""
+        raise CalibrationError(str(session.recording.path), f"holds no press that can be used for a fit{why}")
     return session, for_fit(usable, session.header), refused
 
 

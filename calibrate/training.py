@@ -137,11 +137,7 @@ def _samples(file: GeneratorFile, captures: Captures | None) -> Iterator[dict[st
         yield {
             "name": ", ".join(f"{name} {value:.3g}" for name, value in zip(INPUTS, values, strict=True)),
             "csim": 100.0 * csim(target, drawn) if target.any() and drawn.any() else 0.0,
-            "images": {
-                "target": ink_uri(target),
-                "network": ink_uri(drawn),
-                "difference": overlay_uri(target, drawn),
-            },
+            "images": {"target": ink_uri(target), "network": ink_uri(drawn), "difference": overlay_uri(target, drawn)},
         }
 
 

@@ -27,6 +27,7 @@ from brushloop.sessions.events import Begin, Done, Event, Lost, Repaired, parse_
 from brushloop.sessions.records import Header, Topic
 
 JOURNAL_NAME = "journal.jsonl"
+RIG_EFFECTIVE, PROTOCOL_EFFECTIVE = "rig.effective.json", "protocol.effective.json"
 MAX_JOURNAL_BYTES = 256 * 1024 * 1024
 """Several times the journal of 20,000 strokes."""
 Line = dict[str, Any]

@@ -83,9 +83,10 @@ class McapFile:
 
     def sound(self) -> McapFile:
         """The file itself. Raises `InputError` if it is none of MCAP, `SessionDamaged` if anything is damaged."""
+        if self.damage[:1] == [_NOT_MCAP]:
+            raise InputError(self.path, f"{_NOT_MCAP}: give a session's folder or its .mcap file")
         if self.damage:
-            kind = InputError if self.damage[0] == _NOT_MCAP else SessionDamaged
-            raise kind(self.path, f"cannot read: {'; '.join(self.damage)}")
+            raise SessionDamaged(self.path, f"cannot read: {'; '.join(self.damage)}")
         return self
 
     @property

@@ -16,7 +16,7 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from brushloop.sessions.disk import check_folder
+from brushloop.sessions.disk import check_folder, read_bounded
 from brushloop.sessions.errors import InputError, SessionError
 from brushloop.sessions.events import CaptureResult, step_words
 from brushloop.sessions.journal import JOURNAL_NAME, KILLED, RunState, read_header, replay
@@ -37,7 +37,7 @@ class Details:
     finished: dict[str, int] = field(default_factory=dict[str, int])
     """Finished steps by kind."""
     void: list[str] = field(default_factory=list[str])
-    """Attempts that were cut, and why."""
+    """Attempts that were interrupted, and why."""
     next: str = ""
     """Step under way when the last process ended; empty where none was."""
     strokes: int = 0
@@ -52,6 +52,8 @@ class Details:
     file: str = ""
     """The merged file, once there is one."""
     repairs: list[str] = field(default_factory=list[str])
+    verdict: str = ""
+    """What its newest report says in one sentence; empty where it was not analysed."""
 
 
 def details(path: Path) -> Details:
@@ -85,6 +87,8 @@ def _of_journal(folder: Path) -> Details:
     shown.strokes, shown.marked_bad = len(pressed), len(kept) - len(pressed)
     shown.conditions, shown.planned = _conditions([(one.depth_mm, one.tilt_deg) for one in pressed], header)
     shown.repairs = [f"{repair.event} {repair.file}: {repair.why}" for repair in state.repairs]
+    if (verdict := folder / "validation" / "verdict.txt").is_file():
+        shown.verdict = f"{read_bounded(verdict).decode(errors='replace').strip()} (validation/report.html)"
     final = merged_file(folder, state)
     if state.closed is not None and final.is_file():
         shown.file = final.name
@@ -166,7 +170,7 @@ def renderables(details: Details) -> Iterator[RenderableType]:
     """Parts to print, top to bottom."""
     yield _facts(details)
     strokes = [f"{name}: {count}" for name, count in details.conditions.items()]
-    for title, lines in (("Strokes", strokes), ("Cut attempts", details.void), ("Repaired", details.repairs)):
+    for title, lines in (("Strokes", strokes), ("Interrupted attempts", details.void), ("Repaired", details.repairs)):
         if lines:
             yield Text(title, "bold")
             yield from (f"  {line}" for line in lines)
@@ -178,9 +182,12 @@ def _facts(details: Details) -> Table:
     of = f" of {details.planned} planned" if details.planned else ""
     bad = f", and {details.marked_bad} marked bad" if details.marked_bad else ""
     table.add_row("strokes", f"{details.strokes}{of}{bad}")
+    if details.verdict:
+        table.add_row("report", details.verdict)
     steps = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in details.finished.items())
     if details.finished or details.void:
-        table.add_row("steps", f"finished: {steps or 'none'}; cut: {len(details.void)}")
+        interrupted = f"; {len(details.void)} interrupted" if details.void else ""
+        table.add_row("steps", f"{steps or 'none'} finished{interrupted}")
     if details.next:
         table.add_row("next", f"{details.next} (under way when the last process ended)")
     for sheet, used_patches in details.sheets.items():

@@ -240,13 +240,13 @@ def guidance(views: Sequence[BoardView], slants_deg: Sequence[float], ways: int 
     """Instructions for further photographs: what these views, in `ways` orientations of the board, do not cover."""
     wanted: list[str] = []
     if len(views) < GOOD_VIEWS:
-        wanted.append(f"take more photographs ({len(views)} used, {GOOD_VIEWS} are good)")
+        wanted.append(f"take more photographs ({len(views)} of {GOOD_VIEWS} so far)")
     width, height = views[0].size_px
     places = np.concatenate([view.pixels for view in views])
     counts, _, _ = np.histogram2d(places[:, 1], places[:, 0], bins=3, range=((0, height), (0, width)))
     empty = [name for name, count in zip(THIRDS, counts.ravel(), strict=True) if not count]
     if ways < GOOD_WAYS:
-        wanted.append(f"hold the board in more ways ({ways} so far, {GOOD_WAYS} are good)")
+        wanted.append(f"hold the board in more ways ({ways} of {GOOD_WAYS} so far)")
     if empty:
         wanted.append(f"bring the board into the {', '.join(empty)} of the image: no corner was seen there")
     slanted = sum(slant >= LEAST_SLANT_DEG for slant in slants_deg)

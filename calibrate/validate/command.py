@@ -30,7 +30,7 @@ from brushloop.calibrate.report import data_uri, framed, write_files
 from brushloop.calibrate.scores import MEASURES, scores_csv, write_parquet
 from brushloop.calibrate.session import open_session as open_recording
 from brushloop.calibrate.stats import Paired, holm, paired
-from brushloop.calibrate.validate.page import Curve, page_of, read_curve, terminal_lines
+from brushloop.calibrate.validate.page import Curve, page_of, read_curve, terminal_lines, verdict
 from brushloop.calibrate.validate.run import FittedSession, Outcome, Refused, validate_presses
 from brushloop.calibrate.validate.tables import Report, check_gates, parse_gate, report_of, summary_csv
 from brushloop.calibrate.work import cluster, threads
@@ -210,6 +210,7 @@ def _write(outcome: Outcome, folder: Path, curves: Sequence[Curve], beside: Besi
     files["summary.csv"] = summary_csv(report)
     files["failures.csv"] = csv_text(Refused._fields, report.refused)
     files[report.FILE] = report.to_json()
+    files["verdict.txt"] = f"{verdict(report)}\n"
     names = [*files, *write_parquet(outcome.scores, report.label, folder / "scores.parquet")]
     files["report.html"] = page_of(outcome, report, curves, names, beside.figures_13)
     write_files(folder, files)

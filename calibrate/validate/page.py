@@ -316,7 +316,7 @@ def _session(session: Session) -> Iterator[Point]:
         words = f"two zero touches differ by {collected.moved_mm:.2f} mm ({', '.join(collected.touches[:MAX_NAMED])})"
         yield Point(False, f"{words}: presses with the same H do not have the same depth.")
     if session.cut:
-        words = f"{len(session.cut)} strokes are cut by the edge of their photograph or patch"
+        words = f"{len(session.cut)} strokes are cut by the edge of their photograph, patch or crop"
         yield Point(False, f"{words}: their scores are too low.")
     if scale is not None:
         words = f"scale known to ±{100 * scale.relative_reach:.3f} %, board seen to {scale.rms_px:.2f} px."

@@ -45,10 +45,7 @@ ANOTHER = "another press"
 """A capture predicted by other captures of its condition, averaged: how well one press predicts another."""
 LAMBDAS = {"ccd-bsm-lambda-1": 1.0, "ccd-bsm-lambda-pi/2": 0.5 * math.pi}
 """Values compared in addition to lambda = pi, which is CCD-BSM itself: the paper's figure 3."""
-ORDER = (
-    *("ccd-bsmg", "ccd-bsm", FITTED, FITTED_HELD_OUT, "bezier", BEZIER_REFITTED),
-    *("ellipse", "line", "circle"),
-)
+ORDER = ("ccd-bsmg", "ccd-bsm", FITTED, FITTED_HELD_OUT, "bezier", BEZIER_REFITTED, "ellipse", "line", "circle")
 """Of the paper's tables, calibrated next to uncalibrated."""
 COUNTS = (1, 2, 3, 5, 9, 15, 30, 60)
 """Numbers of fitted presses for which similarity is told."""
@@ -271,7 +268,8 @@ def _left_out(info: ModelInfo, outlines: Mapping[DepthTilt, Draw | None]) -> Mod
     def mark(at: Condition) -> Mark:
         outline = outlines.get((at.depth_mm, at.tilt_deg))
         if outline is None:
-            raise DomainError("depth_mm", at.depth_mm, "other conditions", "they do not determine this press")
+            hint = f"at tilt_deg = {at.tilt_deg:g}"
+            raise DomainError("depth_mm", at.depth_mm, "what the other conditions determine", hint)
         return outline(at.depth_mm, at.tilt_deg), 0.0
 
     return Model(info, mark)

@@ -79,7 +79,7 @@ GATE = re.compile(
     r"((?P<model>[^:<>=]+):)??((?P<alignment>mm|size-normalised):)?((?P<tone>binary|gray):)?"
     r"(?P<measure>csim|ssim)_(?P<statistic>avg|median|min|max)\s*>=\s*(?P<limit>0|1|[01]?\.\d+)"
 )
-GATE_RULE = "expected [MODEL:][ALIGNMENT:][TONE:]csim_avg>=0.90, with csim or ssim, avg, median, min or max, and 0 to 1"
+GATE_RULE = "must be like csim_avg>=0.90 or ccd-bsm:mm:gray:ssim_min>=0.5 (avg, median, min or max; 0 to 1)"
 
 
 class Collected(Frozen):

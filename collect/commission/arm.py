@@ -145,7 +145,7 @@ class ArmStep(Step):
             name, settings = await _name(controller), await read_back(controller)
             mode, safety = await controller.mode(), await controller.safety()
         visit.say(
-            f"{host}:{port} answers in the {framing} framing: {name}",
+            f"{host}:{port} is {name} ({framing} framing)",
             f"robot mode {mode}, safety {safety}",
             f"set on the pendant: {'; '.join(f'{setting} {value}' for setting, value in settings.words().items())}",
         )

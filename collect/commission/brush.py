@@ -147,9 +147,7 @@ class ForceStep(Step):
         bus = await visit.value("aside.bus", ASK_BUS)
         visit.keep({f"force.{field}": Taught(value, "typed") for field, value in _addressed(bus).items()})
         if not bus:
-            visit.say(
-                "Without a force sensor the height of the paper is found by jogging with keys, when a session starts."
-            )
+            visit.say("Without a force sensor, each session finds the height of the paper by jogging with keys.")
             return
         if "touch.force.push_axis" not in visit.notebook.values:
             await self._pushed(visit)
@@ -165,10 +163,7 @@ class ForceStep(Step):
             noise_n = float(np.std([sample.force_n for sample in samples], axis=0).max()) if samples else math.inf
             visit.say(f"{identity.model}: {len(samples) / REST_S:.0f} rounds/s, noise {noise_n:.4f} N")
             samples.clear()
-            how = (
-                "Push the tip of the brush gently up with a finger for a second, along the brush toward the flange, "
-                "then take the finger away."
-            )
+            how = "Push the tip gently up with a finger, toward the flange, for a second; then take the finger away."
             await visit.brought("push-sensor 0", how)
             await asyncio.sleep(REST_S)
             force_n = strongest(samples)
@@ -179,8 +174,7 @@ class ForceStep(Step):
                 "The sensor counts a push toward the flange as positive: it is mounted, or wired, the other way round "
                 "than usual. push_axis takes this into account; nothing has to be changed."
             )
-        known = "direction within 35 deg, sign certain"
-        visit.keep({"touch.force.push_axis": Taught(axis, how, known=known)})
+        visit.keep({"touch.force.push_axis": Taught(axis, how, known="direction within 35 deg, sign certain")})
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """How zero touch is done: by force, or by jogging, at four points."""

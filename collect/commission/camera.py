@@ -195,7 +195,7 @@ async def _board_in(visit: Visit, picture: Gray, name: str, *, lying: bool) -> B
         if lying and ("another board" in error.what or "arranged" in error.what):
             visit.forget(*PRINTED)
             raise NotAccepted(f"{error.what}.", OTHER_PRINT) from None
-        visit.say(f"The board is not seen: {error.what}", picture=picture, tone="warning")
+        visit.say(f"The board is not seen: the picture {error.what}", picture=picture, tone="warning")
         return None
 
 

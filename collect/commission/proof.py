@@ -129,8 +129,7 @@ class ProofStep(Step):
         )
         visit.say(
             f"touch height {z_mm:.3f} mm ({z_mm - by_hand_mm:+.2f} mm from the touch by hand), {known}",
-            f"self-check: marks {check.offset_mm[0]:+.1f}, {check.offset_mm[1]:+.1f} mm from where they were "
-            f"commanded, turned by {check.turn_deg:+.2f} deg",
+            f"marks off by {check.offset_mm[0]:+.1f}, {check.offset_mm[1]:+.1f} mm, turned {check.turn_deg:+.2f} deg",
             f"{PRESSES} presses passed the quality checks, {again} were repeated; camera delay {delay_ms:.0f} ms",
         )
         if delay_ms > SLOW_CAMERA_MS:

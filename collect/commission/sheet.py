@@ -72,17 +72,18 @@ class SheetStep(Step):
             with visit.asked_again_if_refused(SHEET):
                 fit = fitted(visit.notebook)
             (x, y), (width, height) = fit.origin_mm, fit.size_mm
+            reached = "✓" if fit.origin_sigma_mm <= GOOD_MM else "·"
             visit.say(
-                f"sheet of {width:.1f} x {height:.1f} mm, origin ({x:.2f}, {y:.2f}) mm, known to "
-                f"{fit.origin_sigma_mm:.2f} mm (goal {GOOD_MM:g}), turned by {fit.yaw_deg:.2f} deg, leaning by "
-                f"{fit.plane.slope_deg:.2f} deg; no touch is more than {fit.worst_mm:.2f} mm off."
+                f"sheet: {width:.1f} x {height:.1f} mm, turned by {fit.yaw_deg:.2f} deg, leaning by "
+                f"{fit.plane.slope_deg:.2f} deg; corner ({x:.2f}, {y:.2f}) mm; residuals up to {fit.worst_mm:.2f} mm",
+                f"{reached} standard error of the corner: {fit.origin_sigma_mm:.2f} mm (goal: {GOOD_MM:g} mm)",
             )
             if (sigma_mm := fit.origin_sigma_mm) <= GOOD_MM:
                 return
         if sigma_mm > WORST_MM:
             visit.forget(BOARD, SHEET)
             raise NotAccepted(
-                f"the corner of the sheet is known to {sigma_mm:.2f} mm only.",
+                f"the standard error of the sheet's corner is {sigma_mm:.2f} mm, limit {WORST_MM:g} mm.",
                 "Fix the sheet, hold still while you press Enter, and touch the corners again.",
             )
 

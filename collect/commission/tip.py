@@ -198,7 +198,7 @@ class TipStep(Step):
         if (error_mm := self._tip_error_mm(visit)) > WORST_MM:
             visit.forget("pin")
             raise NotAccepted(
-                f"after {MOST_TOUCHES} touches the tip is known to {error_mm:.2f} mm only.",
+                f"after {MOST_TOUCHES} touches the standard error of the tip is still {error_mm:.2f} mm.",
                 "Fix pin and brush firmly, hold still while you press Enter, and touch the pin again.",
             )
 
@@ -218,10 +218,10 @@ class TipStep(Step):
             visit.forget(f"pin {name}")
             return math.inf
         x, y, z = fit.offset_mm
+        reached = "✓" if fit.error_mm <= GOOD_MM else "·"
         visit.say(
-            f"{len(touches)} touches: the tip is at ({x:.2f}, {y:.2f}, {z:.2f}) mm from the flange, with a standard "
-            f"error of {fit.error_mm:.3f} mm (goal: {GOOD_MM:g} mm); "
-            f"no touch is more than {fit.worst_mm:.2f} mm off."
+            f"tip at ({x:.2f}, {y:.2f}, {z:.2f}) mm from the flange; residuals up to {fit.worst_mm:.2f} mm",
+            f"{reached} standard error after {len(touches)} touches: {fit.error_mm:.3f} mm (goal: {GOOD_MM:g} mm)",
         )
         return fit.error_mm
 
@@ -235,10 +235,7 @@ class TipStep(Step):
                     f"after {MOST_UPRIGHTS} holds the direction of the brush is not known to {WORST_DEG:g} deg.",
                     "Hold the brush along a set square, not by eye; or skip the holds: it is then not measured.",
                 )
-            how = (
-                f"Upright {index + 1} of {UPRIGHTS}: the brush upright along the set square, the wrist turned "
-                "differently each time, anywhere over the table."
-            )
+            how = f"Upright {index + 1} of {UPRIGHTS}: brush along the set square, wrist turned differently each time."
             if not await touch(visit, f"upright {index}", how, may_skip=True):
                 if measured_axis(visit.notebook) is None:
                     visit.say("The direction of the brush is not measured.", tone="warning")
@@ -264,8 +261,8 @@ class TipStep(Step):
                 visit.forget(*(f"upright {name}" for name in wrong))
             return False
         if len(holds) >= LEAST_UPRIGHTS:
-            known = f"known to {axis.sigma_deg:.2f} deg (limit {WORST_DEG:g})"
-            visit.say(f"{axis.holds} holds: the direction of the brush is {known}.")
+            reached, error = "✓" if axis.sigma_deg <= WORST_DEG else "·", f"{axis.sigma_deg:.2f} deg"
+            visit.say(f"{reached} standard error after {axis.holds} holds: {error} (goal: {WORST_DEG:g} deg)")
         return axis.holds >= UPRIGHTS and axis.sigma_deg <= WORST_DEG
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:

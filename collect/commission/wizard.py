@@ -111,7 +111,7 @@ class Wizard:
         self._visit.save(notebook.finished(step.name))
         if changed:
             self._visit.say("Changed with it, because it depends on this step:", *changed)
-        self._visit.say(f"{step.title}: done")
+        self._visit.say(f"✓ {step.title}: done")
 
     def _written(self) -> Path:
         """Write `rig.toml`, which says whether it is proven; an older file with another text is kept.

@@ -26,11 +26,10 @@ from brushloop.drivers.host import Clock
 from brushloop.sessions.disk import MAX_SNAPSHOT_BYTES, check_folder, read_bounded
 from brushloop.sessions.errors import InputError, SessionError
 from brushloop.sessions.events import CaptureResult, PressResult
-from brushloop.sessions.journal import JOURNAL_NAME, replay
+from brushloop.sessions.journal import JOURNAL_NAME, PROTOCOL_EFFECTIVE, RIG_EFFECTIVE, replay
 from brushloop.sessions.records import Header, Source
 from brushloop.sessions.store import SessionStore
 
-RIG_EFFECTIVE, PROTOCOL_EFFECTIVE = "rig.effective.json", "protocol.effective.json"
 COMPARED = {RIG_EFFECTIVE: "rig.toml", PROTOCOL_EFFECTIVE: "protocol.toml"}
 """Files whose values are compared, environment and side files included, and the names by which users know them."""
 MACHINE_NAMES = {

@@ -74,7 +74,7 @@ def resume_question(session_id: str, ended: str, hardware: str) -> Prompt:
         f"Resume {session_id}? {before}\n{hardware}The arm first lifts the brush slowly and parks; the board and the "
         "paper are found again, and the plan goes on. No stroke is made twice."
     )
-    resume = "resume: the arm is at rest, the cell is clear, my hand is at the emergency stop"
+    resume = "resume: the arm is at rest, nobody is within its reach, my hand is at the emergency stop"
     return Prompt(text, (Choice(GO_ON, resume), Choice(STOP.key, "do not resume")), STOP.key)
 
 
@@ -132,7 +132,7 @@ def accept_question(result: StepResult, config: RigConfig) -> Prompt:
         case _:
             facts = []
     good = all(within is not False for _name, _value, within in facts)
-    verdict = f"{TITLES[result.kind]}: " + ("all within limits." if good else "not all is within limits.")
+    verdict = f"{TITLES[result.kind]}: " + ("all within limits." if good else "not everything is within limits.")
     lines = [f"{SIGNS[within]} {name:<{NAME}} {value}" for name, value, within in facts]
     choices = [Choice(GO_ON, "good, go on" if good else "go on anyway"), AGAIN]
     if isinstance(result, ZeroTouchResult):
@@ -147,37 +147,32 @@ def _within(name: str, value: float, limit: float, shown: str) -> Fact:
 
 def _board(result: BoardResult, config: RigConfig) -> Iterator[Fact]:
     delay_ms, jitter_ms = result.camera_delay_ms, result.camera_jitter_ms
-    yield "corners seen", str(result.corners), None
+    yield "corners found", str(result.corners), None
     yield "scale (pix2len)", f"{result.mm_per_px:.4f} mm/px", None
     yield _within("residual of corners", result.rms_px, WORST_RMS_PX, f"{result.rms_px:.2f} px")
     if delay_ms is not None and jitter_ms is not None:
         yield _within("delay of the camera", delay_ms, config.camera.max_delay_ms, f"{delay_ms:.0f} ms")
-        yield _within("variation of the delay", jitter_ms, config.camera.max_jitter_ms, f"{jitter_ms:.0f} ms")
+        yield _within("the delay varies by", jitter_ms, config.camera.max_jitter_ms, f"{jitter_ms:.0f} ms")
     for check in result.checks:
-        score = check.score or 0.0
-        if check.name == "blurred":
-            yield "focus: blur", f"{score:.2f} mm  (at most {check.threshold:g})", check.passed
-        elif check.name == "exposure":
-            yield "light: paper", f"level {score:.0f}", check.passed
+        name = {"blurred": "blur of edges", "exposure": "paper's brightness"}.get(check.name, check.name)
+        yield name, f"{check.score:.3g} {check.unit}  (limit {check.threshold:g})", check.passed
 
 
 def _touch(result: ZeroTouchResult, config: RigConfig) -> Iterator[Fact]:
     touch, method = config.touch, result.method
     taught = method == "taught"
-    yield "method", "taught height, visited" if taught else method, None
+    yield "method", "the taught height" if taught else method, None
     for number, point in enumerate(result.points, 1):
         where = f"point {number} ({point.x_mm:.0f}, {point.y_mm:.0f})"
-        if taught:
-            yield where, f"rests at {point.z_mm:.2f} mm", None
-            continue
         yield where, f"{point.z_mm:.3f} mm", None
-        yield _within("  its touches span", point.span_mm, touch.repeatability_mm, f"{point.span_mm:.3f} mm")
+        if not taught:
+            yield _within("  its touches span", point.span_mm, touch.repeatability_mm, f"{point.span_mm:.3f} mm")
     if not taught:
         yield _within("from the height before", result.moved_mm, touch.moved_mm, f"{result.moved_mm:+.3f} mm")
     residuals = [abs(residual_mm) for residual_mm in result.residuals_mm]
     if len(residuals) > 3:
         yield _within("off the plane", max(residuals), touch.residual_mm, f"{max(residuals):.3f} mm")
-    plane = "level: fewer than three points" if len(residuals) < 3 else f"leans by {result.slope_deg:.2f}°"
+    plane = "taken as level: fewer than three points" if len(residuals) < 3 else f"leans by {result.slope_deg:.2f}°"
     yield "plane", plane, None
 
 
@@ -188,4 +183,4 @@ def _self_check(result: SelfCheckResult, config: RigConfig) -> Iterator[Fact]:
     yield _within("marks lie off by", off_mm, limits.offset_mm, f"{off_mm:.2f} mm")
     yield _within("turned by", turn_deg, limits.turn_deg, f"{turn_deg:+.2f}°")
     yield "lengths off by", f"{scale_x:+.2f} % in x, {scale_y:+.2f} % in y", None
-    yield "left over", f"{max(result.residuals_mm):.2f} mm", None
+    yield "largest residual", f"{max(result.residuals_mm):.2f} mm", None

@@ -31,7 +31,7 @@ _R = TypeVar("_R", bound=BaseModel)
 def load_protocol(path: Path) -> ProtocolConfig:
     """Read `protocol.toml` with its side files, or the `.json` that a session keeps. Raises `ConfigError`."""
     if not path.exists():
-        raise ConfigError(path, "", "no such file: --protocol names another one, such as examples/protocol.toml")
+        raise ConfigError(path, "", "no such file: choose another one (--protocol), such as examples/protocol.toml")
     try:
         if path.suffix == ".json":
             return _PROTOCOL.validate_json(read_text(path, MAX_SNAPSHOT_BYTES))

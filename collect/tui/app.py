@@ -39,11 +39,10 @@ NOT_PARKED = yes_or_no(
     "stay",
 )
 UNSEEN = yes_or_no(f"{NOT_AT_REST} Leave this screen anyway?", "leave it as it is", "stay")
-COMMANDS = {"f": ("sessions", "verify"), "c": ("calibrate",), "t": ("fit",), "w": ("validate",)}
-"""What can be done with a session on which no run is in progress, in the order in which it is done."""
 NO_RUN = Snapshot(state=State.DONE)
 """What is shown before the first run of a day and between two of them."""
 LOOK, BACK = Choice("v", "look through the captures"), Choice("q", "back")
+ANALYSE = Choice("a", "analyse: calibrate, fit the brush, compare the models, and write the report")
 
 
 class OperatorApp(PlainApp):
@@ -114,7 +113,7 @@ class OperatorApp(PlainApp):
         from brushloop.collect.tui.review_screen import Review, ReviewScreen  # slow to import
 
         try:
-            self.push_screen(ReviewScreen(Review(folder), self.offer_commands, lambda: self.at_work))
+            self.push_screen(ReviewScreen(Review(folder), lambda: self.at_work))
         except SessionError as error:
             self._complain(error)
 
@@ -213,27 +212,28 @@ class OperatorApp(PlainApp):
             if over and isinstance(self.screen, AskScreen) and self.screen.own:
                 self.pop_screen()  # what it asks about is over
             busy = self.screen is not self._main or self._leave_when_over
+            if self._now.state in FINAL:
+                self.bell()
             if self._now.state is State.DONE and self._now.folder and not busy:
-                self.offer_commands(Path(self._now.folder))
+                self._offer_analysis(Path(self._now.folder))
         if self._leave_when_over and self._now.state in FINAL:
             if self._now.rest_unknown:
                 self._leave_when_over = False  # the operator has to read that first
             else:
                 self._away()
 
-    def offer_commands(self, folder: Path) -> None:
-        """Offer the next commands of a session, one after the other."""
+    def _offer_analysis(self, folder: Path) -> None:
+        """Offer what comes after a finished run."""
 
         def answered(key: str | None) -> None:
-            if key in COMMANDS:
-                self.run_command(*COMMANDS[key], str(folder))
-                self.offer_commands(folder)
+            if key == ANALYSE.key:
+                self.run_command("analyse", str(folder))
+                self._offer_analysis(folder)
             elif key == LOOK.key:
                 self.call_after_refresh(self.action_review)
 
-        choices = [Choice(key, f"brushloop {' '.join(words)}") for key, words in COMMANDS.items()]
-        choices = [*([LOOK] if self.screen is self._main else []), *choices, BACK]
-        self.push_screen(AskScreen(Prompt(f"What comes next with {folder}?", tuple(choices), BACK.key)), answered)
+        question = Prompt(f"What comes next with {folder}?", (LOOK, ANALYSE, BACK), BACK.key)
+        self.push_screen(AskScreen(question), answered)
 
     def _ask(self, engine: Engine, run: RunScreen, now: Snapshot) -> None:
         """Show the engine's question, and take it away once it is answered."""
@@ -246,6 +246,7 @@ class OperatorApp(PlainApp):
             self.pop_screen()
             run.answered()
         if prompt is not None and not isinstance(self.screen, AskScreen):
+            self.bell()  # nobody looks at the screen all the time
             self.push_screen(AskScreen(prompt, partial(engine.answer, prompt.number)))
 
 

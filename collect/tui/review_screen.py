@@ -194,14 +194,13 @@ class ReviewScreen(Screen[None]):
         Binding("escape", "app.pop_screen", "Back"),
         Binding("b", "mark", "Bad / good"),
         Binding("o", "note", "Note"),
-        Binding("f", "finish", "Finish"),
         HELP_KEY,
     ]
 
-    def __init__(self, review: Review, finish: Callable[[Path], None], at_work: Callable[[], bool]) -> None:
-        """`finish` offers the next commands; `at_work` says whether a run is in progress."""
+    def __init__(self, review: Review, at_work: Callable[[], bool]) -> None:
+        """`at_work` says whether a run is in progress."""
         super().__init__()
-        self._review, self._finish, self._at_work = review, finish, at_work
+        self._review, self._at_work = review, at_work
         self._capture: ReviewCapture | None = None
         self._title, self._words = Bar("title"), Line("words")
         self._options = Rows("captures")
@@ -224,8 +223,8 @@ class ReviewScreen(Screen[None]):
         self._list(0)
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
-        """Notes and commands wait until no run is in progress: until then `s` stops the arm."""
-        if action in ("note", "finish"):
+        """Notes wait until no run is in progress: until then `s` stops the arm."""
+        if action == "note":
             return not self._at_work()
         return super().check_action(action, parameters)
 
@@ -267,10 +266,6 @@ class ReviewScreen(Screen[None]):
 
             question = f"{capture.press.stroke_id}: a note. Enter keeps it, escape leaves it."
             app_of(self).push_screen(AskScreen(Prompt(question, default=capture.note, read=str)), answered)
-
-    def action_finish(self) -> None:
-        """Show what can be done with the session."""
-        self._finish(self._review.folder)
 
     def _remark(self, capture: ReviewCapture, *, bad: bool, note: str) -> None:
         still, stroke_id = capture.result.still, capture.press.stroke_id

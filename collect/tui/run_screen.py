@@ -69,6 +69,8 @@ SHEET_SIGNS: dict[Mark | None, tuple[str, str]] = {
 }
 SHARP_PX = 2.0
 """Blur in the full frame below which the lens is in focus: a hint for turning it; the step's own check decides."""
+BLACK_LEVEL = 40
+"""Brightest pixel, of 255, of a picture that counts as black: the noise of a camera stays below."""
 EIGHTHS = " ▁▂▃▄▅▆▇█"
 LEAST_SCALE_N = 0.1
 """Smallest full scale of that drawing, so that noise is not stretched: a soft brush pushes with a few tens of mN."""
@@ -282,8 +284,9 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
     def _show_state(self, now: Snapshot) -> None:
         state = now.state
         word = f"{state.upper()}\nafter this step" if state is State.PAUSING else state.upper()
-        self._state.show("\n".join(filter(None, (word, no_pose_text(now)))))
-        self._state.set_class(now.no_pose_s is not None, "-silent")
+        black = "camera is black" if now.picture is not None and now.picture.image.max() < BLACK_LEVEL else ""
+        self._state.show("\n".join(filter(None, (word, no_pose_text(now), black))))
+        self._state.set_class(now.no_pose_s is not None or bool(black), "-silent")
         for known in State:
             self._state.set_class(known is state, f"-{known}")
 
@@ -294,13 +297,13 @@ def figures_content(now: Snapshot) -> Content:
     percent = 100 * now.strokes_done // now.strokes_planned if now.strokes_planned else 0
     going_on = "" if now.state in FINAL else f"   {left} left   {eta_text(now) or 'no ETA yet'}"
     strokes = f"{now.strokes_done}/{now.strokes_planned}  {percent} %   elapsed {minutes_text(now.elapsed_s)}{going_on}"
-    counts = [f"attempts cut {now.voids}", f"left out {now.given_up}" if now.given_up else ""]
-    counts.append("ink level unknown" if now.ink_level is None else f"ink {now.ink_level:.0%} of the well")
+    ink = "ink level unknown" if now.ink_level is None else f"ink {now.ink_level:.0%} of the well"
+    counts = f"{now.voids} interrupted   {now.given_up} left out   {ink}"
     warned = "bold $text-warning" if now.voids or now.given_up else ""
     rows: list[tuple[str, Content | str]] = [
         ("Step", Content.styled(one_line(now.step) or "-", "bold")),
         ("Strokes", strokes),
-        ("Counts", Content.styled("   ".join(filter(None, counts)), warned)),
+        ("Counts", Content.styled(counts, warned)),
         *_live_rows(now),
         ("", spark(now.trace_n)),
     ]
@@ -393,8 +396,7 @@ def _capture_words(last: LastCapture) -> Content:
     else:
         lines.append(Content(f"✓ all {len(last.verdict.checks)} checks"))
     if last.likeness is not None:
-        words = f"CCD-BSM as published, right: CSIM {100.0 * last.likeness:.1f} % in mm"
-        lines.append(Content.styled(words, "dim"))
+        lines.append(Content.styled(f"CCD-BSM as published (right): CSIM {100.0 * last.likeness:.1f} %", "dim"))
     return Content("\n").join(lines)
 
 

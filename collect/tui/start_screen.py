@@ -36,6 +36,7 @@ from brushloop.collect.tui.widgets import (
     yes_or_no,
 )
 from brushloop.sessions.errors import SessionError
+from brushloop.sessions.journal import PROTOCOL_EFFECTIVE
 from brushloop.sessions.terminal import text_of
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     from brushloop.sessions.show import Details, Summary
 
 RECENT = 50
+PROTOCOL = Path("protocol.toml")
 BESIDE_COLUMNS = 6
 """Columns beside the text about a session: its border, its padding and its scroll bar."""
 SIGNS = {"open": ("▶", "bold $text-warning"), "damaged": ("!", "bold $text-error")}
@@ -56,7 +58,8 @@ class SessionBrowser:
     root: Path = Path("sessions")
     """Folder that holds sessions."""
     config: Path = Path("rig.toml")
-    protocol: Path = Path("protocol.toml")
+    protocol: Path = PROTOCOL
+    """What to press; where there is no such file, the protocol of the newest session."""
 
     def recent(self) -> list[Summary]:
         """The newest sessions first; empty if there is no folder yet."""
@@ -89,7 +92,7 @@ class SessionBrowser:
         """
         from brushloop.collect.engine import CollectRequest
         from brushloop.collect.engine.engine import engine_for
-        from brushloop.collect.engine.open_or_resume import PROTOCOL_EFFECTIVE, Opening
+        from brushloop.collect.engine.open_or_resume import Opening
 
         request = CollectRequest(self.config, self.protocol, self.root, on_screen=True, guided=True)
         if session_id is None:
@@ -112,6 +115,7 @@ class StartScreen(Screen[None]):
     """
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("n", "new", "New session"),
+        Binding("a", "analyse", "Analyse", tooltip="calibrate, fit and validate: from the photographs to the report"),
         Binding("d", "health", "Rig health"),
         Binding("e", "file('rig')", "Files"),
         Binding("q", "app.quit", "Leave"),
@@ -149,12 +153,15 @@ class StartScreen(Screen[None]):
         """List the sessions, now and whenever a run may have changed them."""
         browser = self._browser
         self._title.show(f"brushloop   folder of the sessions: {one_line(str(browser.root))}")
-        self._files.show(f"rig {one_line(str(browser.config))}   protocol {one_line(str(browser.protocol))}")
         try:
             self._rows = browser.recent()
         except (SessionError, OSError) as error:
             self.show_trouble(str(error))
             return
+        if self._rows and browser.protocol == PROTOCOL and not PROTOCOL.is_file():
+            last = browser.root / self._rows[0].session_id / PROTOCOL_EFFECTIVE
+            browser.protocol = last if last.is_file() else PROTOCOL
+        self._files.show(f"rig {one_line(str(browser.config))}   protocol {one_line(str(browser.protocol))}")
         self._options.fill(_row_content(row) for row in self._rows)
         self.set_class(not self._rows, "-empty")
         if not self._rows:
@@ -190,9 +197,11 @@ class StartScreen(Screen[None]):
     def action_file(self, what: str) -> None:
         """Ask for the rig's file, then for the protocol's; an empty name, or escape, keeps a file as it is."""
         browser = self._browser
+        paths = [*sorted(Path().glob(f"{what}*.toml")), *sorted(Path("examples").glob(f"{what}*.toml"))]
+        listed = {str(number): path for number, path in enumerate(paths, 1)}
 
         def answered(name: str | None) -> None:
-            path = Path(name.strip()) if name and name.strip() else None
+            path = listed.get(name.strip(), Path(name.strip())) if name and name.strip() else None
             if what == "rig":
                 browser.config = path or browser.config
                 self.action_file("protocol")
@@ -202,8 +211,9 @@ class StartScreen(Screen[None]):
                 self.on_screen_resume()
 
         before = str(browser.config if what == "rig" else browser.protocol)
-        question = Prompt(f"File of the {what}: enter takes it, escape keeps {before}.", default=before, read=str)
-        app_of(self).push_screen(AskScreen(question), answered)
+        picks = "".join(f"\n{number}  {path}" for number, path in listed.items())
+        question = f"File of the {what}: type a number or a path; escape keeps {before}.{picks}"
+        app_of(self).push_screen(AskScreen(Prompt(question, default=before, read=str)), answered)
 
     @work(exclusive=True, group="new")
     async def action_new(self) -> None:
@@ -220,8 +230,13 @@ class StartScreen(Screen[None]):
             if key == YES:
                 self._begin(partial(self._browser.engine, None))
 
-        question = yes_or_no(f"A new session: is a blank sheet in as its sheet 1?\n\n{planned}", "it is in", "back")
-        app_of(self).push_screen(AskScreen(question), answered)
+        question = f"New session: {planned}.\n\nHas a blank sheet been put in? It becomes sheet 1."
+        app_of(self).push_screen(AskScreen(yes_or_no(question, "yes, begin", "back")), answered)
+
+    def action_analyse(self) -> None:
+        """Analyse the session under the cursor in this terminal."""
+        if (at := self._options.highlighted) is not None:
+            self._run_command("analyse", str(self._browser.root / self._rows[at].session_id))
 
     def action_health(self) -> None:
         """Ask every device for its identity and its faults; powers nothing."""
@@ -238,7 +253,7 @@ No session yet. First steps:
 `brushloop rig new` writes it step by step, `brushloop sim --write-rig rig.toml --rate 20` without an arm.
 
 {protocol} 2  What to press: {plain(str(browser.protocol))}
-Copy examples/protocol-quick.toml, or press e and type another path.
+e picks one of the examples, or takes the path of your own.
 
 · 3  Health: d asks every device; nothing is powered.
 

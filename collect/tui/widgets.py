@@ -148,7 +148,7 @@ class AskScreen(ModalScreen[str]):
     """
     BINDINGS: ClassVar[list[BindingType]] = [
         STOP,
-        Binding("q", "leave", "Leave: park the arm, answer nothing"),
+        Binding("q", "leave", "Leave: answer nothing, end the run"),
         Binding("escape", "dismiss", "Back"),
         HELP_KEY,
     ]
@@ -174,7 +174,7 @@ class AskScreen(ModalScreen[str]):
                 picture.show(self.prompt.image)
                 yield picture
             if self.prompt.read is not None:
-                yield Input(self.prompt.default, id="answer", compact=True, select_on_focus=False)
+                yield Input(self.prompt.default, id="answer", compact=True)
             if not self.own:
                 yield self._live
                 yield Static("Waits until it is answered; the arm does not move meanwhile.", markup=False)

@@ -112,7 +112,7 @@ def test_an_artefact_is_named_after_its_contents(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("no json", ": Invalid JSON"),
+        ("no json", "is not JSON"),
         ('{"session_id": "s"}', "image_to_paper: Field required"),
         (CALIBRATION.model_dump_json().replace('"schema_version":4', '"schema_version":5'), "schema_version: Input"),
     ],

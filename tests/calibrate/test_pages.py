@@ -81,7 +81,7 @@ def _written(folder: Path) -> str:
 def test_a_page_is_one_labelled_file_without_scripts_that_fetches_nothing(pages: dict[str, str]) -> None:
     for name, page in pages.items():
         assert len(page.encode()) <= MAX_BYTES, name
-        foreign = r"(?:src|href)=\"(?!data:|#|[\w.-]+\.(?:png|csv|json|parquet)\")[^\"]*\"|<script|@import|<u>"
+        foreign = r"(?:src|href)=\"(?!data:|#|[\w.-]+\.(?:png|csv|json|parquet|txt)\")[^\"]*\"|<script|@import|<u>"
         assert re.findall(foreign, page) == [], name
         assert '<span class="source">' in page
         for figure in re.findall(r"<img[^>]*>", page):

@@ -237,7 +237,7 @@ def test_a_guided_set_up_measures_again_when_it_is_asked_to_and_later_views_of_t
     answer(engine, "Camera, board, scale", "a")
     now = until(engine, lambda now: now.prompt is not None and now.prompt.number == 2)
     assert now.prompt is not None
-    for words in ("all within limits", "corners seen", "scale (pix2len)", "✓ residual of corners"):
+    for words in ("all within limits", "corners found", "scale (pix2len)", "✓ residual of corners"):
         assert words in now.prompt.question
     picture = until(engine, lambda now: now.picture is not None).picture
     assert picture is not None

@@ -143,7 +143,7 @@ async def test_a_tool_that_is_no_number_is_an_error_of_the_device(rig_path: Path
         ((), "rig.toml: no such file: `brushloop rig new`"),
         (("--config", "p.toml"), "p.toml: is a protocol, not a rig: give it to --protocol"),
         (("--config", "r.toml", "--protocol", "r.toml"), "r.toml: is a rig, not a protocol: give it to --config"),
-        (("--config", "r.toml"), "protocol.toml: no such file: --protocol names another one"),
+        (("--config", "r.toml"), "protocol.toml: no such file: choose another one"),
     ],
 )
 @pytest.mark.parametrize("command", ["strokes", "plan"])

@@ -153,7 +153,7 @@ TOUCHED = Prompt(
     "  method               force\n"
     "  point 1 (4, 4)       120.012 mm\n"
     "!   its touches span   0.180 mm  (at most 0.15)\n"
-    "  plane                level: fewer than three points",
+    "  plane                taken as level: fewer than three points",
     (
         Choice("g", "go on anyway"),
         Choice("a", "measure again"),
@@ -287,7 +287,7 @@ def app_of(engine: Any = None, browser: FakeBrowser | None = None) -> OperatorAp
 
 
 def a_review(folder: Path, app: OperatorApp) -> ReviewScreen:
-    return ReviewScreen(FakeReview(folder), app.offer_commands, lambda: app.at_work)
+    return ReviewScreen(FakeReview(folder), lambda: app.at_work)
 
 
 def has_picture(text: str) -> bool:

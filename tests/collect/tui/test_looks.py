@@ -71,10 +71,7 @@ def test_start(snap_compare: Callable[..., bool]) -> None:
     assert snap_compare(app_of(browser=FakeBrowser()), terminal_size=SMALL, run_before=pressing())
 
 
-@pytest.mark.parametrize("keys", [[], ["f"]])
-def test_review(
-    snap_compare: Callable[..., bool], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, keys: list[str]
-) -> None:
+def test_review(snap_compare: Callable[..., bool], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     app = app_of(browser=FakeBrowser())
 
@@ -83,7 +80,6 @@ def test_review(
         app.push_screen(a_review(Path(), app))
         await settled(pilot)
         await pilot.pause(0.2)
-        await pressing(*keys)(pilot)
 
     assert snap_compare(app, terminal_size=SMALL, run_before=review)
 

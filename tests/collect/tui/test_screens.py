@@ -10,16 +10,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from textual.geometry import Region
 from textual.widget import Widget
 from textual.widgets import Static
 
 from brushloop.collect.engine.control import State
+from brushloop.collect.engine.snapshot import Picture
 from brushloop.collect.operator import Choice, Prompt
 from brushloop.collect.tui.pictures import CellPicture, look_for_pixels, picture_widget
 from brushloop.collect.tui.run_screen import RunScreen
-from brushloop.collect.tui.widgets import AskScreen
 from brushloop.sessions.recording import remarks_of
 from tests.collect.tui.fake import FakeBrowser, FakeEngine, a_review, app_of, full_picture, picture, settled, watched
 
@@ -128,11 +129,13 @@ async def test_other_files_can_be_typed_and_letters_of_stop_keys_too() -> None:
     app = app_of(browser=browser)
     async with app.run_test(size=(80, 24)) as pilot:
         await settled(pilot)
-        await pilot.press("e", "ctrl+u", *"s2.toml", "enter", "ctrl+u", "enter")
+        await pilot.press("e", *"s2.toml", "enter", "backspace", "enter")
         text = await settled(pilot)
         assert "rig s2.toml   protocol protocol.toml" in text, "an emptied field leaves the file as it was"
-        await pilot.press("e", *"x", "escape", *"s", "enter")
-        assert "rig s2.toml   protocol protocol.tomls" in await settled(pilot)
+        await pilot.press("e", *"x", "escape")
+        assert "2  examples/protocol-list.toml" in await settled(pilot)
+        await pilot.press("2", "enter")
+        assert "rig s2.toml   protocol examples/protocol-list.toml" in await settled(pilot)
 
 
 async def test_no_note_is_typed_while_a_run_is_in_progress(tmp_path: Path) -> None:
@@ -142,47 +145,45 @@ async def test_no_note_is_typed_while_a_run_is_in_progress(tmp_path: Path) -> No
         for words in ("red button", "s STOP"):
             assert words in text
         assert "o Note" not in text
-        await run.press("o", "f", "s")
+        await run.press("o", "s")
         assert run.engine.calls == ["stop"]
         assert run.app.screen is review
 
 
-async def test_after_a_session_the_next_commands_run_in_the_terminal(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_session_is_analysed_and_the_rig_asked_in_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     ran: list[list[str]] = []
 
     def run(command: list[str], *, check: bool) -> subprocess.CompletedProcess[str]:
         ran.append(command[3:])
         return subprocess.CompletedProcess(command, 0)
 
-    monkeypatch.chdir(tmp_path)
     app = app_of(browser=FakeBrowser())
     monkeypatch.setattr(app, "suspend", nullcontext)
     monkeypatch.setattr("subprocess.run", run)
     monkeypatch.setattr("sys.stdin", io.StringIO())
     async with app.run_test(size=(120, 40)) as pilot:
         await settled(pilot)
-        app.push_screen(a_review(Path(), app))
-        await settled(pilot)
-        await pilot.press("f")
-        assert "c  brushloop calibrate" in await settled(pilot)
-        for key in ("f", "c", "t", "w"):
-            await pilot.press(key)
-            await settled(pilot)
-            assert isinstance(app.screen, AskScreen), "back at the question"
-        await pilot.press("escape", "escape", "d")
-    folder = "2026-11-21-grid-01"
-    assert ran == [
-        ["sessions", "verify", folder],
-        ["calibrate", folder],
-        ["fit", folder],
-        ["validate", folder],
-        ["doctor", "--config", "rig.toml"],
-    ]
+        await pilot.press("down", "a", "d")
+    assert ran == [["analyse", "sessions/2026-11-21-grid-01"], ["doctor", "--config", "rig.toml"]]
 
 
 def test_pictures_work_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "textual_image", None)
     look_for_pixels()
     assert isinstance(picture_widget("x"), CellPicture)
+
+
+async def test_a_camera_that_shows_black_is_a_state_of_the_run() -> None:
+    async with watched(picture(picture=Picture(np.zeros((4, 4), np.uint8))), (80, 24)) as run:
+        assert "camera is black" in await settled(run.pilot)
+
+
+async def test_without_a_protocol_file_that_of_the_newest_session_is_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    kept = Path("sessions/2026-11-21-grid-02/protocol.effective.json")
+    kept.parent.mkdir(parents=True)
+    kept.touch()
+    async with app_of(browser=FakeBrowser()).run_test(size=(120, 40)) as pilot:
+        assert f"protocol {kept}" in await settled(pilot)

@@ -171,7 +171,7 @@ async def test_a_day_at_the_rig(lab: Lab) -> None:
         rig.world.fresh_sheet()
         await operator.answers("g", "Sheet 1 is full")
         await asyncio.to_thread(runs.wait_for_end, operator.engine)
-        await operator.sees(AskScreen, "What comes next", "brushloop calibrate")
+        await operator.sees(AskScreen, "What comes next", "a  analyse")
         assert operator.engine.snapshot().strokes_done == STROKES
 
         # review: one is marked bad with a note
