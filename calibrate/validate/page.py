@@ -331,7 +331,7 @@ def _models(report: Report) -> Iterator[Point]:
     held = _csim(report, FITTED_HELD_OUT)
     if held is not None and held.below_ceiling is not None:
         near = is_near(held.below_ceiling, held.below_interval)
-        words = f"The calibrated model is {_points(held)} below the ceiling; the goal is {NEAR_POINTS:g}"
+        words = f"The calibrated model is {_points(held)} below the ceiling; the project's goal is {NEAR_POINTS:g}"
         yield Point(near, f"{words} (CSIM, mm, binary).")
     elif held is None and not report.source.imported:
         yield Point(None, "No model was calibrated to this brush: run “brushloop fit”, then validate again.")
@@ -347,7 +347,7 @@ def _points(csim: Summary) -> str:
 
 
 def _span(interval: Interval | None) -> str:
-    return "" if interval is None else " (95 % {:.1f} to {:.1f})".format(*interval)
+    return "" if interval is None else " (95 % interval: {:.1f} to {:.1f})".format(*interval)
 
 
 def _label(report: Report, name: str) -> str:
