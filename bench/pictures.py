@@ -59,7 +59,7 @@ DAY_WAIT_S = 1800.0
 """Longest time between two questions: the runs of the proof ask nothing while the brush feels for the paper."""
 PICTURES = {
     "address of the cabinet": "arm",
-    "hold the board": "camera",
+    "hold the second print": "camera",
     "touch 3": "tip",
     "upper right corner of the sheet": "sheet",
     "middle of the well": "places",

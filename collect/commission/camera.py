@@ -164,7 +164,7 @@ class CameraStep(Step):
     async def _held(self, visit: Visit, camera: OpenCvCamera, folder: Path, index: int, views: list[BoardView]) -> bool:
         """Take one photograph of the held board, so that a resumed session does not; False if the person skips it."""
         where = HOLD[index] if index < len(HOLD) else "where it is still missing"
-        how = f"Cover the sheet, and hold the board before the camera, {where}, all of it sharp; keep still."
+        how = f"Cover the sheet, and hold the second print before the camera, {where}, all of it sharp; keep still."
         async with shown_live(visit, camera):
             if not await visit.brought(f"hold-board {index}", how, may_skip=True):
                 return False

@@ -260,8 +260,9 @@ class Engine:
         robot, real = rig.config.robot, not rig.robot_identity.simulated
         hardware = f"{rig.robot_identity.model} at {robot.host}:{robot.port} is real hardware"
         if self._resumes is not None and self._request.on_screen:
-            ended = replay(self._resumes / JOURNAL_NAME).ended
-            prompt = resume_question(self._resumes.name, ended, f"{hardware}. " if real else "")
+            state = replay(self._resumes / JOURNAL_NAME)
+            self._run.progress.count(state)
+            prompt = resume_question(self._resumes.name, state.ended, f"{hardware}. " if real else "")
         elif self._request.armed or not real:
             return
         elif self._request.on_screen:

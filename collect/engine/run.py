@@ -209,7 +209,7 @@ class Run(RunContext):
             self.sheet.free(used, sheet)  # a brush full of ink does not wait for a fresh sheet
         patches = patches_of(step, self.sheet, used, sheet)
         attempt = store.begin(step.key, step.kind, patches=tuple(patch.index for patch in patches), press=press)
-        self.progress.count()
+        self.progress.count(store.state)
         try:
             with self._observed(attempt, patches) as context:
                 result = await self._do(step, context)
@@ -218,7 +218,7 @@ class Run(RunContext):
             self.left_ink_ns = None
             why = "stopped by the operator" if isinstance(error, asyncio.CancelledError) else describe(error)
             await uninterrupted(store.void, attempt, why)
-            self.progress.count()
+            self.progress.count(store.state)
             raise
         if not isinstance(result, DipResult):
             self.left_ink_ns = None
@@ -227,7 +227,7 @@ class Run(RunContext):
             result = result.model_copy(update={"skipped": left_out})
             self.progress.log(f"{left_out.stroke_id}: is left out, as the operator requested")
         await uninterrupted(store.done, attempt, result)
-        self.progress.count()
+        self.progress.count(store.state)
         return result
 
     @contextlib.contextmanager

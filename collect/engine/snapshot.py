@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from brushloop.collect.rig.paper import Sheet
     from brushloop.drivers.devices import ForceSample
     from brushloop.drivers.host import Clock
+    from brushloop.sessions.journal import RunState
     from brushloop.sessions.store import SessionStore
 
 SLOT_NS = 100_000_000
@@ -204,7 +205,6 @@ class Progress:
         self.left = self._planned
         """Those that neither count nor are left out."""
         self._sheet = sheet
-        self._store: SessionStore | None = None
         self._started_ns = clock.now_ns()
         self._over_ns: int | None = None
         self._messages: list[str] = []
@@ -223,9 +223,8 @@ class Progress:
 
     def opened(self, store: SessionStore) -> int:
         """Begin with what a new or resumed session holds; returns how many strokes of it count."""
-        self._store = store
         self._change(session_id=store.folder.name, folder=str(store.folder), source=store.header.source)
-        self.count()
+        self.count(store.state)
         return self._now.strokes_done
 
     def doing(self, what: str) -> None:
@@ -289,10 +288,9 @@ class Progress:
         with self._lock:
             self._now = replace(self._now, **values)
 
-    def count(self) -> None:
+    def count(self, state: RunState) -> None:
         """Count what the journal holds; of strokes that were pressed again after a review, only the repetition."""
-        assert self._store is not None
-        state, plan = self._store.state, self._planned
+        plan = self._planned
         marks: dict[tuple[int | None, int | None], Mark] = dict.fromkeys(state.used_patches, Mark.VOID)
         at_work = False
         for begin in state.running.values():
