@@ -99,7 +99,7 @@ def _command_line() -> str:
     return " ".join(["brushloop", *sys.argv[1:]])
 
 
-Patch = Annotated[float, Option("--patch-mm", min=30, max=500, help="Side of each patch of paper.")]
+Patch = Annotated[float, Option("--cell-mm", min=30, max=500, help="Side of each patch of paper.")]
 Repeats = Annotated[int, Option(min=1, max=1000, help="How often each is written.")]
 Length = Annotated[float, Option(min=5, max=200, help="Length L of the brush.")]
 CharacterData = Annotated[
