@@ -284,10 +284,10 @@ def test_a_misnamed_corner_is_dropped_and_corners_on_no_plane_are_refused() -> N
 
 @pytest.mark.soak
 @pytest.mark.timeout(1800)
-@pytest.mark.parametrize("seed", [0, 1])
-def test_the_interval_of_pix2len_holds_the_truth_as_often_as_it_says(seed: int) -> None:
+def test_the_interval_of_pix2len_holds_the_truth_as_often_as_it_says() -> None:
     held: list[bool] = []
-    for shot in itertools.chain.from_iterable(boards(rig, 40, seed) for rig in range(len(CAMERAS))):
+    rigs = itertools.product(range(len(CAMERAS)), (0, 1))  # two seeds: of 400 boards, 1 % is one standard error
+    for shot in itertools.chain.from_iterable(boards(rig, 40, seed) for rig, seed in rigs):
         plane = plane_of(shot)
         truth = true_scale(shot, plane.middle_px)
         assert plane.mm_per_px == pytest.approx(truth, rel=WORST)
