@@ -41,8 +41,6 @@ FLAWED = {
     Flaw.FAINT: 3394.469,
 }
 """Ink of a press of the default brush with each flaw."""
-EMPTYING = {0.7: 5663.099, 0.4: 3673.846, 0.2: 1883.439, 0.0: 0.0}
-"""Ink of a press of the default brush by ink load."""
 
 
 def test_the_frozen_brushes_and_the_papers_press_and_draw_what_they_always_did() -> None:
@@ -66,11 +64,10 @@ def ink_of(brush: Brush, depth_mm: float = 15.0, ink_load: float = 1.0, **flaw: 
     return float(press.density.sum(dtype=float))
 
 
-def test_a_flaw_and_an_emptying_brush_take_the_ink_that_they_always_took_and_no_touch_none(brush: Brush) -> None:
+def test_a_flaw_takes_the_ink_that_it_always_took_and_without_ink_or_touch_there_is_none(brush: Brush) -> None:
     flawed = {flaw: ink_of(brush, flaw=flaw, severity=0.7) for flaw in FLAWED}
     assert flawed == pytest.approx(FLAWED, rel=1e-5)
-    assert {load: ink_of(brush, ink_load=load) for load in EMPTYING} == pytest.approx(EMPTYING, rel=1e-5)
-    assert ink_of(brush, depth_mm=0.0) == 0.0
+    assert ink_of(brush, depth_mm=0.0) == ink_of(brush, ink_load=0.0) == 0.0
 
 
 @pytest.fixture(scope="module")
@@ -78,40 +75,25 @@ def brush() -> Brush:
     return Brush(BrushSpec())
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"depth_mm": 45.0}, r"depth_mm = 45 is outside -inf \.\. 43\.2"),
-        ({"depth_mm": float("nan")}, "depth_mm = nan is outside"),
-        ({"tilt_deg": -1.0}, r"tilt_deg = -1 is outside 0 \.\. 30"),
-        ({"ink_load": 1.2}, r"ink_load = 1\.2 is outside 0 \.\. 1"),
-    ],
-)
-def test_a_press_out_of_range_is_refused_with_the_range(brush: Brush, change: dict[str, float], message: str) -> None:
-    press: dict[str, Any] = {"depth_mm": 15.0, "tilt_deg": 0.0, "ink_load": 1.0, "press_seed": 1} | change
-    with pytest.raises(ValueError, match=message):
-        brush.press(**press)
-
-
-def written(folder: Path, text: str) -> Path:
-    path = folder / "brush.toml"
-    path.write_text(text)
-    return path
+def test_a_press_out_of_range_is_refused_with_the_range(brush: Brush) -> None:
+    with pytest.raises(ValueError, match=r"depth_mm = nan is outside -inf \.\. 43\."):
+        ink_of(brush, depth_mm=math.nan)
+    with pytest.raises(ValueError, match=r"ink_load = 1\.2 is outside 0 \.\. 1"):
+        ink_of(brush, ink_load=1.2)
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("friction = 3.0", r"brush: friction = 3 is outside 0 \.\. 0\.8"),
-        ("friction = nan", r"brush\.friction: .*finite"),
-        ("bristles = 400.5", r"brush\.bristles: .*integer"),
         ("radius_mm = 19.0\nlength_mm = 40.0", r"brush: length_mm = 40 is outside 57 \.\. 120"),
         ("friction = ", "is not TOML"),
         ("# " + 300_000 * "x", "is larger than 262144 bytes"),
     ],
 )
 def test_a_brush_out_of_range_is_refused_with_file_field_and_range(tmp_path: Path, text: str, message: str) -> None:
-    path = written(tmp_path, f'name = "any"\n[brush]\n{text}\n')
+    path = tmp_path / "brush.toml"
+    path.write_text(f'name = "any"\n[brush]\n{text}\n')
     with pytest.raises(RigRefused, match=message) as refused:
         load_brush(path)
     assert str(refused.value).startswith(f"{path}: ")
@@ -152,11 +134,9 @@ STROKES = [
 ]
 
 
-def run(script: Iterable[Pose], looks_s: Iterable[float] = (), flaw: Flaw | None = None, **config: Any) -> World:
-    """The world after the script, looked at at the given times of its own clock, with a flaw of the second press."""
+def run(script: Iterable[Pose], looks_s: Iterable[float] = (), **config: Any) -> World:
+    """The world after the script, looked at at the given times of its own clock."""
     world = World(SimConfig(**config))
-    if flaw is not None:
-        world.flaws[1] = (flaw, 0.8)
     for pose in script:
         world.motion.add(pose, 200.0, 800.0, now_s=0.0)
     for now_s in looks_s:
@@ -214,15 +194,6 @@ def test_a_contact_that_travels_is_one_drag_and_no_press():
     assert (world.paper.density[rows, 420:560] > 0.3).mean() > 0.9
 
 
-def test_a_scripted_flaw_happens_once_and_is_on_the_answer_sheet():
-    script = [*SCRIPT, *dip(), *press(150.0, 70.0, 15.0)]
-    sound, split = run(script), run(script, flaw=Flaw.SPLIT)
-    assert [p.flaw for p in sound.presses] == [None] * 3
-    assert [p.flaw for p in split.presses] == [None, Flaw.SPLIT, None]
-    differ = np.nonzero((sound.paper.density != split.paper.density).any(axis=0))[0] / 10.0
-    assert 65.0 < differ.min() < differ.max() < 95.0
-
-
 def test_pressing_on_without_a_dip_goes_wrong_by_itself_and_by_the_seed():
     def named(seed: int) -> list[Flaw | None]:
         marks = [pose for n in range(10) for pose in press(20.0 + 21.0 * n, 70.0 + 40.0 * (n % 2), 13.0)]
@@ -267,13 +238,11 @@ REACH_MM = (6.0, 2.0)
 """Where the middle of the test mark lies in the footprint's own frame."""
 
 
-def mark() -> Footprint:
-    """A small disc of ink off the zero-touch point, so that a wrong turn or flip moves it."""
-    origin = (10.0 * PX_PER_MM, 12.0 * PX_PER_MM)
-    x = (np.arange(round(30 * PX_PER_MM)) + 0.5 - origin[0]) / PX_PER_MM
-    y = (origin[1] - np.arange(round(20 * PX_PER_MM)) - 0.5) / PX_PER_MM
-    inside = (x[None, :] - REACH_MM[0]) ** 2 + (y[:, None] - REACH_MM[1]) ** 2 <= 2.0**2
-    return Footprint(inside.astype(np.float32), PX_PER_MM, origin)
+def mark(density: float) -> Footprint:
+    """A small square of ink off the zero-touch point, so that a wrong turn or flip moves it."""
+    image = np.zeros((200, 300), np.float32)
+    image[80:120, 140:180] = density
+    return Footprint(image, PX_PER_MM, (100.0, 120.0))
 
 
 def centroid_mm(paper: Paper) -> tuple[float, float]:
@@ -287,7 +256,7 @@ def centroid_mm(paper: Paper) -> tuple[float, float]:
 @pytest.mark.parametrize("heading_deg", [0.0, 33.0, 90.0, 180.0])
 def test_a_footprint_lands_where_the_brush_touched_turned_to_its_heading(heading_deg: float):
     paper = Paper(80.0, 60.0)
-    paper.lay(mark(), 35.0, 25.0, heading_deg)
+    paper.lay(mark(1.0), 35.0, 25.0, heading_deg)
     cos, sin = math.cos(math.radians(heading_deg)), math.sin(math.radians(heading_deg))
     u, v = REACH_MM
     expected = 35.0 + cos * u - sin * v, 25.0 + sin * u + cos * v
@@ -296,12 +265,8 @@ def test_a_footprint_lands_where_the_brush_touched_turned_to_its_heading(heading
 
 def test_ink_only_adds_up_and_never_beyond_full():
     paper = Paper(60.0, 40.0)
-    half = mark()
-    half = Footprint(0.5 * half.density, half.px_per_mm, half.origin_px)
-    before = paper.density
-    for x_mm in (20.0, 20.0, 22.0):
-        paper.lay(half, x_mm, 20.0, 0.0)
-        assert (paper.density >= before - 1e-6).all()
-        assert paper.density.max() <= 1.0
+    for x_mm, most in ((20.0, 0.5), (20.0, 0.75), (22.0, 0.875)):
         before = paper.density
-    assert before.max() == pytest.approx(0.875)
+        paper.lay(mark(0.5), x_mm, 20.0, 0.0)
+        assert (paper.density >= before - 1e-6).all()
+        assert paper.density.max() == pytest.approx(most)
