@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 from typing import Any
 
 import pytest
 
-from brushloop.drivers.arcs.controller import Controller, RobotMode, SafetyMode
+from brushloop.drivers.arcs.controller import Controller, ReturnCode, RobotMode, SafetyMode
 from brushloop.drivers.arcs.motion import until_settled
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.arcs.settings import Settings, require_same
@@ -21,7 +22,7 @@ from brushloop.drivers.errors import (
     RobotNotSafe,
     SettingsChanged,
 )
-from brushloop.drivers.geometry import brush_pose, distance, from_wire, lean
+from brushloop.drivers.geometry import brush_pose, distance, from_wire, lean, to_wire
 from brushloop.drivers.sim.kinematics import forward, pose_of
 from tests.drivers.arcs.conftest import NEAR, QUICK, Cabinet, MakeArm, enabled
 
@@ -173,6 +174,34 @@ async def test_an_arm_without_power_is_not_as_it_was_left_and_enabling_it_powers
             await refused
     await arm.enable()
     await arm.move(LOW, **QUICK)
+
+
+@pytest.mark.parametrize("wrong", [{"v": 0.0}, {"v": math.nan}, {"blend_radius": 0.0005}, {"blend_radius": 2.0}])
+async def test_a_cabinet_refuses_a_line_with_a_wrong_argument(
+    arm: AuboArcs, other: Controller, cabinet: Cabinet, wrong: dict[str, float]
+):
+    assert await other.ask("MotionControl.moveLine", **{"pose": to_wire(NEAR), "a": 1.0, "v": 0.1, **wrong}) == -5
+    assert cabinet.rests
+
+
+async def test_a_protective_stop_keeps_the_path_until_a_person_unlocks_and_someone_resumes(
+    arm: AuboArcs, other: Controller, cabinet: Cabinet
+):
+    await other.move_line(NEAR, 100.0, 800.0)
+    await asyncio.sleep(0.005)
+    cabinet.cabinet.safety_stop()
+    await asyncio.sleep(0.1)
+    stopped = cabinet.tool
+    assert distance(stopped, NEAR)[0] > 1.0
+    with pytest.raises(RobotNotSafe):
+        await other.move_line(ABOVE, 100.0, 800.0)
+    assert cabinet.cabinet.resume() == ReturnCode.BAD_STATE
+    cabinet.cabinet.release()
+    await asyncio.sleep(0.1)
+    assert cabinet.tool == stopped
+    cabinet.cabinet.resume()
+    await asyncio.sleep(0.1)
+    assert cabinet.tool == NEAR
 
 
 def test_a_tool_that_is_read_back_in_other_angles_is_the_same_tool_and_one_turned_a_little_is_another():

@@ -14,6 +14,7 @@ from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.devices import Pose, QueuedLine
 from brushloop.drivers.errors import ConnectionLost, MotionFailed, MotionRefused, ProtocolViolation, RobotNotSafe
 from brushloop.drivers.geometry import brush_pose, distance
+from brushloop.drivers.sim.cabinet import MOST_MOVES
 from tests.drivers.arcs.conftest import LIMITS, Cabinet, cut
 
 WAY = {"speed_mm_s": 40.0, "acc_mm_s2": 800.0}
@@ -48,6 +49,7 @@ async def way(arm: AuboArcs, cabinet: Cabinet) -> AsyncIterator[asyncio.Task[Non
     task = asyncio.create_task(arm.follow(LONG, **SLOW))
     while cabinet.taken < queueing.MOST_QUEUED or cabinet.cabinet.world.motion.exec_id(cabinet.cabinet.now_s()) < 1:
         await asyncio.sleep(0.01)
+    assert cabinet.queued <= queueing.MOST_QUEUED
     yield task
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
@@ -75,17 +77,6 @@ async def test_the_arm_halts_nowhere_but_at_the_last_pose_having_passed_near_all
         # a corner is cut by less than half its blend
         assert min(math.dist(pose.position_mm, seen.position_mm) for seen in travelled) < 0.6
     assert len(motion.rests) == 1
-
-
-async def test_never_more_lines_are_queued_than_allowed(arm: AuboArcs, cabinet: Cabinet):
-    motion = cabinet.cabinet.world.motion
-    cabinet.cabinet.hold()
-    task = asyncio.create_task(arm.follow(arc(), **WAY))
-    await asyncio.sleep(1.0)
-    assert motion.size == queueing.MOST_QUEUED
-    cabinet.cabinet.resume()
-    await task
-    assert cabinet.taken == len(arc())
 
 
 @pytest.mark.parametrize(
@@ -124,10 +115,15 @@ async def test_a_stop_while_lines_are_being_sent_lets_none_follow(arm: AuboArcs,
     assert cabinet.taken == 1
 
 
-async def test_a_controller_that_holds_few_lines_is_fed_as_it_takes_them(arm: AuboArcs, cabinet: Cabinet):
-    cabinet.refuses_lines(2, lambda _: cabinet.queued >= 3)
-    await arm.follow(arc(), **WAY)
-    assert distance(cabinet.tool, arc()[-1])[0] <= 0.05
+async def test_a_controller_that_holds_few_lines_is_fed_as_it_takes_them(
+    arm: AuboArcs, cabinet: Cabinet, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(queueing, "MOST_QUEUED", 2 * MOST_MOVES)
+    queued: list[int] = []
+    cabinet.before_each("MotionControl.moveLine", lambda _: queued.append(cabinet.queued))
+    await arm.follow(LONG, **WAY)
+    assert max(queued) == MOST_MOVES
+    assert distance(cabinet.tool, LONG[-1])[0] <= 0.05
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 import pytest
 
 from brushloop.drivers.arcs import stopping, wire
-from brushloop.drivers.arcs.controller import RobotMode, SafetyMode
+from brushloop.drivers.arcs.controller import ReturnCode, RobotMode, SafetyMode
 from brushloop.drivers.arcs.motion import durations_s
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.devices import QueuedLine
@@ -49,10 +49,6 @@ async def test_connecting_reports_who_answers_and_where_the_flange_is(
     await arm.close()
     with pytest.raises(NotConnected):
         await arm.stop()
-
-
-async def test_a_slow_turn_on_the_spot_is_given_the_time_it_takes(arm: AuboArcs):
-    await arm.move(brush_pose(*arm.latest().pose.position_mm, heading_deg=90.0), **QUICK)
 
 
 def test_a_line_is_timed_with_its_ramps_and_a_turn_on_the_spot_in_radians():
@@ -145,6 +141,9 @@ async def test_a_safety_stop_in_mid_move_is_named_with_its_condition_and_stays_u
     for attempt in (arm.move(NEAR, **QUICK), arm.enable()):
         with pytest.raises(RobotNotSafe):
             await attempt
+    if mode is SafetyMode.ROBOT_EMERGENCY_STOP:
+        box.safety_stop()  # takes the place of nothing that is worse
+        assert box.power.power_on() == ReturnCode.BAD_STATE
     assert (box.power.safety, box.power.mode) == (mode, power), "nothing clears it"
     box.release()
     box.resume()  # whoever resumes finds no path: the driver's own stop has dropped it

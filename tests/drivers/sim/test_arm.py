@@ -1,4 +1,4 @@
-"""The loopback arm: its joints, its path of lines, rounded corners, stops and holds, and the cabinet that moves it.
+"""The loopback arm: its joints, its path of lines, rounded corners, stops and holds.
 
 Time is turned by the tests.
 """
@@ -8,22 +8,16 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.devices import Pose
-from brushloop.drivers.geometry import brush_pose, distance, from_wire, to_wire
-from brushloop.drivers.sim.cabinet import Cabinet, methods
-from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.geometry import brush_pose, distance, from_wire
 from brushloop.drivers.sim.kinematics import HOME, LIMITS_DEG, forward, inverse, pose_of
 from brushloop.drivers.sim.motion import MotionQueue
-from brushloop.drivers.sim.world import SimClock, World
-from tests.simulated_time import SimulatedTime
 
 joints = st.tuples(*(st.floats(-2.8, 2.8) for _ in range(6)))
 
@@ -157,106 +151,3 @@ def test_a_path_held_anywhere_goes_on_along_itself(
     assert (cornered.exec_id(20.0), cornered.size) == (-1, 0)
     for (_, a), (b, _) in itertools.pairwise(travelled):
         assert distance(a, b)[0] < 1e-6
-
-
-# ---------------------------------------------------------------- the cabinet
-
-CABINETS_OWN = ("RuntimeMachine", "RegisterControl", "SystemInfo")
-
-
-class Bench:
-    """A cabinet whose time the test lets pass, and a caller. The tool is configured as it is."""
-
-    def __init__(self) -> None:
-        self.time = SimulatedTime()
-        self.world = World(SimConfig(), SimClock(real_s=self.time.seconds))
-        self.cabinet = Cabinet(self.world)
-        self.table = methods(self.cabinet)
-        self.ask("RobotConfig.setTcpOffset", offset=[0.0, 0.0, 0.18, 0.0, 0.0, 0.0])
-
-    def ask(self, method: str, **params: Any) -> Any:
-        name = method if method.split(".")[0] in CABINETS_OWN else f"rob1.{method}"
-        return self.table[name](params)
-
-    def line(self, target: Pose, v: float = 0.1, **more: float) -> int:
-        return self.ask("MotionControl.moveLine", pose=to_wire(target), a=1.0, v=v, **more)
-
-    def run(self) -> None:
-        self.ask("RobotManage.poweron")
-        self.time.pass_s(1.5)
-        self.ask("RobotManage.startup")
-        self.time.pass_s(1.5)
-
-    @property
-    def safety(self) -> str:
-        return self.ask("RobotState.getSafetyModeType")
-
-    @property
-    def exec_id(self) -> int:
-        return self.ask("MotionControl.getExecId")
-
-    def off_mm(self, pose: Pose) -> float:
-        return distance(self.world.tool(), pose)[0]
-
-
-@pytest.fixture
-def on() -> Bench:
-    bench = Bench()
-    assert bench.line(NEAR) == -1, "without power it takes no line"
-    bench.run()
-    return bench
-
-
-HERE = brush_pose(250.0, -230.0, 260.0)
-NEAR = brush_pose(350.0, -230.0, 260.0)
-
-
-@pytest.mark.parametrize("wrong", [{"v": 0.0}, {"v": math.nan}, {"blend_radius": 0.0005}, {"blend_radius": 2.0}])
-def test_a_move_with_a_wrong_argument_is_refused(on: Bench, wrong: dict[str, float]):
-    assert on.line(NEAR, **wrong) == -5
-    assert on.exec_id == -1
-
-
-def test_moves_queue_up_to_a_limit_and_the_same_pose_is_ignored(on: Bench):
-    assert on.line(HERE) == 13
-    codes = [on.line(brush_pose(250.0 + k, -230.0, 260.0)) for k in range(1, 67)]
-    assert (codes.count(0), codes.count(2)) == (64, 2)
-    assert on.ask("MotionControl.getQueueSize") == 64
-    on.time.pass_s(100.0)
-    assert on.ask("MotionControl.getQueueSize") == 0
-
-
-def test_a_protective_stop_keeps_the_path_until_a_person_unlocks_and_someone_resumes(on: Bench):
-    on.line(NEAR)
-    on.time.pass_s(0.5)
-    on.cabinet.safety_stop(SafetyMode.PROTECTIVE_STOP)
-    on.time.pass_s(1.0)
-    rest_mm = on.off_mm(NEAR)
-    assert (on.safety, on.exec_id) == ("ProtectiveStop", 0)
-    assert (on.line(HERE), on.ask("RuntimeMachine.resume")) == (1, 1)
-    on.cabinet.release()
-    on.time.pass_s(5.0)
-    assert (on.safety, on.exec_id) == ("Normal", 0)
-    assert on.off_mm(NEAR) == rest_mm
-    on.ask("RuntimeMachine.resume")
-    on.time.pass_s(5.0)
-    assert on.off_mm(NEAR) == 0.0
-
-
-@pytest.mark.parametrize("mode", [SafetyMode.ROBOT_EMERGENCY_STOP, SafetyMode.SAFEGUARD_STOP])
-def test_only_a_person_ends_a_stop_that_drops_the_path(on: Bench, mode: SafetyMode):
-    on.line(NEAR)
-    on.time.pass_s(0.5)
-    on.cabinet.safety_stop(mode)
-    if mode is SafetyMode.ROBOT_EMERGENCY_STOP:
-        on.cabinet.safety_stop(SafetyMode.PROTECTIVE_STOP)  # takes the place of nothing that is worse
-    powered = mode is SafetyMode.SAFEGUARD_STOP
-    assert on.line(NEAR) != 0
-    assert on.ask("RobotState.isPowerOn") is powered
-    assert on.ask("RuntimeMachine.resume") != 0
-    assert on.ask("RobotManage.poweron") == (0 if powered else 1)
-    assert on.cabinet.release() == mode
-    on.run()
-    assert (on.safety, on.exec_id) == ("Normal", -1)
-    assert on.off_mm(NEAR) > 10.0
-    assert on.line(NEAR) == 0
