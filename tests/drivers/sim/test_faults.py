@@ -79,8 +79,6 @@ def test_a_fault_strikes_the_requests_that_its_conditions_name(
     ("fields", "words"),
     [
         ({"kind": "loud"}, "kind = 'loud' is not one of robot's: deaf, drop,"),
-        ({"device": "coffee"}, "device: Input should be 'robot', 'telemetry'"),
-        ({"nth": 0}, "nth: Input should be greater than or equal to 1"),
         ({"device": "telemetry", "on": "moveLine"}, "only the robot has methods"),
         ({"kind": "emergency-stop", "nth": 2}, "counts nothing here"),
         ({"a\nb\x1b[31m": 1}, "Extra inputs are not permitted"),
