@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import math
 import random
@@ -16,7 +15,7 @@ import cbor2
 import pytest
 
 from brushloop.drivers.arcs import wire
-from brushloop.drivers.arcs.telemetry import RtdeStream, decode_message, encode_sample, outputs_of
+from brushloop.drivers.arcs.telemetry import decode_message, encode_sample, outputs_of
 from brushloop.drivers.arcs.wire import (
     FACTORY_LOGIN_TOKEN,
     PING,
@@ -95,10 +94,6 @@ PUBLISHED: list[tuple[bytes, bytes]] = [
     ),
     (encode(LOGIN)[:8], bytes.fromhex("53 4f 46 01 00 00 00 63")),
     (
-        encode_bare_request(1, "getRobotNames", None),
-        b'{"jsonrpc":"2.0","method":"getRobotNames","params":[],"id":1}',
-    ),
-    (
         encode_bare_request(7, "rob1.MotionControl.moveLine", MOVE),
         b'{"jsonrpc":"2.0","method":"rob1.MotionControl.moveLine",'
         b'"params":[[0.4,-0.13,0.2,3.14,0.0,1.57],1.2,0.25,0.0,0.0],"id":7}',
@@ -161,17 +156,6 @@ async def greeted(said: bytes) -> object:
     return outputs
 
 
-async def streamed(data: bytes) -> object:
-    stream = RtdeStream("127.0.0.1", 1)
-    reader = asyncio.StreamReader()
-    stream._stream = reader, None  # type: ignore[assignment]
-    reader.feed_data(data)
-    reader.feed_eof()
-    samples = await stream.samples()
-    assert all(len(values) == 2 for values in samples)
-    return samples
-
-
 async def joined(data: bytes) -> object:
     """The wrenches in a row of frames, each an id of two bytes and what it holds; then a sound round."""
     parts = RoundAssembler()
@@ -210,7 +194,6 @@ READERS: dict[str, tuple[Read, list[bytes], int]] = {
     "a reply": (answered, REPLIES, 4000),
     "a push": (pushed, PUSHES, 5000),
     "a greeting": (greeted, [GREETING, b'{"protocol":"rtde","output":{}}\n\n'], 4000),
-    "a stream of pushes": (streamed, [encode_short(PUSHES[0]) * 3, encode_short(PUSHES[4])], 2000),
     "rounds of the force board": (joined, [ROUND * 3], 2000),
 }
 

@@ -72,13 +72,11 @@ async def test_a_session_reads_like_the_documented_one(scripted: Scripted):
     ("exchanges", "error", "says"),
     [
         ([(LEVEL, b"001 ok 1.5*CD6C\n")], ProtocolViolation, "above 1"),
-        ([(LEVEL, b"001 ok*C626\n")], ProtocolViolation, "not a decimal: ''"),
         ([(LEVEL, b"001 err 6 jammed*4073\n")], InkRefused, "Look at the pump"),
         ([(DOSE, b"001 ok 0.400*8194\n")], DeviceError, r"gave 0.400 ml instead of 0.500 ml"),
-        ([(DOSE, b""), (DOSE, b"")], DeviceTimeout, r"Between 0 and 0.500 ml may be in the well"),
     ],
 )
-async def test_a_reply_that_is_lost_twice_or_makes_no_sense_is_an_error(
+async def test_a_reply_that_makes_no_sense_or_refuses_is_an_error(
     scripted: Scripted, exchanges: list[tuple[bytes, bytes]], error: type[DeviceError], says: str
 ):
     scripted(HELLO, *exchanges)
@@ -112,7 +110,7 @@ async def test_one_fault_gives_the_dose_once_and_one_that_lasts_is_an_error(faul
     assert await station.level() == 0.55
     if fault != "late":
         line.faults = [fault, fault]
-        with pytest.raises((DeviceTimeout, ProtocolViolation), match="may be in the well"):
+        with pytest.raises((DeviceTimeout, ProtocolViolation), match=r"Between 0 and 1\.000 ml may be in the well"):
             await station.dose(1.0)
         assert given_ml(line) == (1.0 if fault == "deaf" else 2.0)
         assert await station.level() == pytest.approx(line.instrument.well.ml / 20.0)
