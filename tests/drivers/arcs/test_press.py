@@ -263,12 +263,10 @@ async def test_a_line_that_comes_during_the_press_is_not_begun(
     assert cabinet.queued == 0
 
 
-@pytest.mark.parametrize("telemetry", [True, False], ids=["by telemetry", "by asking"])
-async def test_a_client_that_stops_the_press_and_sends_its_own_line_is_seen_by_the_way_that_the_tip_took(
-    arm: AuboArcs, cabinet: Cabinet, other: Controller, monkeypatch: pytest.MonkeyPatch, telemetry: bool
+async def test_a_client_that_stops_the_press_and_sends_its_own_line_is_seen_by_asking_for_the_tip(
+    arm: AuboArcs, cabinet: Cabinet, other: Controller, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if not telemetry:
-        monkeypatch.setattr(arm._telemetry, "_take", lambda *_: None)
+    monkeypatch.setattr(arm._telemetry, "_take", lambda *_: None)
     press = asyncio.create_task(arm.sequence(PRESS, acc_mm_s2=ACC))
     await below(cabinet, 200.01)
     await other.halt(2.0)

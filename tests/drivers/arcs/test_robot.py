@@ -190,14 +190,6 @@ async def test_a_stop_gets_through_at_once_whatever_hangs(
         await move
 
 
-async def test_a_line_that_never_arrives_is_a_timeout_and_nothing_has_moved(arm: AuboArcs, cabinet: Cabinet):
-    cabinet.faults.hang(Fault.model_validate({"device": "robot", "kind": "deaf", "on": "moveLine"}))
-    with pytest.raises(DeviceTimeout, match="moveLine"):
-        await arm.move(FAR, **SLOW)
-    assert to_go_mm(cabinet) == pytest.approx(200.0)
-    await arm.move(NEAR, **QUICK)  # after the stop it works again
-
-
 async def test_nothing_moves_while_there_is_no_way_to_stop_it(arm: AuboArcs, cabinet: Cabinet):
     await cabinet.stop()
     with pytest.raises(ConnectionLost):

@@ -101,22 +101,16 @@ async def test_a_cabinet_that_does_not_answer_the_login_is_asked_all_the_same(ca
     assert (first["method"], first["answer"]) == ("SystemInfo.getInterfaceVersionCode", {"result": 24000})
 
 
-class Archive:
-    """What `brushloop doctor --report` wrote."""
+class Replayed(ArcsServer):
+    """Gives the answers of what `brushloop doctor --report` wrote, in their order, whatever is asked."""
 
-    def __init__(self, path: Path) -> None:
-        with zipfile.ZipFile(path) as archive:
+    def __init__(self, report: Path) -> None:
+        super().__init__(World(SimConfig()))
+        with zipfile.ZipFile(report) as archive:
             self.framing: Framing = json.loads(archive.read("report.json"))["framing"]
             self.lines: list[dict[str, Any]] = [json.loads(line) for line in archive.read("arcs.jsonl").splitlines()]
             """Each has method, params and answer."""
-
-
-class Replayed(ArcsServer):
-    """Gives the answers of an archive, in their order, whatever is asked."""
-
-    def __init__(self, archive: Archive) -> None:
-        super().__init__(World(SimConfig()))
-        self._left = [line["answer"] for line in archive.lines]
+        self._left = [line["answer"] for line in self.lines]
 
     def _answer(self, request: dict[str, Any]) -> bytes:
         answer = self._left.pop(0)
@@ -128,12 +122,11 @@ class Replayed(ArcsServer):
 
 @pytest.mark.parametrize("path", REPORTS, ids=lambda path: path.stem)
 async def test_the_same_questions_get_the_same_answers(path: Path) -> None:
-    archive = Archive(path)
-    controller = Replayed(archive)
+    controller = Replayed(path)
     await controller.start(HOST, 0)
-    exchanges = await survey(HOST, controller.port, archive.framing)
+    exchanges = await survey(HOST, controller.port, controller.framing)
     await controller.stop()
-    for exchange, line in zip(exchanges, archive.lines, strict=True):
+    for exchange, line in zip(exchanges, controller.lines, strict=True):
         assert (exchange["method"], exchange["params"]) == (line["method"], line["params"])
         assert exchange["answer"].keys() == line["answer"].keys(), line["method"]
         assert exchange["answer"].get("result") == line["answer"].get("result"), line["method"]
