@@ -36,12 +36,12 @@ if TYPE_CHECKING:
 CHARACTER = "字"
 LOG, BAR = "demo.log", 40
 """The file that gets what the steps print; length of a full bar, in characters."""
-RATE, SEED = 60.0, 1
+RATE, SEED = 100.0, 1
 """Simulated seconds per real second; seed of the rig, of the order of presses, and of the loop."""
 IDLE_EXIT_S = 180.0
 """Time after which the rig of a killed demo ends; the evaluation between two collections takes less."""
-FPS = 12
-"""Pictures per second: a photograph waits for several. Drawing and decoding more would cost what they save."""
+FPS = 24
+"""Pictures per real second: a photograph waits for several, and the delay of a faster camera is known sooner."""
 
 
 @dataclass(frozen=True, slots=True)
