@@ -102,6 +102,8 @@ class Lab:
     processes: list[subprocess.Popen[str]] = field(default_factory=list)
     make: type[Engine] = Engine
     engines: list[Engine] = field(default_factory=list)
+    loop: asyncio.AbstractEventLoop | None = None
+    """In which a rig on sockets is served, by a thread of its own."""
 
     @property
     def sessions(self) -> Path:
@@ -200,8 +202,8 @@ def sharp(lab: Lab, latency_ms: int = 100) -> Lab:
 @contextlib.contextmanager
 def wired_lab(folder: Path, config: SimConfig = COARSE) -> Iterator[Lab]:
     """A coarse lab on sockets, whose processes end with the block."""
-    with in_thread(LoopbackRig(config)) as (rig, _):
-        lab = coarse(Lab(rig, folder))
+    with in_thread(LoopbackRig(config)) as (rig, loop):
+        lab = coarse(Lab(rig, folder, loop=loop))
         for limit in ("max_delay_ms = 3000.0", "max_jitter_ms = 2000.0"):
             lab.edit_rig(limit, f"{limit.partition(' ')[0]} = 10000.0")  # of a busy machine
         yield lab

@@ -14,38 +14,32 @@ import signal
 import subprocess
 import sys
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 import pytest
 
-from brushloop.collect.motion import Procedures
 from brushloop.collect.protocols.config import load_protocol
-from brushloop.collect.rig.config import load_rig
-from brushloop.collect.rig.devices import Rig, make_robot
-from brushloop.collect.rig.paper import Sheet
-from brushloop.drivers.host import HostClock
-from brushloop.drivers.loopback import ask
-from brushloop.drivers.sim.config import Table
 from brushloop.drivers.sim.faults import Phase
 from brushloop.sessions.disk import file_sha256
 from brushloop.sessions.events import CaptureResult
 from brushloop.sessions.journal import JOURNAL_NAME, RunState, replay
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.records import Condition, Stroke
+from brushloop.sessions.records import Stroke
 from brushloop.sessions.verify import verify_session
 from tests.journal_lines import read_lines
-from tests.waiting import wait_until
-
-if TYPE_CHECKING:
-    from tests.rigs import Lab
+from tests.rigs import TOUCH_DEPTH_MM, Lab
+from tests.waiting import PATIENCE_S, wait_until
 
 LONGEST_LIFE_S = 120.0
 START_S, STROKE_S = 3.2, 0.9
 """How long a process takes before its first step, and for each stroke; corrected by what lives really take."""
+BELOW_S = 3.0
+"""Of the rig's time, from the beginning of a descent to the brush above the paper again."""
+WITHIN_S = 5.0
+"""The same from a kill on, whatever it cut."""
 SAME_SPOT_MM = 10.0
 """Patches are at least 24 mm apart."""
 
@@ -59,6 +53,8 @@ class Toll:
     """How much longer lives are than expected on this machine now."""
     kills: int = 0
     """Of living processes."""
+    in_paper: int = 0
+    """Those of them that left the brush in the paper, from where it lifted by itself."""
     sessions: int = 0
 
 
@@ -80,7 +76,8 @@ def test_two_hundred_kills_over_forty_sessions_lose_nothing(lab: Lab) -> None:
     lab.write_protocol(heights="[11.0, 13.0, 15.0]")
     while toll.kills < 200 or toll.sessions < 40:
         session(lab, toll, kills=max(1, -(-(200 - toll.kills) // max(1, 40 - toll.sessions))))
-        sys.stdout.write(f"{toll.kills} kills, {toll.sessions} sessions, nothing lost\n")
+        sys.stdout.write(f"{toll.kills} kills, {toll.in_paper} in the paper, {toll.sessions} sessions, nothing lost\n")
+    assert toll.in_paper >= 10
 
 
 def session(lab: Lab, toll: Toll, kills: int) -> None:
@@ -100,10 +97,12 @@ def session(lab: Lab, toll: Toll, kills: int) -> None:
             wait_for_a_moment(lab, process, toll.rng, toll.pace * life_s, len(known))
             if process.poll() is None:
                 process.kill()
+            in_paper = check_the_brush_lifts(lab)
             _, stderr = process.communicate()
             if process.returncode == -signal.SIGKILL:
                 kills -= 1
                 toll.kills += 1
+                toll.in_paper += in_paper
         else:
             _, stderr = process.communicate(timeout=LONGEST_LIFE_S)
             toll.pace = (time.monotonic() - began) / life_s
@@ -119,10 +118,11 @@ def session(lab: Lab, toll: Toll, kills: int) -> None:
 def wait_for_a_moment(lab: Lab, process: subprocess.Popen[str], rng: random.Random, life_s: float, known: int) -> None:
     """Wait until some random moment of the process's life, or its end.
 
-    Half of the moments are drawn evenly from its whole life, half are aimed at what takes little of it.
+    A third of the moments are drawn evenly from its whole life, the others are aimed at what takes little of it.
     """
-    aim = rng.choice(["life", "life", "life", "opening", "step", "close"])
-    after_s = rng.uniform(0.0, life_s if aim == "life" else 0.3)
+    aim = rng.choice(["life", "life", "opening", "step", "press", "close"])
+    press_s = BELOW_S / lab.rig.config.rate
+    after_s = rng.uniform(0.0, {"life": life_s, "press": press_s}.get(aim, 0.3))
     deadline = time.monotonic() + LONGEST_LIFE_S
 
     def until(happened: Callable[[], bool]) -> None:
@@ -136,6 +136,8 @@ def wait_for_a_moment(lab: Lab, process: subprocess.Popen[str], rng: random.Rand
         case "step":
             begun = rng.randint(1, 12)
             until(lambda: events(lab)[known:].count("begin") >= begun)
+        case "press":
+            until(lambda: seen(lab)[1] < 7.5)
         case "close":
             until(lambda: strokes_left(lab) == 0)
         case _:
@@ -217,113 +219,34 @@ def check_paper(lab: Lab, strokes: list[Stroke], presses_before: int, begun: int
 
 # A press that nobody watches any more: the controller had the lift before the descent began
 
-PAPER_MM = Table().paper_z_mm
-RATE = 4.0
-WITHIN_S = 5.0
-"""Of the rig's time, from the kill to a brush above the paper."""
-PRESS_S = 6.0
-"""The same for a whole press, its way there included."""
-BELOW_S = 3.0
-"""From the beginning of the descent to the brush above the paper again."""
+
+def seen(lab: Lab) -> tuple[float, float, str]:
+    """(simulated seconds, height of the tip above the paper in mm, phase), seen by the thread that serves the rig."""
+
+    async def look() -> dict[str, Any]:
+        return lab.rig.state()
+
+    assert lab.loop is not None
+    state = asyncio.run_coroutine_threadsafe(look(), lab.loop).result(PATIENCE_S)
+    return state["now_s"], state["tip_mm"][2] - lab.rig.config.table.paper_z_mm, state["phase"]
 
 
-async def press_for_ever(path: Path, seed: int) -> None:
-    """Press with only an arm, and say when the first press begins: the process that is killed."""
-    rng, config, clock = random.Random(seed), load_rig(path), HostClock()
-    robot = make_robot(config, clock, lambda _text: None)
-    nothing = cast(Any, None)
-    identity = await robot.connect()
-    procedures = Procedures(Rig(config, clock, robot, nothing, identity, nothing))
-    await robot.enable()
-    await procedures.retreat()
-    sys.stdout.write("pressing\n")
-    sys.stdout.flush()
-    sheet = Sheet(config.paper)
-    for number in itertools.count():
-        patch = sheet.patch(number % sheet.capacity)
-        await procedures.press(
-            patch, Condition(rng.uniform(5.0, 20.0), rng.uniform(0.0, 14.0)), rng.choice([0.0, 0.2, 0.5])
-        )
-
-
-class OwnRig:
-    """A loopback rig in a process of its own: nothing that is killed beside it can hold it up."""
-
-    def __init__(self, folder: Path) -> None:
-        self.toml, self.control = folder / "rig.toml", folder / "control"
-        command = [sys.executable, "-m", "brushloop", "sim", "--write-rig", str(self.toml), "--rate", str(RATE)]
-        self.process = subprocess.Popen([*command, "--control", str(self.control)], stdout=subprocess.DEVNULL)
-        wait_until(self.toml.exists, "rig.toml", process=self.process)
-
-    def state(self) -> tuple[float, float, str]:
-        """(simulated seconds, height of the tip above the paper in mm, phase)."""
-        state = ask(self.control, {"do": "state"})
-        return state["now_s"], state["tip_mm"][2] - PAPER_MM, state["phase"]
-
-
-@pytest.fixture(scope="module")
-def own_rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OwnRig]:
-    rig = OwnRig(tmp_path_factory.mktemp("rig"))
-    yield rig
-    rig.process.terminate()
-    rig.process.wait()
-
-
-def kill(rig: OwnRig, seed: int, when: Callable[[], None]) -> tuple[str, float]:
-    """(phase of the arm at the kill, height above the paper in mm `WITHIN_S` later). `when` returns at the moment."""
-    command = [sys.executable, "-m", "tests.collect.test_kills", str(rig.toml), str(seed)]
-    killed = False
-    while not killed:
-        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
-            try:
-                assert process.stdout is not None
-                if process.stdout.readline() == "pressing\n":
-                    when()
-                    killed = process.poll() is None  # it may end by itself, where the rig has no time to answer it
-            finally:
-                process.kill()
-    killed_s, _, phase = rig.state()
-    while True:
-        now_s, above_mm, _ = rig.state()
-        if now_s >= killed_s + WITHIN_S:
-            return phase, above_mm
-        time.sleep(0.01)
-
-
-def until_arm(rig: OwnRig, met: Callable[[float, str], bool]) -> None:
-    """Wait for a height above the paper in mm and a phase."""
-    wait_until(lambda: met(*rig.state()[1:]), "a height and a phase")
+def check_the_brush_lifts(lab: Lab, within_s: float = WITHIN_S) -> bool:
+    """Whether a process that was just killed left the brush in the paper, from where it lifts by itself."""
+    killed_s, left_mm, _ = seen(lab)
+    wait_until(lambda: seen(lab)[0] >= killed_s + within_s, "the end of a press")
+    assert seen(lab)[1] > -TOUCH_DEPTH_MM, "the brush is still in the paper"
+    return left_mm < -TOUCH_DEPTH_MM
 
 
 @pytest.mark.parametrize("phase", [pytest.param(Phase.DESCENDING, marks=pytest.mark.soak), Phase.PRESSED])
-def test_killed_with_the_brush_in_the_paper_it_lifts_by_itself(own_rig: OwnRig, phase: Phase):
-    _, above_mm = kill(own_rig, 1, lambda: until_arm(own_rig, lambda at_mm, now: at_mm < -1.0 and now == phase))
-    assert above_mm > 0.5
-
-
-@pytest.mark.soak
-@pytest.mark.timeout(1800)
-def test_fifty_random_moments_of_presses(own_rig: OwnRig):
-    """A third at any moment, the way to the patch included; the others from the beginning of the descent on."""
-    rng, at, deep = random.Random(50), Counter[str](), 0
-    for number in range(50):
-        anywhere = number % 3 == 0
-        after_s = rng.uniform(0.0, 2.0 * PRESS_S if anywhere else BELOW_S) / RATE
-
-        def moment(anywhere: bool = anywhere, after_s: float = after_s) -> None:
-            nonlocal deep
-            if not anywhere:
-                until_arm(own_rig, lambda at_mm, _: at_mm < 7.5)
-            time.sleep(after_s)
-            _, at_mm, phase = own_rig.state()
-            at[phase] += 1
-            deep += at_mm < 0.0
-
-        _, above_mm = kill(own_rig, number, moment)
-        assert above_mm > 0.5, f"kill {number}: the tip is {above_mm:.2f} mm above the paper"
-    sys.stdout.write(f"50 kills: {dict(at)}, {deep} with the brush in the paper\n")
-    assert deep >= 10
-
-
-if __name__ == "__main__":
-    asyncio.run(press_for_ever(Path(sys.argv[1]), int(sys.argv[2])))
+def test_killed_with_the_brush_in_the_paper_it_lifts_by_itself(lab: Lab, phase: Phase) -> None:
+    dwell_s = 60.0
+    lab.edit_rig("press_speed_mm_s = 20.0", "press_speed_mm_s = 1.0")
+    lab.write_protocol("[15.0]", dwell_s=dwell_s)
+    process = lab.process()
+    wait_until(
+        lambda: seen(lab)[1] < -TOUCH_DEPTH_MM and seen(lab)[2] == phase, f"a brush that is {phase}", process=process
+    )
+    process.kill()
+    assert check_the_brush_lifts(lab, dwell_s + 10.0 * WITHIN_S), "it was no longer in the paper"
