@@ -12,27 +12,19 @@ from typing import Any
 import pytest
 
 from brushloop.collect import start
-from brushloop.collect.engine import CollectRequest
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.engine import Engine
-from brushloop.collect.engine.open_or_resume import Opening
 from brushloop.collect.engine.snapshot import Snapshot
-from brushloop.collect.errors import ConfigError, Parked
-from brushloop.collect.protocols.kinds import GridConfig
-from brushloop.collect.rig.config import load_rig
-from brushloop.collect.rig.devices import Rig, make_robot, sole_driver
+from brushloop.collect.errors import CollectAborted, ConfigError, Parked
+from brushloop.collect.rig.devices import sole_driver
 from brushloop.collect.start import ending
 from brushloop.drivers import host as sole
-from brushloop.drivers.devices import Identity
-from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.faults import Phase
-from brushloop.drivers.sim.rig import rig_toml
+from brushloop.drivers.sim.faults import ALWAYS, Device, Fault, Phase
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.store import SessionStore
-from tests.collect.tui.fake import picture, watched
+from tests.collect.tui.fake import picture
 from tests.rigs import Lab
-from tests.runs import until, wait_for_end
+from tests.runs import ended_by, until
 from tests.waiting import wait_until
 
 
@@ -90,13 +82,11 @@ def test_where_nobody_watches_any_more_the_step_ends_and_the_arm_parks(
 def test_a_session_that_is_open_elsewhere_is_refused_before_anything_moves(bare_lab: Lab) -> None:
     lab = bare_lab
     lab.write_protocol()
-    engine = lab.engine()
-    engine.start()
+    engine = lab.started()
     until(engine, lambda now: now.strokes_done == 1)
     engine.park()
-    with pytest.raises(Parked):
-        wait_for_end(engine)
-    elsewhere = SessionStore(lab.session, HandClock().now_ns)
+    ended_by(engine, Parked)
+    elsewhere = SessionStore(lab.session, lambda: 1)
     at = lab.rig.world.tool()
     ran = lab.command()
     assert (ran.returncode, lab.rig.world.tool()) == (2, at)
@@ -176,53 +166,25 @@ def test_the_recording_and_what_comes_next(tmp_path: Path) -> None:
 
 # An arm that no longer sends its pose: every screen says so after a second, long before a call times out
 
-WHO = Identity("aubo_i5", "", True)
 
-
-class HandClock:
-    """Time that a test sets."""
-
-    seconds = 0.0
-
-    def now_ns(self) -> int:
-        return round(self.seconds * 1e9)
-
-
-def test_the_snapshot_says_for_how_long_no_pose_has_come(tmp_path: Path) -> None:
-    (tmp_path / "rig.toml").write_text(rig_toml(SimConfig()))
-    config, clock = load_rig(tmp_path / "rig.toml"), HandClock()
-    robot = make_robot(config, clock, print)
-    devices: Any = robot
-    grid = GridConfig(kind="grid", depths_mm=[11.0], tilts_deg=[0.0])
-    request = CollectRequest(tmp_path / "rig.toml", tmp_path / "protocol.toml")
-    engine = Engine(Opening(request, config, grid, {}), None, clock)
+def test_the_snapshot_says_for_how_long_no_pose_has_come(bare_lab: Lab) -> None:
+    engine, faults = bare_lab.engine(), bare_lab.rig.faults
     assert engine.snapshot().no_pose_s is None, "not connected yet"
-    engine._run.connected(rig := Rig(config, clock, robot, devices, WHO, WHO))
-    engine._rig = rig
-    assert engine.snapshot().no_pose_s is None, "no pose yet"
-    robot._telemetry._take(brush_pose(300.0, 0.0, 200.0))
-
-    for seconds, shown_s in ((0.4, None), (0.9, None), (1.4, 1.4), (20.0, 20.0)):
-        clock.seconds = seconds
-        now = engine.snapshot()
-        assert now.no_pose_s == (None if shown_s is None else pytest.approx(shown_s))
-        assert (now.tip_mm is None) is (seconds > 0.5)
-    robot._telemetry._take(brush_pose(300.0, 0.0, 200.0))
-    assert engine.snapshot().no_pose_s is None, "it sends again"
-    clock.seconds += 30.0
-    engine._run.control.end(State.FAILED)
+    engine.pause()
+    engine.start()
+    until(engine, lambda now: now.state is State.PAUSED and now.tip_mm is not None)
+    faults.hang(Fault(device=Device.TELEMETRY, kind="mute", count=ALWAYS))
+    faults.hang(Fault(device=Device.ROBOT, kind="mute", on="getTcpPose", count=ALWAYS))
+    assert until(engine, lambda now: now.tip_mm is None).no_pose_s is None, "not for a second yet"
+    for shown_s in (1.0, 20.0):
+        now = until(engine, lambda now, least_s=shown_s: (now.no_pose_s or 0.0) >= least_s)
+        assert (now.tip_mm, now.no_pose_s) == (None, pytest.approx(shown_s, abs=0.1))
+    faults.clear()
+    assert until(engine, lambda now: now.tip_mm is not None).no_pose_s is None, "it sends again"
+    engine.stop()
+    ended_by(engine, CollectAborted)
+    bare_lab.rig.time.pass_s(30.0)
     assert engine.snapshot().no_pose_s is None, "a run that is over has let the arm go"
-
-
-async def test_the_run_screen_is_not_green_without_a_pose() -> None:
-    async with watched(picture()) as run:
-        state = run.app.screen.query_one("#state")
-        green = state.styles.background
-        assert "Tip      no pose for 1.4 s" in await run.look(picture(tip_mm=None, no_pose_s=1.44))
-        assert str(state.render()) == "RUNNING\nno pose for 1.4 s"
-        assert state.styles.background != green
-        await run.look(picture())
-        assert (str(state.render()), state.styles.background) == ("RUNNING", green)
 
 
 def test_without_a_screen_it_is_one_line_when_it_begins_and_one_when_it_ends(

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import math
 import threading
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Awaitable, Callable
+from concurrent.futures import wait
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,9 +20,7 @@ from rich.console import Console  # noqa: TID251
 from textual.app import App
 from textual.pilot import Pilot
 
-from brushloop.collect.commission.arm import ASK_ADDRESS
-from brushloop.collect.commission.brush import ASK_BUS, RADIUS
-from brushloop.collect.commission.visit import Visit, choice_of
+from brushloop.collect.commission.visit import Visit
 from brushloop.collect.engine.capture import mark_of
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.engine import Engine
@@ -31,6 +29,7 @@ from brushloop.collect.errors import CollectAborted, ConfigError
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
 from brushloop.collect.photograph.checks import Verdict
 from brushloop.collect.tui.app import OperatorApp
+from brushloop.collect.tui.commission_app import CommissionApp
 from brushloop.collect.tui.review_screen import Review, ReviewCapture, ReviewScreen
 from brushloop.collect.tui.start_screen import SessionBrowser
 from brushloop.drivers.host import HostClock
@@ -38,6 +37,7 @@ from brushloop.model.fitted import FittedPress
 from brushloop.sessions.events import CaptureResult, Press
 from brushloop.sessions.records import Check, Condition, Header, Source
 from brushloop.sessions.show import Details, Summary
+from tests.waiting import until
 
 HEIGHTS_MM = (11.0, 13.0, 15.0, 17.0, 20.0)
 TILTS_DEG = (0.0, 5.0, 10.0)
@@ -347,10 +347,7 @@ async def watched(now: Snapshot, size: tuple[int, int] = (80, 24)) -> AsyncGener
         yield run
 
 
-# A first day that asks one question of each kind
-
-
-TAKE, TOUCH = Choice("y", "yes, take it"), Choice("n", "no, touch it again")
+# A first day
 
 
 def board() -> np.ndarray:
@@ -358,48 +355,36 @@ def board() -> np.ndarray:
     return squares.generateImage((560, 400), marginSize=20)
 
 
+async def brings(visit: Visit) -> bool:
+    """Ask for the tip at a pin, with a picture of the board."""
+    visit.say("the board as the camera sees it", picture=board())
+    how = "Guide the tip to the pin by hand, the brush leaning toward the window, then press Enter."
+    return await visit.brought("pin 2", how, may_skip=True)
+
+
 class Asking:
     """Asks the given questions, and notes the answers."""
 
-    def __init__(self, *kinds: str) -> None:
-        self.kinds = kinds
+    def __init__(self, *questions: Callable[[Visit], Awaitable[object]]) -> None:
+        self.questions = questions
         self.answers: list[object] = []
-        self.at_work = self.stopped_arm = False
         self.visit = Visit(Path("rig.toml"), HostClock(), armed=False)
+        self.app = CommissionApp(self.visit, self)
 
     async def __call__(self) -> None:
         self.visit.step = "step 3 of 9: Tip of the brush, about 8 min"
         self.visit.say("five directions: the tip is known to 0.11 mm", "residuals 0.10, 0.24, 0.08, 0.17, 0.21 mm")
         self.visit.say("direction 2 is like direction 1: lean the brush farther", tone="warning")
-        for kind in self.kinds:
-            self.answers.append(await self._ask(self.visit, kind))
+        for ask in self.questions:
+            self.answers.append(await ask(self.visit))
 
-    async def _ask(self, visit: Visit, kind: str) -> Any:
-        match kind:
-            case "choose":
-                return await visit.ask(choice_of("Take this tip?", (TAKE, TOUCH), "y"))
-            case "no default":
-                return await visit.yes("Is there a pot of water?")
-            case "number":
-                return await visit.ask(RADIUS)
-            case "text":
-                return await visit.ask(replace(ASK_ADDRESS, default="192.0.2.7"))
-            case "empty":
-                return await visit.ask(ASK_BUS)
-            case "bring":
-                visit.say("the board as the camera sees it", picture=board())
-                how = "Guide the tip to the pin by hand, the brush leaning toward the window, then press Enter."
-                return await visit.brought("pin 2", how, may_skip=True)
-            case _:
-                return await self._move(kind)
+    async def asked(self, pilot: Pilot[Any]) -> None:
+        """Once the first question is on the screen."""
+        first_day = self.app.first_day
+        await until(lambda: first_day.is_mounted and first_day.prompt is not None, "the first question")
+        await pilot.pause()
 
-    async def _move(self, kind: str) -> None:
-        """A move that a driver stops when it is cancelled, or a run that ends by itself then."""
-        self.at_work = True
-        try:
-            await asyncio.sleep(60.0)
-        except asyncio.CancelledError:
-            self.stopped_arm = True
-            if kind == "run":
-                raise CollectAborted("stopped") from None
-            raise
+    def end(self) -> None:
+        """Stop what a test has left."""
+        self.app.steps.stop()
+        wait([self.app.steps._outcome])

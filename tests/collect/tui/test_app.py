@@ -23,36 +23,27 @@ from brushloop.collect.tui.widgets import SOFTWARE_STOP, AskScreen
 from tests.collect.tui.fake import FAILED, SPLIT, FakeEngine, Watched, app_of, full_picture, picture, watched
 from tests.waiting import until
 
-AT_WORK = sorted(set(State) - FINAL)
 KEYS = ("space", "r", "k", "n", "j", "b")
+SPACE = {
+    **dict.fromkeys((State.IDLE, State.RECOVERING, State.RUNNING), "pause"),
+    **dict.fromkeys((State.PAUSING, State.PAUSED), "resume"),
+}
+"""What the space bar asks of the engine; nothing in the other states."""
 
 
 def asks(app: OperatorApp) -> bool:
     return isinstance(app.screen, AskScreen) and app.screen.own
 
 
-async def test_space_pauses_and_resumes_and_says_which() -> None:
+async def test_in_every_state_of_a_run_stop_keys_stop_and_space_pauses_or_resumes_where_it_says_so() -> None:
     async with watched(picture()) as run:
-        for state, word, calls in (
-            (State.RUNNING, "space Pause", ["pause"]),
-            (State.PAUSING, "space Resume", ["resume"]),
-            (State.PAUSED, "space Resume", ["resume"]),
-            (State.STOPPING, "", []),
-            (State.DONE, "", []),
-        ):
+        for state in sorted(set(State) - FINAL):
+            text = await run.look(picture(state=state))
             run.engine.calls.clear()
-            assert word in await run.look(picture(state=state))
-            await run.press("space")
-            assert run.engine.calls == calls
-
-
-async def test_stop_keys_stop_in_every_state_of_a_run() -> None:
-    async with watched(picture()) as run:
-        for state in AT_WORK:
-            await run.look(picture(state=state))
-            run.engine.calls.clear()
-            await run.press("s", "ctrl+c")
-            assert run.engine.calls == ["stop", "stop"], state
+            await run.press("space", "s", "ctrl+c")
+            asked = [SPACE[state]] if state in SPACE else []
+            assert run.engine.calls == [*asked, "stop", "stop"], state
+            assert all(f"space {call.title()}" in text for call in asked), text
 
 
 @pytest.mark.parametrize("over", ["q", "question_mark", "enter", "prompt"])

@@ -6,65 +6,68 @@ import asyncio
 import contextlib
 import re
 import threading
-from collections.abc import AsyncIterator, Callable
-from concurrent.futures import wait
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
+from dataclasses import replace
 
 import pytest
 from textual.pilot import Pilot
 
-from brushloop.collect.commission.visit import LeftOff, WentBack
+from brushloop.collect.commission.arm import ASK_ADDRESS
+from brushloop.collect.commission.brush import ASK_BUS, RADIUS
+from brushloop.collect.commission.visit import LeftOff, Visit, WentBack, choice_of
 from brushloop.collect.errors import CollectAborted
+from brushloop.collect.operator import Choice, Prompt
 from brushloop.collect.tui.commission_app import CommissionApp, Steps
 from brushloop.collect.tui.widgets import AskScreen
-from tests.collect.tui.fake import Asking, shown
+from tests.collect.tui.fake import Asking, brings, shown
 from tests.waiting import PATIENCE_S, until
-
-SIZE = (80, 24)
 
 
 @asynccontextmanager
 async def running(asking: Asking) -> AsyncIterator[tuple[CommissionApp, Pilot[None]]]:
-    app = CommissionApp(asking.visit, asking)
-    async with app.run_test(size=SIZE) as pilot:
-        await until(lambda: app.first_day.is_mounted and app.first_day.prompt is not None, "the first question")
-        await pilot.pause()
+    async with asking.app.run_test(size=(80, 24)) as pilot:
+        await asking.asked(pilot)
         try:
-            yield app, pilot
+            yield asking.app, pilot
         finally:
-            app.steps.stop()
-            wait([app.steps._outcome])
+            asking.end()
 
 
-async def seen(app: CommissionApp, pilot: Pilot[None], condition: Callable[[], bool]) -> None:
-    await until(condition, "what the screen is to show")
-    await pilot.pause()
+def asks(prompt: Prompt) -> Callable[[Visit], Awaitable[object]]:
+    return lambda visit: visit.ask(prompt)
+
+
+CHOICE = asks(choice_of("Take this tip?", (Choice("y", "yes, take it"), Choice("n", "no, touch it again")), "y"))
+ADDRESS = asks(replace(ASK_ADDRESS, default="192.0.2.7"))
 
 
 @pytest.mark.parametrize(
-    ("kind", "keys", "answer"),
+    ("question", "keys", "answer"),
     [
-        ("choose", ["n"], "n"),
-        ("choose", ["enter"], "y"),
-        ("no default", ["enter", "n"], False),
-        ("number", ["2", "6", "enter"], 26),
-        ("text", ["enter"], "192.0.2.7:30004"),
-        ("empty", ["enter"], ""),
-        ("text", ["s", "q", "1", "enter"], "sq1:30004"),
-        ("bring", ["enter"], True),
-        ("bring", ["k"], False),
+        (CHOICE, ["n"], "n"),
+        (CHOICE, ["enter"], "y"),
+        (lambda visit: visit.yes("Is there a pot of water?"), ["enter", "n"], False),
+        (asks(RADIUS), ["2", "6", "enter"], 26),
+        (ADDRESS, ["enter"], "192.0.2.7:30004"),
+        (asks(ASK_BUS), ["enter"], ""),
+        (ADDRESS, ["s", "q", "1", "enter"], "sq1:30004"),
+        (brings, ["enter"], True),
+        (brings, ["k"], False),
     ],
 )
-async def test_a_question_is_answered_by_its_keys(kind: str, keys: list[str], answer: object) -> None:
-    asking = Asking(kind)
-    async with running(asking) as (app, pilot):
+async def test_a_question_is_answered_by_its_keys(
+    question: Callable[[Visit], Awaitable[object]], keys: list[str], answer: object
+) -> None:
+    asking = Asking(question)
+    async with running(asking) as (_, pilot):
         await pilot.press(*keys)
-        await seen(app, pilot, lambda: bool(asking.answers))
+        await until(lambda: asking.answers, "the answer")
     assert asking.answers == [answer]
 
 
 async def test_a_number_out_of_range_is_refused_with_the_range() -> None:
-    asking = Asking("number")
+    asking = Asking(asks(RADIUS))
     async with running(asking) as (app, pilot):
         await pilot.press("9", "9", "enter")
         await pilot.pause()
@@ -75,23 +78,40 @@ async def test_a_number_out_of_range_is_refused_with_the_range() -> None:
 
 @pytest.mark.parametrize(("keys", "raised"), [(["escape"], WentBack), (["q"], LeftOff)])
 async def test_escape_goes_back_and_q_leaves(keys: list[str], raised: type[Exception]) -> None:
-    async with running(Asking("bring")) as (app, pilot):
+    async with running(Asking(brings)) as (app, pilot):
         await pilot.press(*keys)
-        await seen(app, pilot, lambda: app.steps.finished)
+        await until(lambda: app.steps.finished, "the end of the steps")
     with pytest.raises(raised):
         app.steps.join()
 
 
 @pytest.mark.parametrize(
-    ("key", "work", "leaving"),
-    [("s", "move", False), ("ctrl+c", "move", False), ("s", "run", False), ("s", "move", True)],
+    ("key", "ended_by", "leaving"),
+    [
+        ("s", asyncio.CancelledError(), False),
+        ("ctrl+c", asyncio.CancelledError(), False),
+        ("s", CollectAborted("stopped"), False),
+        ("s", asyncio.CancelledError(), True),
+    ],
 )
-async def test_a_stop_key_stops_what_is_at_work_and_ends_the_screen(key: str, work: str, leaving: bool) -> None:
-    """Also over the question that leaving asks meanwhile."""
-    asking = Asking("choose", work)
-    async with running(asking) as (app, pilot):
+async def test_a_stop_key_stops_what_is_at_work_and_ends_the_screen(
+    key: str, ended_by: BaseException, leaving: bool
+) -> None:
+    """A move that a driver stops, or a run that ends by itself then; also over the question that leaving asks."""
+    moves: list[str] = []
+
+    async def move(_visit: Visit) -> None:
+        moves.append("at work")
+        try:
+            await asyncio.sleep(60.0)
+        except asyncio.CancelledError:
+            moves.append("stopped")
+            raise ended_by from None
+
+    async with running(Asking(CHOICE, move)) as (app, pilot):
         await pilot.press("y")
-        await seen(app, pilot, lambda: asking.at_work and app.first_day.prompt is None)
+        await until(lambda: moves and app.first_day.prompt is None, "a move")
+        await pilot.pause()
         assert re.search(r"s: software stop; red button: emergency stop   at work, \d+ s", shown(app))
         if leaving:
             await pilot.press("q")
@@ -99,7 +119,7 @@ async def test_a_stop_key_stops_what_is_at_work_and_ends_the_screen(key: str, wo
             assert isinstance(app.screen, AskScreen)
         await pilot.press(key)
         await until(lambda: not app.is_running, "the end of the screen")
-    assert asking.stopped_arm
+    assert moves == ["at work", "stopped"]
     with pytest.raises(CollectAborted, match=r"look at the arm\. The same command resumes"):
         app.steps.join()
 

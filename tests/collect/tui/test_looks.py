@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
-from concurrent.futures import wait
 from pathlib import Path
 
 import pytest
@@ -11,7 +10,6 @@ from textual.pilot import Pilot
 
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.snapshot import Snapshot
-from brushloop.collect.tui.commission_app import CommissionApp
 from tests.collect.tui.fake import (
     FAILED,
     SPLIT,
@@ -21,6 +19,7 @@ from tests.collect.tui.fake import (
     FakeEngine,
     a_review,
     app_of,
+    brings,
     capture,
     full_picture,
     settled,
@@ -85,16 +84,8 @@ def test_review(snap_compare: Callable[..., bool], monkeypatch: pytest.MonkeyPat
 
 
 def test_first_day(snap_compare: Callable[..., bool]) -> None:
-    asking = Asking("bring")
-    app = CommissionApp(asking.visit, asking)
-
-    async def asked(pilot: Pilot[None]) -> None:
-        while app.first_day.prompt is None:
-            await pilot.pause(0.02)
-        await pilot.pause()
-
+    asking = Asking(brings)
     try:
-        assert snap_compare(app, terminal_size=SMALL, run_before=asked)
+        assert snap_compare(asking.app, terminal_size=SMALL, run_before=asking.asked)
     finally:
-        app.steps.stop()
-        wait([app.steps._outcome])
+        asking.end()

@@ -67,15 +67,12 @@ async def test_b_marks_the_last_capture_and_takes_it_back_while_the_run_is_on(tm
         assert (remark.stroke_id, remark.bad) == (last.press.stroke_id, True)
         await run.press("b")
         assert not remarks_of(tmp_path)[last.still].bad
+        await run.look(replace(now, folder=str(tmp_path / "gone")))
+        await run.press("b")
+        assert "/gone" in await run.look(), "a disk that refuses is reported"
         await run.look(replace(now, state=State.DONE))
         await run.press("b")
         assert not remarks_of(tmp_path)[last.still].bad
-
-
-async def test_a_disk_that_refuses_is_reported(tmp_path: Path) -> None:
-    async with watched(full_picture(folder=str(tmp_path / "gone")), (120, 40)) as run:
-        await run.press("b")
-        assert "/gone" in await run.look()
 
 
 PROMPT = Prompt(
@@ -173,9 +170,18 @@ def test_pictures_work_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> Non
     assert isinstance(picture_widget("x"), CellPicture)
 
 
-async def test_a_camera_that_shows_black_is_a_state_of_the_run() -> None:
-    async with watched(picture(picture=Picture(np.zeros((4, 4), np.uint8))), (80, 24)) as run:
-        assert "camera is black" in await settled(run.pilot)
+async def test_a_run_without_a_pose_or_a_picture_is_not_green() -> None:
+    black, silent = Picture(np.zeros((4, 4), np.uint8)), {"tip_mm": None, "no_pose_s": 1.44}
+    async with watched(picture()) as run:
+        state = run.app.screen.query_one("#state")
+        green = state.styles.background
+        for now, word in ((picture(picture=black), "camera is black"), (picture(**silent), "no pose for 1.4 s")):
+            text = await run.look(now)
+            assert str(state.render()) == f"RUNNING\n{word}"
+            assert state.styles.background != green
+        assert "Tip      no pose for 1.4 s" in text
+        await run.look(picture())
+        assert (str(state.render()), state.styles.background) == ("RUNNING", green)
 
 
 async def test_without_a_protocol_file_that_of_the_newest_session_is_taken(
