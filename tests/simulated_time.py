@@ -9,6 +9,7 @@ import asyncio
 import itertools
 import os
 import selectors
+import socket
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -92,12 +93,9 @@ class MemoryLoop(asyncio.SelectorEventLoop):
     async def create_connection(self, protocol_factory: Any, host: Any = None, port: Any = None, **_: Any) -> Any:  # type: ignore[override]
         if (server := self._servers.get((host, port))) is None:
             raise ConnectionRefusedError(f"nobody listens on {host}:{port} in this loop")
-        near, far = MemoryTransport(self, protocol_factory()), MemoryTransport(self, server.protocol_factory())
-        near.peer, far.peer = far, near
-        for end in (far, near):
-            end.protocol.connection_made(end)
-        await asyncio.sleep(0)
-        return near, near.protocol
+        near, far = socket.socketpair()
+        await self.connect_accepted_socket(server.protocol_factory, far)
+        return await super().create_connection(protocol_factory, sock=near)
 
 
 class MemoryServer:
@@ -123,45 +121,3 @@ class MemoryServer:
 
     async def wait_closed(self) -> None:
         pass
-
-
-class MemoryTransport(asyncio.Transport):
-    """One end of a connection; what is written arrives at the other in the next turn of the loop."""
-
-    peer: MemoryTransport
-
-    def __init__(self, loop: asyncio.AbstractEventLoop, protocol: Any) -> None:
-        super().__init__()
-        self.protocol = protocol
-        self._loop = loop
-        self._closing = False
-
-    def write(self, data: bytes | bytearray | memoryview) -> None:
-        if not self._closing:
-            self._loop.call_soon(self.peer.receive, bytes(data))
-
-    def receive(self, data: bytes) -> None:
-        """Hand `data` to the protocol; the end of the stream if there is none."""
-        if self._closing:
-            return
-        if data:
-            self.protocol.data_received(data)
-        elif not self.protocol.eof_received():
-            self.close()
-
-    def close(self) -> None:
-        if not self._closing:
-            self.write(b"")
-            self._closing = True
-            self._loop.call_soon(self.protocol.connection_lost, None)
-
-    abort = close
-
-    def is_closing(self) -> bool:
-        return self._closing
-
-    def get_write_buffer_size(self) -> int:
-        return 0
-
-    def pause_reading(self) -> None:
-        raise NotImplementedError
