@@ -15,38 +15,24 @@ from numpy.typing import NDArray
 from brushloop.collect.motion import Procedures, photograph_moves
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.devices import Rig, limits_of
-from brushloop.collect.touch.force import ForceTap
 from brushloop.drivers.devices import Frame, Identity, Pose, QueuedLine, Stamp
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.rig import rig_toml
 from brushloop.drivers.sim.scene import Scene
-from brushloop.drivers.sim.world import World
+from brushloop.drivers.sim.world import SimClock, World
 from tests.rigs import SMALL_TABLE
+from tests.simulated_time import SimulatedTime
 
 SMALL_VIEW = View(width_px=480, height_px=360, px_per_mm=2.8, centre_mm=(55.0, 40.0))
 WHOLE_VIEW = View(width_px=1024, height_px=768, px_per_mm=3.125)
 """Of a sheet of the usual size."""
 
 
-class OwnClock:
-    """Time that passes only when the arm moves."""
-
-    rate = 1.0
-
-    def __init__(self) -> None:
-        self.seconds = 0.0
-
-    def now_s(self) -> float:
-        return self.seconds
-
-    def now_ns(self) -> int:
-        return round(self.seconds * 1e9)
-
-
 @dataclass
 class Bench:
-    """Arm, camera, force sensor and clock over one world, and the rig that they are."""
+    """Arm, camera and force sensor over one world, the rig that they are, and its procedures beside a person who keeps
+    the well full. Time passes only when the arm moves."""
 
     sim: SimConfig
     folder: Path
@@ -56,11 +42,11 @@ class Bench:
     """Every target that the arm was sent."""
 
     def __post_init__(self) -> None:
-        self.clock = OwnClock()
-        self.world = World(self.sim)
-        self.world.clock = self.clock  # pyright: ignore[reportAttributeAccessIssue]
+        self.time = SimulatedTime()
+        self.world = World(self.sim, SimClock(real_s=self.time.seconds))
         self.scene = Scene(self.world)
         self.rng = np.random.default_rng(self.sim.seed)
+        self.weight_n = self.world.wrench()[2]
         self.target = brush_pose(*self.sim.home_mm)
         text = re.sub(r"touch_z_mm = .*", "touch_z_mm = 120.0", rig_toml(self.sim))
         (self.folder / "rig.toml").write_text(text)
@@ -68,9 +54,10 @@ class Bench:
         self.limits = limits_of(config)
         devices: Any = self
         identity = Identity("world without wires", "", True)
-        self.rig = Rig(config, devices, devices, devices, identity, identity, force=devices)
-        self.effector = BenchHands(self)
-        self.tap = BenchTap(self)
+        self.rig = Rig(config, self.time, devices, devices, identity, identity, force=devices)
+        self.effector = Procedures(self.rig)
+        self.effector.dip = self.dip
+        self.effector.photographer.photograph = self.see_sheet
 
     def truth_mm(self, x_mm: float, y_mm: float) -> float:
         """The height of the sheet."""
@@ -81,18 +68,14 @@ class Bench:
         """Whether the tip is at travel height or above."""
         return self.target.z_mm >= self.rig.config.motion.safe_z_mm
 
-    # Clock
-    def now_ns(self) -> int:
-        return self.clock.now_ns()
-
     # Robot
     async def move(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
         self.limits.check("robot", target, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
         self.target = target
         self.sent.append(target)
-        self.world.motion.add(self.bent(target), speed_mm_s, acc_mm_s2, self.clock.seconds)
-        self.clock.seconds += 1e3
-        self.world.motion.advance(self.clock.seconds)
+        self.world.motion.add(self.bent(target), speed_mm_s, acc_mm_s2, self.world.clock.now_s())
+        self.time.pass_s(1e3)
+        self.world.motion.advance(self.world.clock.now_s())
 
     async def sequence(self, lines: Sequence[QueuedLine], *, acc_mm_s2: float) -> list[Pose]:
         for line in lines:
@@ -104,42 +87,27 @@ class Bench:
 
     # Camera
     async def fresh(self, after: Stamp) -> Frame:
-        return Frame(Stamp(self.clock.now_ns()), after.host_ns, self.photograph())
+        return Frame(Stamp(self.time.now_ns()), after.host_ns, self.photograph())
 
     def photograph(self) -> NDArray[np.uint8]:
         return self.scene.render(tool=self.world.tool())
 
-
-class BenchTap(ForceTap):
-    """Averages of the world's own force with the rig's noise, drawn at once."""
-
-    def __init__(self, bench: Bench) -> None:
-        super().__init__()
-        self._bench = bench
-        self._weight_n = bench.world.wrench()[2]
-
+    # Force, as a `ForceTap`
     async def average(self, samples: int, push_axis: tuple[float, float, float], after_ns: int) -> tuple[float, float]:
-        push_n = self._weight_n - self._bench.world.wrench()[2]
-        drawn = self._bench.rng.normal(push_n, self._bench.sim.force_noise_n, samples)
+        """Of the world's own force with the rig's noise, drawn at once."""
+        push_n = self.weight_n - self.world.wrench()[2]
+        drawn = self.rng.normal(push_n, self.sim.force_noise_n, samples)
         return float(drawn.mean()), float(drawn.std(ddof=1))
 
-
-class BenchHands(Procedures):
-    """A rig's procedures beside a person who keeps the well full."""
-
-    def __init__(self, bench: Bench) -> None:
-        super().__init__(bench.rig)
-        self._well = bench.world.well
-        self.photographer.photograph = self._photograph
-
+    # Procedures
     async def dip(self) -> None:
-        self._well.add(5.0)
-        await super().dip()
+        self.world.well.add(5.0)
+        await Procedures.dip(self.effector)
 
-    async def _photograph(self) -> Frame:
+    async def see_sheet(self) -> Frame:
         """Without wires no picture is late: there is no delay to measure."""
-        await self.go(*photograph_moves(self.rig.config))
-        return await self.rig.camera.fresh(Stamp(self.rig.clock.now_ns()))
+        await self.effector.go(*photograph_moves(self.rig.config))
+        return await self.fresh(Stamp(self.time.now_ns()))
 
 
 MakeBench = Callable[..., Bench]

@@ -41,8 +41,8 @@ NOBODY = Asker(watched=False)
 
 async def measured(bench: Bench, asker: Asker = NOBODY, **touch: Any) -> ZeroTouchResult:
     config = TouchConfig.model_validate(touch)
-    dip, tap = bench.effector.dip, bench.tap
-    return await measure_plane(bench.effector, config, dip=dip, tap=tap, asker=asker, tell=lambda _: None)
+    tap: Any = bench
+    return await measure_plane(bench.effector, config, dip=bench.dip, tap=tap, asker=asker, tell=lambda _: None)
 
 
 def errors_mm(bench: Bench, result: ZeroTouchResult) -> list[float]:
