@@ -308,13 +308,10 @@ def test_without_the_lens_file_the_run_ends_before_ink_and_names_the_remedy(bent
 
 
 def test_what_is_no_lens_file_is_refused_in_one_line(bent_lab: Lab) -> None:
-    lens, rig = with_lens_file(bent_lab), bent_lab.folder / "rig.toml"
+    lens = with_lens_file(bent_lab)
     lens.write_text(lens.read_text().replace("a board", "another"))
     with pytest.raises(ConfigError, match=r"rig.toml: camera.lens_file: .*was edited"):
-        load_rig(rig)
-    lens.unlink()
-    with pytest.raises(ConfigError, match=r"rig.toml: camera.lens_file: .*no such file"):
-        load_rig(rig)
+        load_rig(bent_lab.folder / "rig.toml")
 
 
 def test_a_board_that_moved_is_searched_again_and_one_that_is_hidden_lies_where_it_was_seen_last() -> None:

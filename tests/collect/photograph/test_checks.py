@@ -8,7 +8,6 @@ import itertools
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -29,7 +28,6 @@ from brushloop.collect.rig.paper import Patch
 from tests.calibrate.given import flat_plane
 
 LIMITS = QualityConfig()
-PAGE = (Path(__file__).parents[3] / "docs" / "quality.md").read_text(encoding="utf-8")
 PX = 8.0
 PATCH = Patch(0, 20.0, 15.0, 40.0, 24.0)
 Gray = NDArray[np.uint8]
@@ -255,12 +253,6 @@ def test_a_verdict_shows_the_operator_what_was_seen_and_what_to_do_by_the_limits
     [faint] = [check for check in verdict.checks if check.name == Failure.FAINT]
     assert (faint.passed, faint.reason) == (True, "")
     assert named(judged(None, LIMITS.model_copy(update={"faint_tone": 0.99}))) == Failure.FAINT
-
-
-@pytest.mark.parametrize(("field", "default"), QualityConfig().model_dump().items())
-def test_the_page_gives_the_default_of_every_field(field: str, default: float | bool) -> None:
-    shown = f"{default:g}" if isinstance(default, float) else str(default).lower()
-    assert f"`{field}` {shown}" in PAGE
 
 
 # Real photographs. They are drags, and nothing was tuned to them
