@@ -52,7 +52,9 @@ def test_a_signal_stops_the_run_and_the_same_command_goes_on(bare_lab: Lab, monk
 
     again = lab.command()
     assert again.returncode == 0, again.stderr
-    assert again.stdout.splitlines() == ending(lab.session, "grid")
+    recorded = f"recorded: {lab.session}/{lab.session.name}.mcap"
+    assert again.stdout.splitlines() == [recorded, f"next:     brushloop analyse {lab.session}"]
+    assert ending(lab.session, "write") == [recorded]
     assert len({c.stroke.stroke_id for c in Recording(lab.session).captures()}) == 2
 
 
@@ -155,13 +157,6 @@ def test_a_folder_that_may_not_be_written_is_refused_before_anything_is_connecte
     lab.sessions.write_text("not a folder", encoding="utf-8")
     assert refused() == (2, f"{lab.sessions}: is a file; a folder is needed")
     assert lab.rig.arcs.cabinet.power.mode == "PowerOff"
-
-
-def test_the_recording_and_what_comes_next(tmp_path: Path) -> None:
-    folder = tmp_path / "grid-01"
-    recorded = f"recorded: {folder}/grid-01.mcap"
-    assert ending(folder, "grid") == [recorded, f"next:     brushloop analyse {folder}"]
-    assert ending(folder, "write") == [recorded]
 
 
 # An arm that no longer sends its pose: every screen says so after a second, long before a call times out

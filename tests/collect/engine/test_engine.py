@@ -46,7 +46,12 @@ def test_a_whole_session_is_collected_as_the_protocol_says_and_merged(collected:
 
 
 def test_stop_in_mid_press_voids_the_patch_and_the_same_command_goes_on(lab: Lab) -> None:
-    """Who has asked to park does not have to wait for the end of the press."""
+    """Who has asked to park does not have to wait for the end of the press; nor who stops before anything has moved."""
+    engine = lab.engine()
+    engine.stop()
+    engine.start()
+    ended_by(engine, CollectAborted)
+    assert engine.snapshot().state == State.STOPPED
     for parked_before in (True, False):
         engine = lab.started()
         until(engine, lambda now: now.strokes_done == 1)
@@ -68,14 +73,6 @@ def test_stop_in_mid_press_voids_the_patch_and_the_same_command_goes_on(lab: Lab
     assert len({stroke.stroke_id for stroke in strokes}) == len(strokes) == 2
     assert [s.reached_mm for s in strokes] == [capture.press.reached_mm for capture in state.results(CaptureResult)]
     assert [s.reached_mm for s in strokes] == pytest.approx([s.depth_mm for s in strokes], abs=0.2)
-
-
-def test_stop_before_anything_has_moved(lab: Lab) -> None:
-    engine = lab.engine()
-    engine.stop()
-    engine.start()
-    ended_by(engine, CollectAborted)
-    assert engine.snapshot().state == State.STOPPED
 
 
 def test_a_full_sheet_asks_for_a_fresh_one_and_goes_on_with_it(lab: Lab) -> None:
@@ -194,7 +191,11 @@ def test_a_safety_stop_holds_the_session_until_a_person_has_released_it(lab: Lab
 
 
 def test_a_dry_run_moves_all_the_way_and_leaves_neither_ink_nor_session(lab: Lab) -> None:
+    """One too low or too high is refused with the range."""
     lab.write_protocol("[11.0, 20.0]")
+    for depth_mm in (24.0, 46.0):
+        with pytest.raises(ConfigError, match=r"--dry-run.*outside \[25, 44.97\] mm"):
+            lab.engine(dry_run_mm=depth_mm)
     well_ml = lab.rig.world.well.ml
     ran = lab.command("--dry-run", "30")
     assert ran.returncode == 0, ran.stderr
@@ -206,10 +207,3 @@ def test_a_dry_run_moves_all_the_way_and_leaves_neither_ink_nor_session(lab: Lab
     assert not lab.rig.world.presses
     assert lab.rig.world.well.ml == well_ml
     assert lab.at_rest
-
-
-@pytest.mark.parametrize("depth_mm", [24.0, 46.0])
-def test_a_dry_run_too_low_or_too_high_is_refused_with_the_range(lab: Lab, depth_mm: float) -> None:
-    lab.write_protocol("[20.0]", "[0.0]")
-    with pytest.raises(ConfigError, match=r"--dry-run.*outside \[25, 44.97\] mm"):
-        lab.engine(dry_run_mm=depth_mm)
