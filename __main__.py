@@ -177,10 +177,11 @@ def sim(
     from brushloop.drivers.loopback import RigRefused
     from brushloop.drivers.sim.brush.spec import load_brush
     from brushloop.drivers.sim.config import SimConfig, View
-    from brushloop.drivers.sim.lab import UnknownLab
     from brushloop.drivers.sim.rig import LoopbackRig, serve
 
     if unknown is not None:
+        from brushloop.drivers.sim.lab import UnknownLab
+
         if write_rig is not None or brush != Path("loopback"):
             raise RigRefused("--unknown: can only be combined with --trap, --control, --rate and --idle-exit")
         asyncio.run(serve(UnknownLab(unknown, trap, rate=rate), say, idle_exit_s=idle_exit, control=control))
