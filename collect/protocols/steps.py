@@ -8,7 +8,8 @@ import hashlib
 import itertools
 from collections.abc import Generator, Iterable
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, ClassVar, get_args
+from functools import cache
+from typing import Annotated, Any, ClassVar
 
 from pydantic import Field, TypeAdapter
 
@@ -44,7 +45,7 @@ class StepBase:
     @property
     def key(self) -> str:
         """Stable across processes: sha256 of kind, parameters and index, without what was measured."""
-        text = _ADAPTERS[self.kind].dump_json(self, exclude={"press": MEASURED}, exclude_defaults=True)
+        text = _adapter(type(self)).dump_json(self, exclude={"press": MEASURED}, exclude_defaults=True)
         return hashlib.sha256(f"{self.kind} ".encode() + text).hexdigest()
 
     @property
@@ -119,7 +120,8 @@ class ReviewStep(StepBase):
 
 
 Step = ZeroTouchStep | BoardStep | SelfCheckStep | DipStep | PressStep | CaptureStep | ReviewStep
-_ADAPTERS = {step.kind: TypeAdapter[Any](step) for step in get_args(Step)}
+_adapter = cache(TypeAdapter[Any])
+"""What makes a kind of step JSON: made when it is first needed, which takes milliseconds."""
 MARKING = frozenset({StepKind.PRESS, StepKind.SELF_CHECK})
 """Steps that leave ink on a paper patch of their own."""
 
