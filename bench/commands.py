@@ -90,7 +90,7 @@ def analysis(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
 
 
 def report(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
-    """Wall seconds from the photographs of about `n` collected presses (150) to the report: calibrate, fit, validate.
+    """Wall seconds of `analyse`, from the photographs of about `n` collected presses (150) to the report.
 
     The presses are collected first, on the loopback rig at 60 times its speed, which takes minutes and does not count.
     """
@@ -99,15 +99,12 @@ def report(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
         repeats = max(1, round(strokes / len(DESIGN)))
         with simulated_rig(Path(folder), "paper", RATE, seed + 1) as rig:
             session = collect_grid(Path(folder), rig, DEPTHS_MM, TILTS_DEG, repeats, seed)
-        used = {words: measure(*BRUSHLOOP, words, session) for words in ("calibrate", "fit", "validate")}
-    each = ", ".join(f"{name} {one.wall_s:.1f} s" for name, one in used.items())
-    where = f"loopback rig, {strokes} presses: {each}; {machine()}"
-    wall_s, peak_mb = sum(one.wall_s for one in used.values()), max(one.peak_mb for one in used.values())
+        used = measure(*BRUSHLOOP, "analyse", session)
+    where = f"loopback rig, {strokes} presses; {machine()}"
+    name = "report.150 presses" if strokes == COLLECTED else "report"
     return [
-        at_most(
-            "report.150 presses" if strokes == COLLECTED else "report", wall_s, "s", REPORT_S, strokes, seed, where
-        ),
-        at_most("report.memory", peak_mb, "MB", PEAK_MB, strokes, seed, where),
+        at_most(name, used.wall_s, "s", REPORT_S, strokes, seed, where),
+        at_most("report.memory", used.peak_mb, "MB", PEAK_MB, strokes, seed, where),
     ]
 
 
