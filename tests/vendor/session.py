@@ -6,6 +6,7 @@ Usage: session.py PORT RTDE_PORT. The last line of the output is one JSON object
 from __future__ import annotations
 
 import json
+import re
 import sys
 import time
 from collections.abc import Callable
@@ -26,10 +27,12 @@ def until(true: Callable[[], bool], timeout_s: float = 5.0) -> bool:
 
 
 def failure(call: Callable[[], object]) -> str:
+    """What the client raises, up to the code of the error."""
     try:
         return f"no exception: {call()!r}"
     except sdk.AuboException as error:
-        return f"AuboException: {error}"
+        method, code, _ = re.split(r"(--\d+)", str(error), maxsplit=1)
+        return f"AuboException: {method}{code}"
 
 
 def at_rest(robot: Any) -> bool:
@@ -74,7 +77,7 @@ def power(robot: Any) -> None:
 def move(rpc: Any, robot: Any) -> None:
     motion, state, machine = robot.getMotionControl(), robot.getRobotState(), rpc.getRuntimeMachine()
     start = state.getTcpPose()
-    SEEN["move"] = [motion.moveLine(shifted(start, 0.05), 1.0, 0.1, 0.0, 0.0), motion.getExecId()]
+    SEEN["move"] = [motion.moveLine(shifted(start, 0.05), 1.0, 0.1, 0.0, 0.0), motion.getExecId() >= 0]
     SEEN["queue"] = motion.getQueueSize()
     SEEN["arrived"] = until(lambda: at_rest(robot))
     SEEN["moved by"] = state.getTcpPose()[0] - start[0]
@@ -137,7 +140,7 @@ def subscribe(port: int) -> None:
         pushed.append((q, pose, running, parser.popSafetyModeType() == sdk.SafetyModeType.Normal))
 
     SEEN["rtde connect"] = [rtde.connect("127.0.0.1", port), rtde.login("aubo", "123456")]
-    SEEN["rtde outputs"] = rtde.getOutputMaps()
+    SEEN["rtde pose"] = rtde.getOutputMaps()["R1_actual_TCP_pose"]
     names = ["R1_actual_q", "R1_actual_TCP_pose", "R1_robot_mode", "R1_safety_mode"]
     channel = -1
     for _ in range(5):  # right after login the client may not be ready to send
@@ -147,7 +150,8 @@ def subscribe(port: int) -> None:
             break
     SEEN["rtde topic"] = [channel, rtde.subscribe(channel, take)]
     until(lambda: len(pushed) >= 10)
-    SEEN["rtde pushed"] = [len(pushed), *pushed[-1]] if pushed else [0]
+    q, pose, running, normal = pushed[9]
+    SEEN["rtde pushed"] = [len(q), len(pose), running, normal]
     SEEN["rtde removed"] = rtde.removeTopic(False, channel)
     time.sleep(3.5)  # after three seconds of silence it pings
     SEEN["rtde connected"] = rtde.hasConnected()
