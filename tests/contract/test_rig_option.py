@@ -24,7 +24,6 @@ from tests.rigs import in_thread
 from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
-QUESTION = "May the arm move? [y/N]"
 # One test that moves and two that do not.
 CHOSEN = "a_move_arrives or who_answers or agree_on_an_arm"
 
@@ -42,8 +41,8 @@ def on_a_terminal(rig_toml: Path, answer: str) -> tuple[int, str]:
     """Exit code and output of a run that is given `answer` once it asks."""
     ours, theirs = pty.openpty()
     chosen = ["tests/contract", "--rig", str(rig_toml), "-k", CHOSEN, "-p", "no:cacheprovider", "--color=no"]
-    command, terminal = [sys.executable, "-m", "pytest", *chosen], dict.fromkeys(("stdin", "stdout", "stderr"), theirs)
-    with subprocess.Popen(command, cwd=ROOT, start_new_session=True, **terminal) as run:
+    command = [sys.executable, "-m", "pytest", *chosen]
+    with subprocess.Popen(command, cwd=ROOT, start_new_session=True, stdin=theirs, stdout=theirs, stderr=theirs) as run:
         os.close(theirs)
         try:
             output, answered = "", False
@@ -56,7 +55,7 @@ def on_a_terminal(rig_toml: Path, answer: str) -> tuple[int, str]:
                     if not (data := os.read(ours, 65536)):
                         break
                     output += data.decode()
-                    if QUESTION in output and not answered:
+                    if conftest.QUESTION in output and not answered:
                         assert "passed" not in output, "asks before the first test"
                         os.write(ours, f"{answer}\n".encode())
                         answered = True
@@ -81,33 +80,27 @@ def test_it_says_what_it_will_do_and_after_a_yes_it_moves(rig_toml: Path):
         assert re.search(expected, output), expected
 
 
-def answered(monkeypatch: pytest.MonkeyPatch, answer: str, *, asked: bool = True) -> str | None:
-    """What a person's answer comes to, of an arm that nobody has to connect to; `asked` on a terminal."""
-    terminal = Mock(spec=io.StringIO, **{"isatty.return_value": asked, "readline.return_value": f"{answer}\n"})
+@pytest.mark.parametrize(
+    ("answer", "refused"),
+    [("y", ""), ("YES", ""), (" yes ", ""), ("", "was 'no'"), ("n", "was 'n'"), ("yesterday", "was 'yesterday'")],
+)
+@pytest.mark.parametrize("on_terminal", [True, False])
+def test_only_a_yes_on_a_terminal_lets_it_move_and_nothing_else_is_skipped(
+    monkeypatch: pytest.MonkeyPatch, answer: str, refused: str, on_terminal: bool
+):
+    terminal = Mock(spec=io.StringIO, **{"isatty.return_value": on_terminal, "readline.return_value": f"{answer}\n"})
     monkeypatch.setattr(sys, "stdin", terminal)
     monkeypatch.setattr(conftest, "_look", AsyncMock(return_value=(None, None, None)))
     monkeypatch.setattr(conftest, "_announcement", Mock(return_value=""))
     monkeypatch.setattr(conftest, "sole_driver", lambda _host, _port: contextlib.nullcontext())
-    return conftest.permission_refused(Mock(), Mock(), 1)
-
-
-@pytest.mark.parametrize(
-    ("answer", "refused"),
-    [("y", None), ("YES", None), (" yes ", None), ("", "was 'no'"), ("n", "was 'n'"), ("yesterday", "was 'yesterday'")],
-)
-def test_only_a_yes_on_a_terminal_lets_it_move(monkeypatch: pytest.MonkeyPatch, answer: str, refused: str | None):
-    said = answered(monkeypatch, answer)
-    assert said is None if refused is None else refused in str(said)
-    assert "no terminal to ask on" in str(answered(monkeypatch, answer, asked=False))
-
-
-def test_a_refusal_skips_what_moves_and_nothing_else(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(conftest, "permission_refused", lambda *_: "no")
     config = Mock(stash=pytest.Stash(), option=Mock(collectonly=False))
     config.stash[conftest.RIG] = Mock()
     moving, still = Mock(), Mock(**{"get_closest_marker.return_value": None})
     conftest.pytest_collection_modifyitems(config, [moving, still])
-    assert [mark.args[0].name for mark in moving.add_marker.call_args_list] == ["skip"]
+    reasons = [mark.args[0].kwargs["reason"] for mark in moving.add_marker.call_args_list]
+    expected = refused if on_terminal else "no terminal to ask on"
+    assert len(reasons) == bool(expected)
+    assert all(expected in reason for reason in reasons)
     assert not still.add_marker.called
 
 
