@@ -9,7 +9,7 @@ import re
 import threading
 import time
 from collections import deque
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from functools import partial
 from itertools import count, pairwise
@@ -166,29 +166,34 @@ async def test_a_sensor_that_says_the_same_again_and_again_is_named_as_stuck(mon
         await until(lambda: latest_error(sensor) is None, "a sensor that measures")
 
 
-async def test_bus_off_is_a_lost_connection_that_says_what_to_do_and_a_bus_error_is_counted(
-    board: ForceBoard, sensor: SriM8123
+def raising(error: Exception) -> Callable[[], str]:
+    def fault() -> str:
+        raise error
+
+    return fault
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        (lambda: "bus-off", r"off after too many errors.*termination.*1000000 bit/s"),
+        (raising(can.CanOperationError("network is down", 100)), r"bus virtual a board failed: .*connect again"),
+        (raising(OSError(19, "No such device")), r"bus virtual a board failed: .*connect again"),
+    ],
+    ids=["bus off", "network down", "adapter gone"],
+)
+async def test_a_bus_that_is_off_or_gone_is_a_lost_connection_that_says_what_to_do_and_a_bus_error_is_counted(
+    board: ForceBoard, sensor: SriM8123, fault: Callable[[], str], words: str
 ):
     board.next_fault = partial(next, iter(["bus-error"]), None)
     await until(lambda: sensor.bus_errors == 1, "the driver")
     assert sensor.latest().force_n == WRENCH[:3]
-    board.next_fault = partial(next, iter(["bus-off"]), None)
+    board.next_fault = fault
     await until(lambda: readers() == 0, "the driver")
-    with pytest.raises(ConnectionLost, match=r"off after too many errors.*termination.*1000000 bit/s"):
+    with pytest.raises(ConnectionLost, match=words):
         sensor.latest()
     with pytest.raises(ConnectionLost):
         await sensor.bias(0.1)
-
-
-@pytest.mark.parametrize("error", [can.CanOperationError("network is down", 100), OSError(19, "No such device")])
-async def test_an_adapter_that_goes_away_is_a_lost_connection(error: Exception, board: ForceBoard, sensor: SriM8123):
-    def gone() -> None:
-        raise error
-
-    board.next_fault = gone
-    await until(lambda: readers() == 0, "the driver")
-    with pytest.raises(ConnectionLost, match=r"bus virtual a board failed: .*connect again"):
-        sensor.latest()
 
 
 async def test_where_no_board_answers_the_connection_times_out(monkeypatch: pytest.MonkeyPatch):

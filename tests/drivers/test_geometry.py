@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -98,7 +97,6 @@ def test_on_the_way_both_distances_are_shared_out(a: Pose, b: Pose, s: float):
 # ---------------------------------------------------------------- the limits
 
 LIMITS = Limits(x_mm=(200.0, 640.0), y_mm=(-260.0, 260.0), z_mm=(95.0, 400.0))
-INSIDE: dict[str, float] = {"x": 400.0, "y": 0.0, "z": 200.0, "tilt": 5.0, "speed": 100.0, "acceleration": 500.0}
 RANGES = {
     "x": (200.0, 640.0),
     "y": (-260.0, 260.0),
@@ -110,7 +108,7 @@ RANGES = {
 
 
 def check(**change: float) -> None:
-    at: dict[str, Any] = {**INSIDE, **change}
+    at: dict[str, float] = {field: sum(ends) / 2.0 for field, ends in RANGES.items()} | change
     pose = brush_pose(at["x"], at["y"], at["z"], heading_deg=70.0, tilt_deg=at["tilt"])
     LIMITS.check("robot", pose, speed_mm_s=at["speed"], acc_mm_s2=at["acceleration"])
 
