@@ -9,14 +9,13 @@ import asyncio
 import json
 import re
 import zipfile
-from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from brushloop.drivers.arcs.controller import survey
-from brushloop.drivers.arcs.wire import Framing, RpcConnection, answer_in
+from brushloop.drivers.arcs.controller import Controller, survey
+from brushloop.drivers.arcs.wire import Framing, answer_in
 from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation
 from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
@@ -29,21 +28,13 @@ REPORTS = sorted((Path(__file__).parent / "reports").glob("*.zip"))
 MODE, SAFETY = "rob1.RobotState.getRobotModeType", "rob1.RobotState.getSafetyModeType"
 
 
-@pytest.fixture
-async def client(cabinet: Cabinet) -> AsyncIterator[RpcConnection]:
-    connection = RpcConnection(HOST, cabinet.port)
-    await connection.open()
-    yield connection
-    await connection.close()
-
-
 async def test_callers_at_the_same_time_take_turns_with_ids_of_the_vendors_shape_that_never_repeat(
-    cabinet: Cabinet, client: RpcConnection
+    cabinet: Cabinet, other: Controller
 ):
     requests: list[dict[str, Any]] = []
     answer = cabinet._answer
     cabinet._answer = lambda request: (requests.append(request), answer(request))[1]  # type: ignore[method-assign]
-    answers = await asyncio.gather(*[client.call(method) for method in (MODE, SAFETY) * 10])
+    answers = await asyncio.gather(*[other.call(method) for method in (MODE, SAFETY) * 10])
     assert answers == ["PowerOff", "Normal"] * 10
     assert [request["method"] for request in requests] == [MODE, SAFETY] * 10
     idents = [request["id"] for request in requests]
@@ -63,18 +54,18 @@ async def test_callers_at_the_same_time_take_turns_with_ids_of_the_vendors_shape
     ],
 )
 async def test_a_call_without_a_good_answer_fails_and_calls_work_again_on_a_connection_that_is_whole_or_opened_again(
-    cabinet: Cabinet, client: RpcConnection, kind: str, error: type[Exception]
+    cabinet: Cabinet, other: Controller, kind: str, error: type[Exception]
 ):
     cabinet.faults.hang(Fault(device=Device.ROBOT, kind=kind, on="getRobotModeType", late_s=1.5))
     with pytest.raises(error, match="getRobotModeType"):
-        await client.call(MODE)
-    assert client.lost is (error is ConnectionLost)
-    if client.lost:
+        await other.call(MODE)
+    assert other.lost is (error is ConnectionLost)
+    if other.lost:
         with pytest.raises(ConnectionLost, match="getSafetyModeType"):
-            await client.call(SAFETY)
-        await client.open()
+            await other.call(SAFETY)
+        await other.open()
     await asyncio.sleep(1.0)  # the late reply is there before the next one
-    assert await client.call(SAFETY) == "Normal"
+    assert await other.call(SAFETY) == "Normal"
 
 
 @pytest.mark.parametrize("reply", [b"hello", b"[" * 100_000, b'{"id": 1}', b'{"id": 1, "error": "bad"}'])
@@ -85,11 +76,11 @@ def test_a_reply_that_makes_no_sense_is_a_violation_and_one_with_another_id_is_n
         assert answer_in(other, 1, "getRobotNames") is None
 
 
-async def test_closing_wakes_the_caller_that_still_waits(cabinet: Cabinet, client: RpcConnection):
+async def test_closing_wakes_the_caller_that_still_waits(cabinet: Cabinet, other: Controller):
     mute_to(cabinet, "getRobotModeType")
-    waiting = asyncio.create_task(client.call(MODE))
+    waiting = asyncio.create_task(other.call(MODE))
     await asyncio.sleep(0.02)
-    await client.close()
+    await other.close()
     with pytest.raises(NotConnected, match="closed while waiting"):
         await waiting
 
