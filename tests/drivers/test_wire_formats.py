@@ -7,7 +7,7 @@ import math
 import random
 import re
 import tracemalloc
-from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -135,28 +135,23 @@ def test_what_a_format_cannot_carry_is_refused(refused: Callable[[], object]):
 
 # ---------------------------------------------------------------- any bytes
 
-Read = Callable[[bytes], Awaitable[object]]
+Read = Callable[[bytes], object]
 """Raises `DeviceError` for what it refuses, and returns None for what it passes over."""
 
 
-async def answered(payload: bytes) -> object:
-    """What a call gets for this payload."""
-    return answer_in(payload, "a", "getTcpPose")
-
-
-async def pushed(payload: bytes) -> object:
+def pushed(payload: bytes) -> object:
     head, values = decode_message(payload)
     assert (type(head), type(values)) == (int, list)
     return head, values
 
 
-async def greeted(said: bytes) -> object:
+def greeted(said: bytes) -> object:
     outputs = outputs_of(said)
     assert all(type(name) is str and isinstance(ident, int) for name, ident in outputs.items())
     return outputs
 
 
-async def joined(data: bytes) -> object:
+def joined(data: bytes) -> object:
     """The wrenches in a row of frames, each an id of two bytes and what it holds; then a sound round."""
     parts = RoundAssembler()
     frames = [(int.from_bytes(data[at : at + 2]), data[at + 2 : at + 10]) for at in range(0, len(data), 10)]
@@ -191,7 +186,7 @@ SHARED = b"\x82\x00\xd8\x1c\x82\x01\xd8\x1d\x00"
 """A value that holds itself."""
 GREETING = b'{"protocol":"rtde","version":1,"input":{"set_recipe":100},"output":{"R1_actual_TCP_pose":1021}}\n\n'
 READERS: dict[str, tuple[Read, list[bytes], int]] = {
-    "a reply": (answered, REPLIES, 4000),
+    "a reply": (lambda payload: answer_in(payload, "a", "getTcpPose"), REPLIES, 4000),
     "a push": (pushed, PUSHES, 5000),
     "a greeting": (greeted, [GREETING, b'{"protocol":"rtde","output":{}}\n\n'], 4000),
     "rounds of the force board": (joined, [ROUND * 3], 2000),
@@ -199,11 +194,11 @@ READERS: dict[str, tuple[Read, list[bytes], int]] = {
 
 
 @pytest.mark.parametrize(("read", "valid", "count"), READERS.values(), ids=READERS.keys())
-async def test_any_bytes_are_a_value_or_a_refusal(read: Read, valid: list[bytes], count: int):
+def test_any_bytes_are_a_value_or_a_refusal(read: Read, valid: list[bytes], count: int):
     taken = 0
     for data in hostile(valid, count):
         try:
-            taken += await read(data) is not None
+            taken += read(data) is not None
         except DeviceError:
             continue
     assert taken > count / 100

@@ -33,6 +33,10 @@ def pytest_asyncio_loop_factories() -> dict[str, Callable[[], asyncio.AbstractEv
     return {"simulated": MemoryLoop}
 
 
+Ends = pytest.RaisesExc[Exception]
+"""How a motion ends: the context manager that `pytest.raises` returns."""
+
+
 class Cabinet(ArcsServer):
     """The loopback controller, and what tests ask of it."""
 
@@ -75,6 +79,10 @@ class Cabinet(ArcsServer):
         """Answer lines like these with this code and do not queue them."""
         move_line = self._methods["rob1.MotionControl.moveLine"]
         self._methods["rob1.MotionControl.moveLine"] = lambda p: code if refused(p) else move_line(p)
+
+
+Act = Callable[[AuboArcs, Cabinet], Any]
+"""What happens during a motion; the end of the task or coroutine that it returns, if any, is waited for."""
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 
 import pytest
 
@@ -15,7 +15,7 @@ from brushloop.drivers.devices import Pose, QueuedLine
 from brushloop.drivers.errors import ConnectionLost, MotionFailed, MotionRefused, ProtocolViolation, RobotNotSafe
 from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.sim.cabinet import MOST_MOVES
-from tests.drivers.arcs.conftest import LIMITS, Cabinet, cut
+from tests.drivers.arcs.conftest import LIMITS, Act, Cabinet, Ends, cut
 
 WAY = {"speed_mm_s": 40.0, "acc_mm_s2": 800.0}
 SLOW = {**WAY, "speed_mm_s": 3.0}
@@ -80,26 +80,21 @@ async def test_the_arm_halts_nowhere_but_at_the_last_pose_having_passed_near_all
 
 
 @pytest.mark.parametrize(
-    ("act", "error", "words"),
+    ("act", "ends"),
     [
-        (lambda arm, _: asyncio.create_task(arm.stop()), MotionFailed, "was stopped"),
-        (lambda _, cabinet: cabinet.cabinet.stop(2.0, 2.0), MotionFailed, "does not advance"),
-        (lambda _, cabinet: cabinet.cabinet.hold(), MotionFailed, "does not advance"),
-        (lambda _, cabinet: cabinet.cabinet.safety_stop(), RobotNotSafe, "ProtectiveStop"),
-        (lambda arm, _: cut(arm._motion), ConnectionLost, "closed|lost|reset|abort|connection"),
+        (lambda arm, _: asyncio.create_task(arm.stop()), pytest.raises(MotionFailed, match="was stopped")),
+        (lambda _, cabinet: cabinet.cabinet.stop(2.0, 2.0), pytest.raises(MotionFailed, match="does not advance")),
+        (lambda _, cabinet: cabinet.cabinet.hold(), pytest.raises(MotionFailed, match="does not advance")),
+        (lambda _, cabinet: cabinet.cabinet.safety_stop(), pytest.raises(RobotNotSafe, match="ProtectiveStop")),
+        (lambda arm, _: cut(arm._motion), pytest.raises(ConnectionLost, match=r"closed|lost|reset|abort|connection")),
     ],
     ids=["stopped", "stopped by another client", "held", "stopped by itself", "cut off"],
 )
 async def test_whatever_ends_a_way_is_named_and_no_line_follows(
-    arm: AuboArcs,
-    cabinet: Cabinet,
-    way: asyncio.Task[None],
-    act: Callable[[AuboArcs, Cabinet], asyncio.Task[None] | None],
-    error: type[Exception],
-    words: str,
+    arm: AuboArcs, cabinet: Cabinet, way: asyncio.Task[None], act: Act, ends: Ends
 ):
     stopping = act(arm, cabinet)
-    with pytest.raises(error, match=words):
+    with ends:
         await way
     assert await rests_short(cabinet)
     if stopping:
@@ -127,19 +122,19 @@ async def test_a_controller_that_holds_few_lines_is_fed_as_it_takes_them(
 
 
 @pytest.mark.parametrize(
-    ("accepted", "code", "error", "words"),
+    ("accepted", "code", "ends"),
     [
-        (0, 2, MotionRefused, "Another client"),
-        (3, 2, MotionFailed, "does not advance"),
-        (5, -5, MotionRefused, "refused with -5"),
+        (0, 2, pytest.raises(MotionRefused, match="Another client")),
+        (3, 2, pytest.raises(MotionFailed, match="does not advance")),
+        (5, -5, pytest.raises(MotionRefused, match="refused with -5")),
     ],
     ids=["a queue that somebody else fills", "one that stays full", "a line that is refused"],
 )
 async def test_a_line_that_is_not_taken_ends_the_way(
-    arm: AuboArcs, cabinet: Cabinet, accepted: int, code: int, error: type[Exception], words: str
+    arm: AuboArcs, cabinet: Cabinet, accepted: int, code: int, ends: Ends
 ):
     cabinet.refuses_lines(code, lambda _: cabinet.taken >= accepted)
-    with pytest.raises(error, match=words):
+    with ends:
         await arm.follow(LONG, **SLOW)
     assert await rests_short(cabinet)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -23,7 +23,7 @@ from brushloop.drivers.errors import (
 )
 from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
-from tests.drivers.arcs.conftest import Cabinet, MakeArm, cut, enabled, mute
+from tests.drivers.arcs.conftest import Act, Cabinet, Ends, MakeArm, cut, enabled, mute
 
 X_MM, Y_MM = 250.0, -230.0
 HOME, TOP, DEEP = (brush_pose(X_MM, Y_MM, z_mm) for z_mm in (260.0, 300.0, 200.0))
@@ -37,13 +37,9 @@ LINE, SIZE, STOP_MOVE, START_MOVE = (
 )
 
 
-def z_mm(cabinet: Cabinet) -> float:
-    return cabinet.tool.z_mm
-
-
 async def below(cabinet: Cabinet, height_mm: float) -> None:
     """Return once the tip is lower than this."""
-    while z_mm(cabinet) > height_mm:
+    while cabinet.tool.z_mm > height_mm:
         await asyncio.sleep(0.002)
 
 
@@ -59,7 +55,7 @@ async def test_the_arm_goes_down_dwells_and_comes_up_once_the_controller_has_eve
     arm: AuboArcs, cabinet: Cabinet
 ):
     held: list[tuple[float, int]] = []
-    cabinet.before_each(START_MOVE, lambda _: held.append((z_mm(cabinet), cabinet.queued)))
+    cabinet.before_each(START_MOVE, lambda _: held.append((cabinet.tool.z_mm, cabinet.queued)))
     seen = await arm.sequence(PRESS, acc_mm_s2=ACC)
     assert held == [(HOME.z_mm, 3)]
     assert distance(cabinet.tool, TOP)[0] <= 0.05
@@ -69,50 +65,35 @@ async def test_the_arm_goes_down_dwells_and_comes_up_once_the_controller_has_eve
     assert deep.at_s - near.at_s == pytest.approx(DWELL_S, abs=1e-3)
 
 
-def cuts(arm: AuboArcs, _: Cabinet) -> None:
-    cut(arm._motion)
-
-
-def stops(arm: AuboArcs, _: Cabinet) -> asyncio.Task[None]:
-    return asyncio.create_task(arm.stop())
-
-
 def sends_aside(_: AuboArcs, cabinet: Cabinet) -> None:
     """Another client's line reaches the controller now."""
     assert cabinet.cabinet.world.motion.add(ASIDE, 200.0, ACC, cabinet.cabinet.now_s())
 
 
 @pytest.mark.parametrize(
-    ("act", "error", "words"),
+    ("act", "ends"),
     [
-        (cuts, ConnectionLost, "closed the connection"),
-        (stops, MotionFailed, "was stopped|holds 0 of 3 lines"),
-        (sends_aside, PathDisturbed, r"holds 4 lines, 3 were sent.*nother client"),
+        (lambda arm, _: cut(arm._motion), pytest.raises(ConnectionLost, match="closed the connection")),
+        (
+            lambda arm, _: asyncio.create_task(arm.stop()),
+            pytest.raises(MotionFailed, match=r"was stopped|holds 0 of 3 lines"),
+        ),
+        (sends_aside, pytest.raises(PathDisturbed, match=r"holds 4 lines, 3 were sent.*nother client")),
     ],
 )
 @pytest.mark.parametrize(("method", "number"), [(STOP_MOVE, 1), (LINE, 1), (LINE, 3), (SIZE, 1)])
 async def test_whatever_happens_before_the_path_is_let_go_drops_it_and_leaves_the_arm_where_it_is(
-    arm: AuboArcs,
-    cabinet: Cabinet,
-    method: str,
-    number: int,
-    act: Callable[[AuboArcs, Cabinet], asyncio.Task[None] | None],
-    error: type[Exception],
-    words: str,
+    arm: AuboArcs, cabinet: Cabinet, method: str, number: int, act: Act, ends: Ends
 ):
     tasks: list[asyncio.Task[None] | None] = []
     cabinet.before_each(method, lambda now: tasks.append(act(arm, cabinet)) if now == number else None)
-    with pytest.raises(error, match=words):
+    with ends:
         await arm.sequence(PRESS, acc_mm_s2=ACC)
     await asyncio.gather(*filter(None, tasks))
-    assert z_mm(cabinet) == HOME.z_mm
+    assert cabinet.tool.z_mm == HOME.z_mm
     assert await nothing_is_left(cabinet)
-    if act is not cuts:
+    if not arm._motion.lost:
         await arm.move(TOP, speed_mm_s=100.0, acc_mm_s2=ACC)  # the hold is over, too
-
-
-async def stops_itself(_: AuboArcs, cabinet: Cabinet) -> None:
-    cabinet.cabinet.safety_stop()
 
 
 async def is_stopped_although_no_answer_can_be_read(arm: AuboArcs, cabinet: Cabinet) -> None:
@@ -127,22 +108,19 @@ async def is_stopped_although_no_answer_can_be_read(arm: AuboArcs, cabinet: Cabi
         (250.0, lambda arm, _: arm.stop(), MotionFailed),
         (200.1, lambda arm, _: arm.stop(), MotionFailed),
         (255.0, is_stopped_although_no_answer_can_be_read, MotionFailed),
-        (255.0, stops_itself, RobotNotSafe),
+        (255.0, lambda _, cabinet: cabinet.cabinet.safety_stop(), RobotNotSafe),
     ],
 )
 async def test_a_stop_on_the_way_down_or_at_depth_ends_the_press_at_once_and_drops_the_lift(
-    arm: AuboArcs,
-    cabinet: Cabinet,
-    below_mm: float,
-    act: Callable[[AuboArcs, Cabinet], Awaitable[None]],
-    error: type[Exception],
+    arm: AuboArcs, cabinet: Cabinet, below_mm: float, act: Act, error: type[Exception]
 ):
     press = asyncio.create_task(arm.sequence(PRESS, acc_mm_s2=ACC))
     await below(cabinet, below_mm)
-    await act(arm, cabinet)
+    if (stop := act(arm, cabinet)) is not None:
+        await stop
     with pytest.raises(error):
         await press
-    assert DEEP.z_mm <= z_mm(cabinet) <= below_mm
+    assert DEEP.z_mm <= cabinet.tool.z_mm <= below_mm
     assert await nothing_is_left(cabinet)
 
 
@@ -157,7 +135,7 @@ async def test_lines_that_a_dead_process_left_held_are_dropped_and_do_not_hold_u
     if not counted:
         cabinet._methods["rob1.MotionControl.getExecId"] = lambda p: -1 if cabinet.cabinet.motion.held else running(p)
     other = await enabled(make_arm)
-    assert z_mm(cabinet) == HOME.z_mm
+    assert cabinet.tool.z_mm == HOME.z_mm
     assert await nothing_is_left(cabinet)
     await other.move(TOP, speed_mm_s=100.0, acc_mm_s2=ACC)
 
@@ -168,21 +146,24 @@ def does_not_hold(cabinet: Cabinet) -> None:
 
 
 @pytest.mark.parametrize(
-    ("tamper", "error", "words"),
+    ("tamper", "ends"),
     [
-        (does_not_hold, MotionFailed, "does not hold its path|holds . of 3"),
-        (lambda c: c.refuses_lines(0, lambda line: line["duration"]), MotionFailed, "holds 2 of 3 lines"),
-        (lambda c: c.refuses_lines(2, lambda line: line["duration"]), MotionRefused, "QUEUE_FULL"),
+        (does_not_hold, pytest.raises(MotionFailed, match=r"does not hold its path|holds . of 3")),
+        (
+            lambda c: c.refuses_lines(0, lambda line: line["duration"]),
+            pytest.raises(MotionFailed, match="holds 2 of 3"),
+        ),
+        (lambda c: c.refuses_lines(2, lambda line: line["duration"]), pytest.raises(MotionRefused, match="QUEUE_FULL")),
     ],
     ids=["does not hold", "keeps fewer lines", "refuses a line"],
 )
 async def test_a_controller_that_does_not_keep_all_lines_is_not_let_go(
-    arm: AuboArcs, cabinet: Cabinet, tamper: Callable[[Cabinet], None], error: type[Exception], words: str
+    arm: AuboArcs, cabinet: Cabinet, tamper: Callable[[Cabinet], None], ends: Ends
 ):
     tamper(cabinet)
-    with pytest.raises(error, match=words):
+    with ends:
         await arm.sequence(PRESS, acc_mm_s2=ACC)
-    assert z_mm(cabinet) > DEEP.z_mm
+    assert cabinet.tool.z_mm > DEEP.z_mm
     assert await nothing_is_left(cabinet)
 
 
@@ -218,7 +199,7 @@ async def test_a_controller_that_never_answers_again_is_given_the_time_of_the_pr
     mute(cabinet)
     with pytest.raises(DeviceTimeout):
         await press
-    assert z_mm(cabinet) == pytest.approx(TOP.z_mm)
+    assert cabinet.tool.z_mm == pytest.approx(TOP.z_mm)
     cabinet.faults.clear()
 
 
@@ -240,23 +221,16 @@ def strays_mm(cabinet: Cabinet) -> list[float]:
     return strays
 
 
-async def test_a_line_that_comes_between_the_last_check_and_the_release_is_stopped(
-    arm: AuboArcs, cabinet: Cabinet, strays_mm: list[float]
-) -> None:
-    cabinet.before_each(START_MOVE, lambda _: sends_aside(arm, cabinet))
-    with pytest.raises(PathDisturbed, match="nother client"):
-        await arm.sequence(PRESS, acc_mm_s2=ACC)
-    assert max(strays_mm) < 0.5
-    assert cabinet.queued == 0
-
-
-@pytest.mark.parametrize("at_mm", [250.0, 200.01])
-async def test_a_line_that_comes_during_the_press_is_not_begun(
-    arm: AuboArcs, cabinet: Cabinet, other: Controller, strays_mm: list[float], at_mm: float
+@pytest.mark.parametrize("at_mm", [None, 250.0, 200.01], ids=["as the path is released", "on the way down", "at depth"])
+async def test_a_line_that_comes_after_the_last_check_is_not_begun(
+    arm: AuboArcs, cabinet: Cabinet, strays_mm: list[float], at_mm: float | None
 ) -> None:
     press = asyncio.create_task(arm.sequence(PRESS, acc_mm_s2=ACC))
-    await below(cabinet, at_mm)
-    await other.move_line(ASIDE, 200.0, ACC)
+    if at_mm is None:
+        cabinet.before_each(START_MOVE, lambda _: sends_aside(arm, cabinet))
+    else:
+        await below(cabinet, at_mm)
+        sends_aside(arm, cabinet)
     with pytest.raises(PathDisturbed, match=r"holds \d lines, at most \d of ours are left.*nother client"):
         await press
     assert max(strays_mm) < 0.5

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import pytest
 
@@ -24,7 +24,7 @@ from brushloop.drivers.errors import (
 )
 from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.sim.faults import ALWAYS, Fault
-from tests.drivers.arcs.conftest import NEAR, QUICK, Cabinet, MakeArm, mute_to
+from tests.drivers.arcs.conftest import NEAR, QUICK, Act, Cabinet, MakeArm, mute_to
 from tests.waiting import until
 
 FAR = brush_pose(250.0, -30.0, 260.0)  # 200 mm from home: two seconds of the fast clock
@@ -175,9 +175,7 @@ def loses_what_is_sent_to_stop(arm: AuboArcs, _: Cabinet) -> None:
     ],
     ids=["no id", "no safety mode", "no connection", "no answer to a stop"],
 )
-async def test_a_stop_gets_through_at_once_whatever_hangs(
-    arm: AuboArcs, cabinet: Cabinet, act: Callable[[AuboArcs, Cabinet], None]
-):
+async def test_a_stop_gets_through_at_once_whatever_hangs(arm: AuboArcs, cabinet: Cabinet, act: Act):
     move = asyncio.create_task(arm.move(FAR, **SLOW))
     await asyncio.sleep(0.2)
     act(arm, cabinet)
