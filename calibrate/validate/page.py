@@ -60,6 +60,8 @@ MOVED_MM = 0.3
 MISSED_MM = 0.1
 """Difference between the commanded and the reached depth above which a report says so."""
 MAX_NAMED = 6
+ANSWERS = {True: "Yes", False: "No", None: "Not certain"}
+"""Whether the model predicts the brush: whether all, none or a part of its interval is within the goal."""
 SHORT = {HELD_OUT: ", held out", "fitted, in sample": ", in sample"}
 """What a model knows of the strokes, shortened for the terminal."""
 MAX_POINTS = 200
@@ -263,16 +265,17 @@ def headline(report: Report) -> Iterator[tuple[str, float]]:
 
 
 def verdict(report: Report) -> str:
-    """How well the model shown predicts; empty where none was compared."""
+    """Whether, and how well, the model shown predicts; empty where none was compared."""
     csim, top = _csim(report, report.shown), _csim(report, CEILING)
     if csim is None:
         return ""
-    below = ""
-    if top is not None and csim.below_ceiling is not None:
-        below = f", {_points(csim)} below the ceiling of {top.avg:.1f} %"
     unseen = " from conditions that it has not seen" if report.shown == FITTED_HELD_OUT else ""
-    label = _label(report, report.shown)
-    return f"{label} predicts presses{unseen} with an average CSIM of {csim.avg:.1f} %{below}."
+    says = f"{_label(report, report.shown)} predicts presses{unseen} with an average CSIM of {csim.avg:.1f} %"
+    if top is None or csim.below_ceiling is None:
+        return f"{says}."
+    answer = ANSWERS[is_near(csim.below_ceiling, csim.below_interval)]
+    below = f"{csim.below_ceiling:.1f} points{_span(csim.below_interval)} below the ceiling of {top.avg:.1f} %"
+    return f"{answer}: {says}, {below}; the goal is {NEAR_POINTS:g} points or less."
 
 
 def trust(report: Report) -> Iterator[Point]:
@@ -291,9 +294,6 @@ def trust(report: Report) -> Iterator[Point]:
     yield from _models(report)
     for loop in report.loops:
         yield loop.answer
-    if any("in sample" in model.basis for model in report.models):
-        words = "Rows “in sample” were fitted to the very strokes that they predict: read the held-out rows instead."
-        yield Point(None, words)
 
 
 def _session(session: Session) -> Iterator[Point]:
@@ -324,26 +324,17 @@ def _session(session: Session) -> Iterator[Point]:
 
 
 def _models(report: Report) -> Iterator[Point]:
-    """Whether there is a ceiling, and where the calibrated model stands."""
+    """Whether there is a ceiling, and a calibrated model."""
     if _csim(report, CEILING) is None:
         words = "No condition was pressed twice: the repeatability of the brush is unknown, and there is no ceiling."
         yield Point(False, words)
-    held = _csim(report, FITTED_HELD_OUT)
-    if held is not None and held.below_ceiling is not None:
-        near = is_near(held.below_ceiling, held.below_interval)
-        words = f"The calibrated model is {_points(held)} below the ceiling; the project's goal is {NEAR_POINTS:g}"
-        yield Point(near, f"{words} (CSIM, mm, binary).")
-    elif held is None and not report.source.imported:
+    if _csim(report, FITTED_HELD_OUT) is None and not report.source.imported:
         yield Point(None, "No model was calibrated to this brush: run “brushloop fit”, then validate again.")
 
 
-def _csim(report: Report, model: str, key: Key = STRICT) -> Summary | None:
-    stat = report.stat(model, key)
+def _csim(report: Report, model: str) -> Summary | None:
+    stat = report.stat(model, STRICT)
     return None if stat is None else stat.csim
-
-
-def _points(csim: Summary) -> str:
-    return f"{csim.below_ceiling:.1f} points{_span(csim.below_interval)}"
 
 
 def _span(interval: Interval | None) -> str:

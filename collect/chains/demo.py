@@ -119,13 +119,20 @@ class Demo:
 
     def _say_answer(self) -> None:
         """Print how much of the ink is predicted, and what follows."""
-        from brushloop.calibrate.validate.page import headline, verdict  # slow to import
+        from brushloop.calibrate.compare import TABLE_2  # slow to import
+        from brushloop.calibrate.validate.page import headline, verdict
+        from brushloop.calibrate.validate.tables import NORMAL
 
         if (report := self._validated.report) is None:
             return
         say("", f"How much of the ink is predicted (average CSIM; {report.label}):")
         for label, percent in headline(report):
             say(f"  {label:30} {'█' * round(percent / 100 * BAR):{BAR}} {percent:.1f} %")
+        if (shapes := report.stat("ccd-bsm", NORMAL)) is not None:
+            say(
+                "Size and place count here. The paper compares only shapes, scaled to one size: so compared, CCD-BSM "
+                f"as published scores {shapes.csim.avg:.1f} %, and {TABLE_2['ccd-bsm'].csim[2]:.1f} % in the paper."
+            )
         say(verdict(report))
 
     def _started(self) -> LoopbackRig:
