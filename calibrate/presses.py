@@ -51,6 +51,8 @@ from brushloop.sessions.terminal import Progress, counted, unseen
 
 SPECK_SHARE = 0.002
 """Smallest share of a figure's ink that counts; lower than for a press, because a figure may have dots."""
+LEAST_LEFT = 0.25
+"""Smallest share of a press's ink that lies to the left of its touch."""
 Refused = tuple[str, str]
 """(stroke, reason) of a capture that cannot be used: it is listed, never dropped in silence."""
 
@@ -100,6 +102,14 @@ def too_thin(press: Press) -> str:
     return "" if thin is None else f"is too thin to be seen at the scale of {thin[0]} ({thin[1]})"
 
 
+def beside_touch(press: Press) -> str:
+    """Refuse an imported press whose ink lies to the right of its touch point: every mark extends to the left of it."""
+    left = round(press.anchor_mm[0] / FIELD_MM * press.coverage.shape[1])
+    if press.stroke.anchor_px is None or press.coverage[:, :left].sum() >= LEAST_LEFT * press.coverage.sum():
+        return ""
+    return "lies to the right of its touch point (start_x_px): is its photograph turned or mirrored?"
+
+
 def read_presses(
     session: OpenSession,
     refused: list[Refused],
@@ -140,7 +150,7 @@ def read_for_fit(place: Path | Recording, progress: Progress = unseen) -> tuple[
     Raises `CalibrationError` where it holds none, or was not calibrated.
     """
     session, refused = open_session(place, "press"), list[Refused]()
-    usable = list(read_presses(session, refused, uncommanded, cut, progress=progress))
+    usable = list(read_presses(session, refused, uncommanded, cut, beside_touch, progress=progress))
     if not usable:
         why = ", first: {} {}".format(*refused[0]) if refused else ""
         raise CalibrationError(str(session.recording.path), f"holds no press that can be used for a fit{why}")

@@ -21,7 +21,7 @@ from brushloop.calibrate.compare import MM_BINARY, Alignment, Pixels, brush_of, 
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.command import BrushFit
 from brushloop.calibrate.fit.heldout import Refit, leave_out, refits
-from brushloop.calibrate.presses import Press, for_fit, read_presses, too_thin, uncommanded
+from brushloop.calibrate.presses import Press, beside_touch, for_fit, read_presses, too_thin, uncommanded
 from brushloop.calibrate.scores import Scores, similarities
 from brushloop.calibrate.session import OpenSession
 from brushloop.calibrate.stats import CEILING, others_of
@@ -182,7 +182,7 @@ def validate_presses(
     presses: list[Press] = []
     for session in sessions:
         name, left_out = session.header.session_id, list[tuple[str, str]]()
-        reasons = uncommanded, too_thin
+        reasons = uncommanded, too_thin, beside_touch
         of_session = list(read_presses(session, left_out, *reasons, scheduler=scheduler, progress=progress))
         refused += (Refused(name, *reason) for reason in left_out)
         every = in_order([*models[name], *_held_out(session, of_session, request, scheduler, progress)])
