@@ -72,7 +72,7 @@ def fit(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     for name, presses, prior in _pressed(n, seed):
         rows = leave_condition_out(presses, fit_presses(presses, prior=prior), prior)
         csim = {row.model: row.csim.avg for row in rows}
-        where = f"simulated; ceiling {csim[CEILING]:.2f}, refitted Bezier {csim[BEZIER]:.2f} %; {machine()}"
+        where = f"simulated; ceiling {csim[CEILING]:.2f}, Bezier refitted {csim[BEZIER]:.2f} %; {machine()}"
         gap = csim[CEILING] - csim[FITTED]
         results.append(at_most(f"fit.gap.{name}", gap, POINTS, FULL_POINTS, len(presses), seed, where))
     return results
@@ -222,7 +222,7 @@ def twin(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
         with workers() as pool:
             fitted = fit_twin(presses, pool)
         csim = {row.model: row.csim.avg for row in fitted.held_out}
-        where = f"simulated; ceiling {csim[CEILING]:.2f}, refitted Bezier {csim[BEZIER]:.2f} %; {machine()}"
+        where = f"simulated; ceiling {csim[CEILING]:.2f}, Bezier refitted {csim[BEZIER]:.2f} %; {machine()}"
         gap = csim[CEILING] - csim[TWIN]
         results.append(at_most(f"twin.gap.{name}", gap, POINTS, TWIN_POINTS, len(presses), seed, where))
         if spread := fitted.spread:

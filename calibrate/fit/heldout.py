@@ -19,7 +19,7 @@ from brushloop.model.fitted import FittedPress, Prior
 from brushloop.model.presses import DepthTilt, Draw, Presses, image_of, refit_bezier
 from brushloop.sessions.terminal import Progress, counted, unseen
 
-FITTED, BEZIER, UNCALIBRATED = "fitted", "refitted Bezier", "uncalibrated"
+FITTED, BEZIER, UNCALIBRATED = "CCD-BSM calibrated", "Bezier refitted", "CCD-BSM as published"
 Images = NDArray[np.floating]
 MAX_FOLDS = 15
 """Most folds: the paper's grid leaves out one condition at a time, a larger grid several."""

@@ -15,7 +15,7 @@ from brushloop.calibrate.commands import FitRequest
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.command import FEWEST_CONDITIONS, BrushFit, fit_press_session, sizes_of
 from brushloop.calibrate.fit.fit import draw, fit_presses, regress
-from brushloop.calibrate.fit.heldout import FITTED, leave_condition_out
+from brushloop.calibrate.fit.heldout import BEZIER, FITTED, UNCALIBRATED, leave_condition_out
 from brushloop.calibrate.session import open_session
 from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.validate.tables import Report
@@ -126,7 +126,7 @@ def test_held_out_conditions_are_scored_beside_the_ceiling_which_one_press_of_ea
     rows = {row.model: row for row in leave_condition_out(strokes, fit_presses(strokes))}
     fitted, ceiling = rows[FITTED].csim, rows[CEILING].csim
     assert fitted.n == ceiling.n == 10
-    assert rows["uncalibrated"].csim.avg + 5.0 < fitted.avg <= 100.0
+    assert rows[UNCALIBRATED].csim.avg + 5.0 < fitted.avg <= 100.0
     assert fitted.below_ceiling == pytest.approx(ceiling.avg - fitted.avg, abs=1e-5)
     assert fitted.below_interval is not None
     assert fitted.below_interval[0] < fitted.below_ceiling < min(2.5, fitted.below_interval[1])
@@ -184,7 +184,7 @@ def test_one_command_leads_from_photographs_to_a_fit_and_a_report(tmp_path: Path
     ran = CliRunner(env={"COLUMNS": "60"}).invoke(app, ["analyse", str(session)])
     assert ran.exit_code == 0, ran.output
     said = " ".join(ran.output.split())
-    sizes = "heel", "width", "95 %", "left out of the fit in turn", "refitted Bezier", "uncalibrated"
+    sizes = "heel", "width", "95 %", "left out of the fit in turn", BEZIER, UNCALIBRATED
     for words in (*sizes, "paper's", "CCD-BSMG"):
         assert words in said
     assert "…" not in said, "a size is cut in 60 columns"
@@ -195,7 +195,7 @@ def test_one_command_leads_from_photographs_to_a_fit_and_a_report(tmp_path: Path
     fit = BrushFit.read(path)
     assert fit.strokes == 5
     assert set(fit.cells) == set(CONDITIONS)
-    assert fit.csim_percent["fitted"] > fit.csim_percent["uncalibrated"] + 3.0
+    assert fit.csim_percent[FITTED] > fit.csim_percent[UNCALIBRATED] + 3.0
     report = Report.read(session / "validation" / "report.json")
     fitted = report.model(NAME)
     assert fitted is not None
