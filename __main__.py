@@ -234,13 +234,13 @@ def hand(
     control: Annotated[Path, typer.Argument(help="Control socket of a lab: `brushloop sim --unknown`.")],
     act: Annotated[str, typer.Argument(help="bring, measure or mend.")],
     to: Annotated[str | None, typer.Argument(help="What: pin, board-corner, well, park, hold-board, ...")] = None,
-    index: Annotated[int, typer.Option(min=0, max=999, help="Which one, from 0, such as a direction at the pin.")] = 0,
+    index: Annotated[int, typer.Option(min=1, max=999, help="Which one, from 1, such as a direction at the pin.")] = 1,
     corner: Annotated[str | None, typer.Option(help="Such as 'lower left' or 'upper right'.")] = None,
 ) -> None:
     """Act as the person in an unknown lab: guide the arm by hand, hold the printed board, correct mistakes."""
     from brushloop.drivers.loopback import ask
 
-    wanted = {"act": act, "to": to, "index": index or None, "corner": corner}
+    wanted = {"act": act, "to": to, "index": index - 1, "corner": corner}
     say(ask(control, {"do": "hand", **{name: value for name, value in wanted.items() if value is not None}})["says"])
 
 
