@@ -130,7 +130,8 @@ class ProofStep(Step):
         visit.say(
             f"touch height {z_mm:.3f} mm ({z_mm - by_hand_mm:+.2f} mm from the touch by hand), {known}",
             f"marks off by {check.offset_mm[0]:+.1f}, {check.offset_mm[1]:+.1f} mm, turned {check.turn_deg:+.2f} deg",
-            f"{PRESSES} presses passed the quality checks, {again} were repeated; camera delay {delay_ms:.0f} ms",
+            f"{PRESSES} presses passed the quality checks, {again} were repeated",
+            f"camera delay {delay_ms:.0f} ms: up to {SLOW_CAMERA_MS:g} ms are good",
         )
         if delay_ms > SLOW_CAMERA_MS:
             slow = f"The camera is slow: {delay_ms / 1e3:.1f} s. Each photograph waits for it."

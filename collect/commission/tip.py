@@ -80,11 +80,11 @@ def find_tip(flanges: Sequence[Pose]) -> TipFit:
     )
 
 
-def stray_touch(flanges: Sequence[Pose]) -> tuple[int, float] | None:
-    """Number of the touch that does not fit the others, and its distance in mm from their point; None if all fit.
+def stray_touch(flanges: Sequence[Pose]) -> tuple[int, float, float] | None:
+    """Number of the touch that does not fit the others, its distance from their point and the limit of that, in mm.
 
     A touch that slipped, or was never made at the pin, spoils the residuals of all, so each is compared with a fit of
-    the others alone. None also for fewer than five touches.
+    the others alone. None if all fit, and for fewer than five touches.
     """
     stray, worst = None, 1.0
     for k in range(len(flanges)):
@@ -93,9 +93,9 @@ def stray_touch(flanges: Sequence[Pose]) -> tuple[int, float] | None:
         except NotAccepted:
             continue
         off_mm = math.dist(tip_of(flanges[k], fit.offset_mm), fit.pin_mm)
-        excess = off_mm / max(LEAST_OUTLIER_MM, OUTLIER_SHARE * fit.touch_mm)
-        if excess > worst:
-            stray, worst = (k, off_mm), excess
+        limit_mm = max(LEAST_OUTLIER_MM, OUTLIER_SHARE * fit.touch_mm)
+        if off_mm / limit_mm > worst:
+            stray, worst = (k, off_mm, limit_mm), off_mm / limit_mm
     return stray
 
 
@@ -213,8 +213,10 @@ class TipStep(Step):
             visit.say(str(error), tone="warning")
             return math.inf
         if (stray := stray_touch(list(touches.values()))) is not None:
-            name, off_mm = list(touches)[stray[0]], stray[1]
-            visit.say(f"Touch {int(name) + 1} lies {off_mm:.1f} mm off: it is left out.", tone="warning")
+            number, off_mm, limit_mm = stray
+            name = list(touches)[number]
+            off = f"{off_mm:.1f} mm from the point of the others (at most {limit_mm:.1f} mm)"
+            visit.say(f"Touch {int(name) + 1} lies {off}: it is left out.", tone="warning")
             visit.forget(f"pin {name}")
             return math.inf
         x, y, z = fit.offset_mm

@@ -200,8 +200,9 @@ async def _fresh_frame(context: StepContext) -> Frame:
     known = photographer.delay
     frame = await photographer.photograph()
     if photographer.delay is not known:
-        context.recorder.log(f"camera delay: {photographer.delay}")
-        run.progress.log(f"camera delay: {photographer.delay}")
+        measured = f"camera delay: {photographer.delay}, limit {run.rig.config.camera.max_delay_ms:g} ms"
+        context.recorder.log(measured)
+        run.progress.log(measured)
     return frame
 
 

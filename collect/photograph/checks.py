@@ -276,7 +276,7 @@ def misplaced(mark: Mark, limits: QualityConfig) -> Check:
 
 def smeared(mark: Mark, depth_mm: float, limits: QualityConfig) -> Check:
     """The mark is no larger than a press of its depth makes it: a brush that moves sideways leaves more."""
-    excess_mm = max(mark.length_mm - LONGEST * depth_mm, mark.width_mm - WIDEST * depth_mm)
+    excess_mm = max(mark.length_mm - LONGEST * depth_mm, mark.width_mm - WIDEST * depth_mm, 0.0)
     reason = (
         f"The stroke is smeared: {mark.length_mm:.0f} by {mark.width_mm:.0f} mm at a depth of {depth_mm:g} mm. Did "
         "another client move the arm, or did the sheet slip?"

@@ -32,7 +32,7 @@ PASSED = {
     "neighbour": "alone",
     "blank": "inked",
     "dry": "wet",
-    "smeared": "clean",
+    "smeared": "no smear",
     "misplaced": "in place",
     "faint": "dark",
     "split": "whole",

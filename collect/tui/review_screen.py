@@ -134,7 +134,7 @@ class Review:
         if len(binaries) < 2:
             return "one press only"
         alike = statistics.fmean(csim(a, b) for a, b in itertools.combinations(binaries, 2))
-        return f"mean CSIM {alike:.3f} of every pair of {len(binaries)} presses"
+        return f"{100.0 * alike:.1f} % alike: mean CSIM of every pair of {len(binaries)} presses (equal: 100 %)"
 
     def predicted(self, capture: ReviewCapture) -> tuple[LastCapture, str]:
         """A capture with the mark that the session's fitted brush predicts, and which fit that is.
@@ -308,7 +308,7 @@ class ReviewScreen(Screen[None]):
         file = capture.file if (folder / capture.file).is_file() else merged_file(folder).name
         lines = [
             Content.assemble((press.stroke_id, "bold"), f"  {condition_text(press.condition)}", (why, "bold")),
-            labelled("MCAP", f"{file}  still {result.still}"),
+            labelled("MCAP", f"{file}, photograph {result.still}"),
             labelled("Repeats", alike),
         ]
         if capture.unlike:
