@@ -102,7 +102,8 @@ async def touch(visit: Visit, thing: str, how: str, *, may_skip: bool = False) -
     flange = await taught_flange(visit.notebook)
     visit.save(visit.notebook.with_touch(thing, flange))
     x, y, z = flange.position_mm
-    visit.say(f"✓ noted: the flange is at ({x:.2f}, {y:.2f}, {z:.2f}) mm")
+    name = " ".join(word for word in thing.split() if not word.isdecimal())
+    visit.say(f"✓ {name}: the flange is at ({x:.2f}, {y:.2f}, {z:.2f}) mm")
     return True
 
 

@@ -161,7 +161,8 @@ class ForceStep(Step):
             sensor.listen(samples.append)
             await asyncio.sleep(REST_S)
             noise_n = float(np.std([sample.force_n for sample in samples], axis=0).max()) if samples else math.inf
-            visit.say(f"{identity.model}: {len(samples) / REST_S:.0f} rounds/s, noise {noise_n:.4f} N")
+            noise = f"noise {noise_n:.4f} N (limit: {MOST_NOISE_N:g} N)"
+            visit.say(f"{identity.model}: {len(samples) / REST_S:.0f} rounds/s, {noise}")
             samples.clear()
             how = "Push the tip gently up with a finger, toward the flange, for a second; then take the finger away."
             await visit.brought("push-sensor 0", how)
@@ -169,6 +170,7 @@ class ForceStep(Step):
             force_n = strongest(samples)
         axis = judged_push(force_n, noise_n)
         how = f"a finger pushed the tip with {float(np.linalg.norm(force_n)):.1f} N"
+        visit.say(f"✓ {how}, along the brush")
         if axis[2] > 0.0:
             visit.say(
                 "The sensor counts a push toward the flange as positive: it is mounted, or wired, the other way round "

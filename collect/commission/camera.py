@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from brushloop.calibrate.board.detect import find_board
-from brushloop.calibrate.board.lens import GOOD_VIEWS, fit_lens, guidance, held, nominal_normals
+from brushloop.calibrate.board.lens import GOOD_VIEWS, RMS_LIMIT_PX, fit_lens, guidance, held, nominal_normals
 from brushloop.calibrate.board.spec import BoardSpec, BoardView, describe
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_gray
@@ -34,7 +34,7 @@ VIEW = "aside.lens_view_"
 """Beginning of the fields for the photographs of the held board: the names of their files."""
 MOST_VIEWS = 20
 HOLD = (
-    "flat in the middle of the picture",
+    "flat, in the middle of the picture",
     "slanted to the left",
     "slanted to the right",
     "slanted away from the camera",
@@ -84,7 +84,8 @@ class CameraStep(Step):
         square_mm = await visit.value("board.square_mm", SQUARE)
         marker = number_of("Side of a marker", 1.0, 100.0, "mm", f"{MARKER_SHARE * square_mm:g}")
         await visit.value("board.marker_mm", marker)
-        await visit.value("board.dictionary", Prompt("Markers of the print", default="DICT_5X5_1000", read=str))
+        family = Prompt("Family of its markers (an ArUco dictionary)", default="DICT_5X5_1000", read=str)
+        await visit.value("board.dictionary", family)
         with visit.asked_again_if_refused(*PRINTED):
             try:
                 board_of(visit.notebook)
@@ -109,9 +110,9 @@ class CameraStep(Step):
             async with opened(visit, source) as camera:
                 picture = await still(camera, visit.clock)
             view = await _board_in(visit, picture, source, lying=False)
-            corners, (height, width) = 0 if view is None else len(view.ids), picture.shape
-            visit.say(f"{source}: {width} x {height} px; {corners} corners of the board are seen", picture=picture)
-            probably = YES if corners else NO
+            height, width = picture.shape
+            seen, probably = ("the board is seen", YES) if view is not None else ("no board is seen", NO)
+            visit.say(f"{source}: {width} x {height} px; {seen}", picture=picture)
             asked = choice_of("Is this the picture of the camera over the sheet?", (YES, NO), probably.key)
             over_sheet = await visit.ask(asked)
         # What a device chose by itself; the settings of a stream only its own set-up can change.
@@ -157,14 +158,14 @@ class CameraStep(Step):
             visit.say(warning, tone="warning")
         path = file.save(visit.rig_path.parent)
         how = f"fitted to {len(file.residuals_px)} photographs of the board held in {file.ways} ways"
-        known = f"residual {file.rms_px:.2f} px"
+        known = f"residual {file.rms_px:.2f} px (limit: {RMS_LIMIT_PX:g} px)"
         visit.keep({"camera.lens_file": Taught(str(path.relative_to(visit.rig_path.parent)), how, known=known)})
-        visit.say(f"Lens: residual {file.rms_px:.2f} px over {len(file.residuals_px)} photographs.")
+        visit.say(f"Lens: {known} over {len(file.residuals_px)} photographs.")
 
     async def _held(self, visit: Visit, camera: OpenCvCamera, folder: Path, index: int, views: list[BoardView]) -> bool:
         """Take one photograph of the held board, so that a resumed session does not; False if the person skips it."""
         where = HOLD[index] if index < len(HOLD) else "where it is still missing"
-        how = f"Cover the sheet, and hold the second print before the camera, {where}, all of it sharp; keep still."
+        how = f"View {index + 1}: cover the sheet, and hold the second print {where}, all of it sharp; keep still."
         async with shown_live(visit, camera):
             if not await visit.brought(f"hold-board {index}", how, may_skip=True):
                 return False

@@ -35,12 +35,12 @@ APART_MM = 150.0
 AWAY = {
     "clear-view": "Guide the arm to any place out of the camera's picture.",
     # Last, because the runs of the proof begin where the arm is left: it has to be within the limits.
-    "park": "Now bring the arm to its waiting place: brush upright, above everything, out of the camera's picture, "
-    f"{APART_MM:g} mm or more from there: two pictures that agree show the arm in neither.",
+    "park": "Now bring the arm to its waiting place: brush upright, above everything, out of the camera's picture, and "
+    f"{APART_MM:g} mm or more from the last place: the pictures from both must agree, as the arm is in neither.",
 }
 PARKED = "aside.parked"
 INK = ("well-rim", "well", "wash-rim", "wash-pot")
-WIPE = choice_of("Shall each dip end with a wipe across the rim of the well, which takes the drop off?", (YES, NO))
+WIPE = choice_of("Shall each dip end with a wipe across the rim of the well, so that no drop falls?", (YES, NO))
 WASH = choice_of("Is there a pot of water to wash the brush in?", (YES, NO))
 MARGIN_MM = 25.0
 """Room beside what was taught: a brush lifted along a tool axis that leans by 15 deg moves aside by as much."""
@@ -74,7 +74,7 @@ class PlacesStep(Step):
         with visit.asked_again_if_refused("well-rim", "well"):
             check_pot(visit.notebook, "well-rim 0", "well 0", "well")
         if await visit.value("aside.wipe", WIPE) == YES.key:
-            how = "Bring the tip to the rim on the side where the drop shall be wiped off, away from the sheet."
+            how = "Bring the tip to the rim of the well where the drop shall be wiped off, away from the sheet."
             await touch(visit, "well-rim 1", how)
             with visit.asked_again_if_refused("well-rim 1"):
                 check_wipe(visit.notebook)
@@ -115,9 +115,9 @@ class PlacesStep(Step):
                 f"the arm, or its shadow, is in one of the two pictures: {100 * share:.0f} % of them differs.",
                 "Park it farther from the sheet, or higher; both places are asked again.",
             )
-        shown = f"with the arm at both places {100 * share:.1f} % of the picture differs"
+        shown = f"the two pictures agree ({100 * share:.1f} % of them differs): the arm is in neither"
         visit.keep({PARKED: Taught(True, shown)})
-        visit.say(f"{shown.capitalize()}: it is out of both.")
+        visit.say(f"{shown.capitalize()}.")
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """Places in the sheet's frame, and the travel height."""
@@ -218,8 +218,12 @@ class LimitsStep(Step):
             f"{picture} shows box, sheet, board, well and park from above.",
             picture=await asyncio.to_thread(read_gray, picture),
         )
-        text = "; ".join(f"{field} {value.value} mm: {value.how}" for field, value in box.items())
-        if not await visit.yes(f"The box of the tip in the base frame. {text}. Agreed?"):
+        x_mm, y_mm, z_mm = ("{:g} to {:g} mm".format(*taught.value) for taught in box.values())
+        if not await visit.yes(
+            f"The tip will stay in this box of the base frame: x {x_mm}, y {y_mm}, z {z_mm}. It is the smallest "
+            f"around all that you taught, with {MARGIN_MM:g} mm beside and above, and {BELOW_MM:g} mm below all. "
+            "Agreed?"
+        ):
             raise NotAccepted(
                 "the box was not agreed.", "Teach the place again that makes the box too large: `brushloop rig teach`."
             )

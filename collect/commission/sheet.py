@@ -17,6 +17,7 @@ from scipy.optimize import least_squares
 from brushloop.calibrate.board.spec import BoardSpec, size_mm
 from brushloop.collect.commission.arm import HAND_MM, Point, tips, touch
 from brushloop.collect.commission.camera import board_of
+from brushloop.collect.commission.tip import LEAST_OUTLIER_MM
 from brushloop.collect.commission.visit import Notebook, Step, Taught, Visit
 from brushloop.collect.errors import NotAccepted
 from brushloop.collect.rig.paper import PaperPlane, fit_plane
@@ -34,7 +35,7 @@ EXPLAINED, LEAST_MM = 0.2, 0.3
 ASKEW_DEG = 0.5
 """A sheet that is turned by more against its board must be laid straight: `rig.toml` has one turn for both."""
 BOARD, SHEET = "board-corner", "sheet-corner"
-THINGS = ((BOARD, "the board's outermost square"), (SHEET, "the sheet"))
+THINGS = ((BOARD, "the board's printed squares"), (SHEET, "the sheet"))
 GOOD_MM = 0.13
 """Standard error of the sheet's origin, in each axis, at which touching ends."""
 MOST_ROUNDS = 5
@@ -57,6 +58,7 @@ class SheetStep(Step):
             "Lay the board where the sheet will lie, in the middle of the picture, and the sheet on it, its edges "
             "along the squares.",
             "Touch each corner with the brush upright (hold a set square beside it), and hold still.",
+            "The lower edge is the one with the print's name.",
         )
         sigma_mm = math.inf
         for number in range(MOST_ROUNDS):
@@ -75,7 +77,8 @@ class SheetStep(Step):
             reached = "✓" if fit.origin_sigma_mm <= GOOD_MM else "·"
             visit.say(
                 f"sheet: {width:.1f} x {height:.1f} mm, turned by {fit.yaw_deg:.2f} deg, leaning by "
-                f"{fit.plane.slope_deg:.2f} deg; corner ({x:.2f}, {y:.2f}) mm; residuals up to {fit.worst_mm:.2f} mm",
+                f"{fit.plane.slope_deg:.2f} deg; corner ({x:.2f}, {y:.2f}) mm; residuals up to {fit.worst_mm:.2f} mm "
+                f"(above {LEAST_OUTLIER_MM:g} mm a touch slipped: esc goes back to it)",
                 f"{reached} standard error of the corner: {fit.origin_sigma_mm:.2f} mm (goal: {GOOD_MM:g} mm)",
             )
             if (sigma_mm := fit.origin_sigma_mm) <= GOOD_MM:

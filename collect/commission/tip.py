@@ -48,6 +48,11 @@ class TipFit:
     error_mm: float
     """Root mean square of the distance by which the offset may be wrong."""
 
+    @property
+    def limit_mm(self) -> float:
+        """A touch that is farther from the point than this is a stray."""
+        return max(LEAST_OUTLIER_MM, OUTLIER_SHARE * self.touch_mm)
+
 
 def find_tip(flanges: Sequence[Pose]) -> TipFit:
     """Solve R_i t + p_i = c for the offset t and the point c by least squares (pivot calibration, e.g. Yaniv 2015).
@@ -93,9 +98,8 @@ def stray_touch(flanges: Sequence[Pose]) -> tuple[int, float, float] | None:
         except NotAccepted:
             continue
         off_mm = math.dist(tip_of(flanges[k], fit.offset_mm), fit.pin_mm)
-        limit_mm = max(LEAST_OUTLIER_MM, OUTLIER_SHARE * fit.touch_mm)
-        if off_mm / limit_mm > worst:
-            stray, worst = (k, off_mm, limit_mm), off_mm / limit_mm
+        if off_mm / fit.limit_mm > worst:
+            stray, worst = (k, off_mm, fit.limit_mm), off_mm / fit.limit_mm
     return stray
 
 
@@ -192,7 +196,7 @@ class TipStep(Step):
                 return
             how = (
                 f"Touch {index + 1}: bring the tip to the pin, the brush leaning by 30 deg or more "
-                f"{SIDES[index % 4]}; lean it without turning the wrist with it."
+                f"{SIDES[index % 4]}. Do not turn the wrist along with it."
             )
             await touch(visit, f"pin {index}", how, may_skip=True)
         if (error_mm := self._tip_error_mm(visit)) > WORST_MM:
@@ -222,7 +226,8 @@ class TipStep(Step):
         x, y, z = fit.offset_mm
         reached = "✓" if fit.error_mm <= GOOD_MM else "·"
         visit.say(
-            f"tip at ({x:.2f}, {y:.2f}, {z:.2f}) mm from the flange; residuals up to {fit.worst_mm:.2f} mm",
+            f"tip at ({x:.2f}, {y:.2f}, {z:.2f}) mm from the flange; residuals up to {fit.worst_mm:.2f} mm "
+            f"(limit: {fit.limit_mm:.1f} mm)",
             f"{reached} standard error after {len(touches)} touches: {fit.error_mm:.3f} mm (goal: {GOOD_MM:g} mm)",
         )
         return fit.error_mm
@@ -237,7 +242,7 @@ class TipStep(Step):
                     f"after {MOST_UPRIGHTS} holds the direction of the brush is not known to {WORST_DEG:g} deg.",
                     "Hold the brush along a set square, not by eye; or skip the holds: it is then not measured.",
                 )
-            how = f"Upright {index + 1} of {UPRIGHTS}: brush along the set square, wrist turned differently each time."
+            how = f"Hold {index + 1} of {UPRIGHTS}: brush along the set square, wrist turned differently each time."
             if not await touch(visit, f"upright {index}", how, may_skip=True):
                 if measured_axis(visit.notebook) is None:
                     visit.say("The direction of the brush is not measured.", tone="warning")
@@ -253,7 +258,7 @@ class TipStep(Step):
         wrong = {names[k]: f"is {off_deg:.1f} deg from the others" for k, off_deg in axis.strays.items()}
         sure = axis.clear
         if square.verdict == "contradicts":
-            wrong, sure = {names[-1]: f"would make the brush lean by {square.value} ({square.allowed})"}, True
+            wrong, sure = {names[-1]: f"would make the brush lean {square.value} (plausible: {square.allowed})"}, True
         elif len(holds) > 1 and distance(flanges[-2], flanges[-1])[1] < LEAST_TURN_DEG:
             wrong, sure = {names[-1]: "is the one before again: turn the wrist in between"}, True
         if wrong:
@@ -262,10 +267,11 @@ class TipStep(Step):
             if sure:
                 visit.forget(*(f"upright {name}" for name in wrong))
             return False
+        known = axis.holds >= UPRIGHTS and axis.sigma_deg <= WORST_DEG
         if len(holds) >= LEAST_UPRIGHTS:
-            reached, error = "✓" if axis.sigma_deg <= WORST_DEG else "·", f"{axis.sigma_deg:.2f} deg"
-            visit.say(f"{reached} standard error after {axis.holds} holds: {error} (goal: {WORST_DEG:g} deg)")
-        return axis.holds >= UPRIGHTS and axis.sigma_deg <= WORST_DEG
+            error = f"{axis.sigma_deg:.2f} deg (goal: {WORST_DEG:g} deg)"
+            visit.say(f"{'✓' if known else '·'} standard error after {axis.holds} of {UPRIGHTS} holds: {error}")
+        return known
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """The offset, and how the brush leans against the flange."""

@@ -212,7 +212,7 @@ Picture = NDArray[np.uint8]
 ARM = Choice("a", "let it move: I look at the cell, my hand is at the emergency stop")
 STAY = Choice("x", "leave it where it is")
 YES, NO = Choice("y", "yes"), Choice("n", "no")
-THERE, SKIP = Choice("enter", "it is there"), Choice("k", "skip it")
+THERE, SKIP = Choice("enter", "done"), Choice("k", "skip it")
 Tone = Literal["finding", "warning", "trouble"]
 """After a warning the step can go on; trouble ends it, and its last line says what to do."""
 

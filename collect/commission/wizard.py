@@ -31,7 +31,7 @@ STEPS = (
     LimitsStep(),
     ProofStep(),
 )
-AGAIN = Choice("a", "try this step again, where it was")
+AGAIN = Choice("a", "try again: what is known already is kept")
 STOPPED = "stopped; the same command resumes from there"
 REFUSED = (NotAccepted, DeviceError, InputError, StepError, ConfigError)
 

@@ -178,7 +178,7 @@ async def test_a_day_at_the_rig(lab: Lab) -> None:
 
         # review: one is marked bad with a note
         await operator.press("v")
-        await operator.sees(ReviewScreen, f"{STROKES} of {STROKES + 1} count", "still")
+        await operator.sees(ReviewScreen, f"{STROKES} of {STROKES + 1} count", "photograph")
         await operator.press("b", "o", *"smudge", "enter")
         await operator.sees(ReviewScreen, "smudge")
         await operator.press("escape", "q")
