@@ -218,7 +218,7 @@ class LimitsStep(Step):
             f"{picture} shows box, sheet, board, well and park from above.",
             picture=await asyncio.to_thread(read_gray, picture),
         )
-        x_mm, y_mm, z_mm = ("{:g} to {:g} mm".format(*taught.value) for taught in box.values())
+        x_mm, y_mm, z_mm = (f"{taught.value} mm" for taught in box.values())
         if not await visit.yes(
             f"The tip will stay in this box of the base frame: x {x_mm}, y {y_mm}, z {z_mm}. It is the smallest "
             f"around all that you taught, with {MARGIN_MM:g} mm beside and above, and {BELOW_MM:g} mm below all. "
