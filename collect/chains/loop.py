@@ -48,19 +48,17 @@ def run_loop(request: LoopRequest) -> Path:
         check_fresh_sheet(root, request.sheet)  # now, not after minutes of fitting
     if not header.source.imported:
         calibrated(folder)
-    begun = begun_with(out)
-    # The fit that the loop was begun with, even if another one was made since.
-    fit = fitted(folder) if begun is None else folder / FITS / f"{begun.fit}.json"
-    settings = Settings(
+    wanted = Settings(
         original=header.session_id,
         original_sha256=recording.sha256,
-        fit=fit.stem,
+        fit=fitted(folder).stem,
         depth_range_mm=(LEAST_DEPTH_MM, rig.brush.max_depth_mm),
         tilt_range_deg=(0.0, rig.robot.limits.tilt_deg),
         presses=request.presses,
         seed=request.seed,
     )
-    keep_settings(settings, begun, out)
+    settings = begun_with(wanted, out)
+    fit = folder / FITS / f"{settings.fit}.json"
     if not (out / PROTOCOL).exists():  # it is written last: where it exists, this stage is done
         from brushloop.calibrate.recover import recover  # slow to import
 
@@ -68,8 +66,8 @@ def run_loop(request: LoopRequest) -> Path:
         chosen = settings.model_dump(include={"depth_range_mm", "tilt_range_deg", "presses", "seed"})
         show_work(recover, RecoverRequest(folder, out / RECOVERED, fit=fit, **chosen))
     check_recovered(out / RECOVERED)
-    wanted = CollectRequest(request.config, out / PROTOCOL, root, sheet=request.sheet, armed=request.armed)
-    again = collected_session(replace(wanted, on_screen=request.tui))
+    collection = CollectRequest(request.config, out / PROTOCOL, root, sheet=request.sheet, armed=request.armed)
+    again = collected_session(replace(collection, on_screen=request.tui))
 
     from brushloop.calibrate.loop import compare  # slow to import
 
@@ -104,24 +102,20 @@ class Settings(BaseModel):
     seed: int
 
 
-def begun_with(folder: Path) -> Settings | None:
-    """The settings that the loop in that folder was begun with; None for a new one. Raises `ConfigError`."""
+def begun_with(wanted: Settings, folder: Path) -> Settings:
+    """The settings that the loop in that folder was begun with; a new one begins with those wanted, which are written.
+
+    A loop goes on with its own fit, even if another one was made since. Raises `ConfigError` if anything else differs.
+    """
     path = folder / SETTINGS
     if not path.exists():
-        return None
+        folder.mkdir(parents=True, exist_ok=True)
+        write_whole(path, wanted.model_dump_json(indent=2) + "\n")
     try:
-        return Settings.model_validate_json(read_bounded(path))
+        begun = Settings.model_validate_json(read_bounded(path))
     except ValidationError:
         raise ConfigError(path, "", "does not hold the settings of a loop: use another --out") from None
-
-
-def keep_settings(settings: Settings, begun: Settings | None, folder: Path) -> None:
-    """Write the settings of a new loop, or check that they are those it was begun with. Raises `ConfigError`."""
-    if begun is None:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_whole(folder / SETTINGS, settings.model_dump_json(indent=2) + "\n")
-        return
-    for name in Settings.model_fields:
-        was, now = getattr(begun, name), getattr(settings, name)
-        if was != now:
-            raise ConfigError(folder / SETTINGS, name, f"this loop was begun with {was}, not {now}: use another --out")
+    for (name, was), (_, now) in zip(begun, wanted, strict=True):
+        if was != now and name != "fit":
+            raise ConfigError(path, name, f"this loop was begun with {was}, not {now}: use another --out")
+    return begun

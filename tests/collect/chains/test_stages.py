@@ -27,7 +27,7 @@ from brushloop.calibrate.writing import Figure, Plan, PlannedBy
 from brushloop.calibrate.writing.compare import ANOTHER, PLANNED, REFERENCE, SIMULATED, WrittenRecord
 from brushloop.collect.chains import LoopRequest, WritingRequest, demo, loop, writing
 from brushloop.collect.chains.loop import SETTINGS as FILE
-from brushloop.collect.chains.loop import Settings, begun_with, check_recovered, keep_settings, run_loop
+from brushloop.collect.chains.loop import Settings, begun_with, check_recovered, run_loop
 from brushloop.collect.chains.writing import FOOTPRINT, Writing
 from brushloop.collect.engine import CollectRequest
 from brushloop.collect.engine.snapshot import Snapshot
@@ -167,14 +167,14 @@ SETTINGS = Settings(
 
 def test_a_loop_goes_on_with_what_it_was_begun_with_and_nothing_else(tmp_path: Path) -> None:
     folder = tmp_path / "loop"
-    keep_settings(SETTINGS, begun_with(folder), folder)
-    keep_settings(SETTINGS, begun_with(folder), folder)
-    for name, value in (("fit", "ef"), ("original_sha256", "xy"), ("depth_range_mm", (2.0, 20.0)), ("presses", 5)):
+    assert begun_with(SETTINGS, folder) == SETTINGS
+    assert begun_with(SETTINGS.model_copy(update={"fit": "ef"}), folder) == SETTINGS, "another fit was made since"
+    for name, value in (("original_sha256", "xy"), ("depth_range_mm", (2.0, 20.0)), ("presses", 5)):
         with pytest.raises(ConfigError, match=f"{name}: this loop was begun with"):
-            keep_settings(SETTINGS.model_copy(update={name: value}), SETTINGS, folder)
+            begun_with(SETTINGS.model_copy(update={name: value}), folder)
     (folder / FILE).write_text("{}")
     with pytest.raises(ConfigError, match="does not hold the settings of a loop"):
-        begun_with(folder)
+        begun_with(SETTINGS, folder)
 
 
 def test_presses_that_cannot_be_made_again_are_refused_before_anything_is_computed(
