@@ -1,13 +1,13 @@
 """The checks of a capture: a number, its limit, and what an operator should do; and the verdict that follows.
 
-A new check needs a name in `Failure`, a limit in `QualityConfig`, and a function here: listed in `MARK_CHECKS` if it
-judges the measured mark, called by `Photograph.check_press` if it judges the photograph or the ink.
+A new check needs a name in `Failure`, a limit in `QualityConfig`, and a place here: in `judge_mark` if it judges the
+measured mark, in `Photograph.check_press` if it judges the photograph or the ink.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -129,7 +129,7 @@ class Photograph:
         checks += [enough, dry(mark, limits)]
         if checks[-1].passed:
             # The head, tip and tone of a dry brush's mark mean nothing.
-            checks += [smeared(mark, depth_mm, limits), *(check(mark, limits) for check in MARK_CHECKS)]
+            checks += judge_mark(mark, depth_mm, limits)
         return Verdict.of(checks)
 
     def check_drawing(self, patch: Patch, depth_mm: float) -> Verdict:
@@ -147,8 +147,11 @@ class Photograph:
         if self.previous is not None:
             inked = inked & ~take(self.previous, self.plane, inside).inked(gate)
         edge = np.concatenate([inked[0], inked[-1], inked[1:-1, 0], inked[1:-1, -1]])
-        enough = blank(mm2(inked), depth_mm, self.limits)
-        return Verdict((*frame.checks, crossing(float(edge.sum()) / PX_PER_MM), enough))
+        length_mm = float(edge.sum()) / PX_PER_MM
+        across = f"New ink, or the arm, lies across {length_mm:.0f} mm of the patch's edge."
+        reason = f"{across} Is the arm out of the picture?"
+        crossing = _check(Failure.NEIGHBOUR, length_mm, "mm", CROSSING_MM, reason)
+        return Verdict((*frame.checks, crossing, blank(mm2(inked), depth_mm, self.limits)))
 
     def check_blank(self, patch: Patch) -> Check:
         """Check that the patch is blank; `NEIGHBOUR` if it holds ink or is not completely seen."""
@@ -238,12 +241,6 @@ def neighbour(ink: Ink, limits: QualityConfig) -> Check:
     return _check(Failure.NEIGHBOUR, area_mm2, "mm^2", limits.foreign_mm2, reason)
 
 
-def crossing(length_mm: float) -> Check:
-    """No new ink across the edge of a figure's patch."""
-    reason = f"New ink, or the arm, lies across {length_mm:.0f} mm of the patch's edge. Is the arm out of the picture?"
-    return _check(Failure.NEIGHBOUR, length_mm, "mm", CROSSING_MM, reason)
-
-
 def blank(own_mm2: float, depth_mm: float, limits: QualityConfig) -> Check:
     """The press left ink."""
     least_mm2 = limits.blank_mm2_per_mm * depth_mm
@@ -266,42 +263,29 @@ def dry(mark: Mark, limits: QualityConfig) -> Check:
     return _check(Failure.DRY, mark.uneven, "of the mean", limits.uneven, reason)
 
 
-def misplaced(mark: Mark, limits: QualityConfig) -> Check:
-    """The mark begins where the tip touched."""
-    along, aside = mark.head_mm
-    off_mm = math.hypot(along - limits.head_mm, aside)
-    reason = f"The stroke begins {off_mm:.1f} mm from where the tip should have touched. {_WHERE}"
-    return _check(Failure.MISPLACED, off_mm, "mm", limits.misplaced_mm, reason)
-
-
-def smeared(mark: Mark, depth_mm: float, limits: QualityConfig) -> Check:
-    """The mark is no larger than a press of its depth makes it: a brush that moves sideways leaves more."""
+def judge_mark(mark: Mark, depth_mm: float, limits: QualityConfig) -> Iterator[Check]:
+    """The checks of a mark that is not dry."""
+    # It is no larger than a press of its depth makes it: a brush that moves sideways leaves more.
     excess_mm = max(mark.length_mm - LONGEST * depth_mm, mark.width_mm - WIDEST * depth_mm, 0.0)
     reason = (
         f"The stroke is smeared: {mark.length_mm:.0f} by {mark.width_mm:.0f} mm at a depth of {depth_mm:g} mm. Did "
         "another client move the arm, or did the sheet slip?"
     )
-    return _check(Failure.SMEARED, excess_mm, "mm", limits.smeared_mm, reason)
-
-
-def faint(mark: Mark, limits: QualityConfig) -> Check:
-    """Dark ink."""
+    yield _check(Failure.SMEARED, excess_mm, "mm", limits.smeared_mm, reason)
+    # It begins where the tip touched.
+    along, aside = mark.head_mm
+    off_mm = math.hypot(along - limits.head_mm, aside)
+    reason = f"The stroke begins {off_mm:.1f} mm from where the tip should have touched. {_WHERE}"
+    yield _check(Failure.MISPLACED, off_mm, "mm", limits.misplaced_mm, reason)
+    # Its ink is dark.
     reason = f"The ink is faint: darkness {mark.tone:.2f}. Stir or renew the ink, and dip again."
-    return _at_least(Failure.FAINT, mark.tone, "of 1", limits.faint_tone, reason)
-
-
-def split(mark: Mark, limits: QualityConfig) -> Check:
-    """One group of hairs, not two."""
+    yield _at_least(Failure.FAINT, mark.tone, "of 1", limits.faint_tone, reason)
+    # One group of hairs made it, not two.
     reason = f"The bristles are split: a gap of {mark.gap_mm:.1f} mm. Comb the brush together on the rim and dip again."
-    return _check(Failure.SPLIT, mark.gap_mm, "mm", limits.split_mm, reason)
-
-
-def bent(mark: Mark, limits: QualityConfig) -> Check:
-    """A mark that runs along the heading."""
+    yield _check(Failure.SPLIT, mark.gap_mm, "mm", limits.split_mm, reason)
+    # It runs along the heading.
     reason = f"The tip is bent: the stroke runs {mark.bent_deg:.0f} deg off. Wipe the tip straight and dip again."
-    return _check(Failure.BENT, mark.bent_deg, "deg", limits.bent_deg, reason)
+    yield _check(Failure.BENT, mark.bent_deg, "deg", limits.bent_deg, reason)
 
 
-MARK_CHECKS = (misplaced, faint, split, bent)
-"""Checks of a mark that is not dry."""
 _WHERE = "Check the sheet's origin, that the sheet has not slipped, and that the brush is tight."

@@ -1,8 +1,8 @@
 """A quality check: a stroke whose ink is unusually dark.
 
-Put such a function into `collect/photograph/checks.py` and its name into `MARK_CHECKS` there. A finding of its own
-needs a name in `Failure` there, and its limit belongs in `QualityConfig` (`collect/rig/config.py`), so that a rig
-can set it. `docs/quality.md` says what it measures.
+Yield such a check in `judge_mark` of `collect/photograph/checks.py`. A finding of its own needs a name in `Failure`
+there, and its limit belongs in `QualityConfig` (`collect/rig/config.py`), so that a rig can set it. `docs/quality.md`
+says what it measures.
 """
 
 from __future__ import annotations
