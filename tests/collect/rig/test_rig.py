@@ -23,7 +23,7 @@ from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.faults import Device, Fault
 from brushloop.drivers.sim.rig import rig_toml
 from tests.command import brushloop
-from tests.drivers.arcs.test_rpc import Archive
+from tests.drivers.arcs.test_rpc import Replayed
 
 if TYPE_CHECKING:
     from tests.rigs import Lab
@@ -246,7 +246,7 @@ def test_a_rig_in_order_is_reported_with_all_that_was_answered_and_left_as_it_wa
     assert sent["board"]["squares"] == [26, 20]
     assert "127.0.0.1" not in json.dumps(document)
     assert len(rtde["sample"]) == 2
-    lines = Archive(report).lines
+    lines = Replayed(report).lines
     answered = {line["method"]: line["answer"] for line in lines}
     assert answered["rob1.RobotState.getSafetyModeType"] == {"result": "Normal"}
     assert answered["rob1.MotionControl.getSpeedFraction"]["result"] == 1.0
@@ -291,7 +291,7 @@ def test_on_the_first_day_there_is_no_rig_yet_and_the_archive_holds_what_is_know
     ran = brushloop("doctor", "--config", rig, "--report", report)
     assert ran.returncode == 0, ran.stderr
     assert "new.toml yet" in ran.stdout
-    archive = Archive(report)
+    archive = Replayed(report)
     answered = {line["method"]: line["answer"] for line in archive.lines}
     assert answered["rob1.RobotState.getSafetyModeType"] == {"result": "Normal"}
     with zipfile.ZipFile(report) as held:
