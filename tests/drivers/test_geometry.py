@@ -80,6 +80,12 @@ def test_lean_is_the_inverse_of_brush_pose(tilt: float, heading: float):
     assert math.remainder(got_heading - heading, 360.0) == pytest.approx(0.0, abs=0.01)
 
 
+def test_the_ferrule_leans_toward_the_heading():
+    ferrule = rotation.turned(brush_pose(0.0, 0.0, 0.0, heading_deg=90.0, tilt_deg=10.0).quaternion, (0.0, 0.0, -1.0))
+    ten = math.radians(10.0)
+    assert ferrule == pytest.approx([0.0, math.sin(ten), math.cos(ten)])
+
+
 @given(poses, poses, st.floats(0.0, 1.0))
 def test_on_the_way_both_distances_are_shared_out(a: Pose, b: Pose, s: float):
     total_mm, total_deg = distance(a, b)
