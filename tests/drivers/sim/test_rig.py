@@ -20,11 +20,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import can
 import cv2
 import numpy as np
 import pytest
 
 from brushloop.drivers.camera import CameraTable, OpenCvCamera
+from brushloop.drivers.camera.source import JpegStream
 from brushloop.drivers.devices import Stamp
 from brushloop.drivers.force.simulator import FRAME_S, ForceBoard, SocketcandServer
 from brushloop.drivers.force.sri_m8123 import COMMAND_ID, LOOPBACK_CHANNEL, START
@@ -136,18 +138,15 @@ async def test_the_frames_of_a_round_are_one_burst_on_a_busy_computer(monkeypatc
     monkeypatch.setattr(time, "time", lambda: next(late_s))
     server = SocketcandServer(ForceBoard(lambda: (0.0,) * 6), rate_hz=100.0)
     await server.start("127.0.0.1", 0)
-    reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
-    command = f"< send {COMMAND_ID:03X} {len(START):x} {' '.join(f'{byte:02X}' for byte in START)} >"
-    writer.write(f"< open {LOOPBACK_CHANNEL} >< rawmode >{command}".encode())
-    times_s: list[float] = []
-    while len(times_s) < 3:
-        words = (await reader.readuntil(b">")).decode().split()
-        if words[1] == "frame":
-            times_s.append(float(words[3]))
-    writer.close()
-    await writer.wait_closed()
+    wire = {"interface": "socketcand", "channel": LOOPBACK_CHANNEL, "host": HOST, "port": server.port}
+    bus = await asyncio.to_thread(can.Bus, ignore_config=True, **wire)
+    bus.send(can.Message(arbitration_id=COMMAND_ID, is_extended_id=False, data=START))
+    frames = [await asyncio.to_thread(bus.recv) for _ in range(3)]
+    await asyncio.to_thread(bus.shutdown)
     await server.stop()
-    assert [b - a for a, b in itertools.pairwise(times_s)] == pytest.approx([FRAME_S, FRAME_S], abs=1e-6)
+    assert [b.timestamp - a.timestamp for a, b in itertools.pairwise(frames)] == pytest.approx(
+        [FRAME_S, FRAME_S], abs=1e-6
+    )
 
 
 Ask = Callable[..., Awaitable[dict[str, Any]]]
@@ -236,16 +235,13 @@ async def test_no_late_picture_overtakes_another_and_the_server_notices_that_its
     view = View(width_px=320, height_px=240, px_per_mm=0.9, fps=50.0, delay_s=0.05, delay_jitter_s=0.2)
     async with LoopbackRig(replace(SMALL, view=view)) as rig:
         rig.faults.hang(Fault(device=Device.CAMERA, kind="frozen", count=ALWAYS))  # numbers its pictures
-        reader, writer = await asyncio.open_connection(HOST, rig.camera.port)
-        writer.write(b"GET /stream.mjpg HTTP/1.0\r\n\r\n")
-        numbers: list[int] = []
-        while len(numbers) < 20:
-            await reader.readuntil(b"\xff\xd8\xff\xfe")
-            length = int.from_bytes(await reader.readexactly(2), "big")
-            numbers.append(int(await reader.readexactly(length - 2)))
+        source = tomllib.loads(rig.toml())["camera"]["source"]
+        stream = await asyncio.to_thread(JpegStream, CameraTable(kind="opencv", source=source))
+        jpegs = [await asyncio.to_thread(stream.read) or b"" for _ in range(20)]
+        numbers = [int(jpeg[6 : jpeg.index(b"\xff", 6)]) for jpeg in jpegs]  # of the comment
         assert numbers == sorted(numbers)
         assert rig.camera.clients == 1
-        writer.transport.abort()
+        stream.close()
         await until(lambda: rig.camera.clients == 0, "the server to notice")
 
 
