@@ -62,11 +62,6 @@ async def on_the_way_up(arm: Enabled) -> AsyncIterator[asyncio.Task[None]]:
         await asyncio.gather(move, return_exceptions=True)
 
 
-async def test_where_and_latest_agree_on_an_arm_at_rest(arm: AuboArcs):
-    here = await assert_still(arm)
-    assert_there(arm.latest().pose, here)
-
-
 async def test_telemetry_comes_often_and_in_order(arm: AuboArcs):
     samples: list[PoseSample] = []
     enough = asyncio.Event()
@@ -121,6 +116,7 @@ async def test_connecting_says_who_answers_and_with_closing_leaves_the_arm_where
             identity = await robot.connect()
             assert all((identity.model, identity.firmware))
             poses.append(await assert_still(robot))
+            assert_there(robot.latest().pose, poses[-1])
         finally:
             await robot.close()
         with pytest.raises(NotConnected):
@@ -129,14 +125,10 @@ async def test_connecting_says_who_answers_and_with_closing_leaves_the_arm_where
 
 
 @pytest.mark.moves
-async def test_enabling_readies_the_arm_and_moves_nothing(enabled: Enabled):
+async def test_an_enabled_arm_has_not_moved_and_is_as_it_was_left(enabled: Enabled):
     mode, _ = await enabled.robot.modes()
     assert mode == "Running"
     assert_there(await assert_still(enabled.robot), enabled.start)
-
-
-@pytest.mark.moves
-async def test_an_arm_that_nobody_else_had_is_as_it_was_left(enabled: Enabled):
     await enabled.robot.confirm()
     await enabled.robot.move(enabled.top, **GENTLY)
     await enabled.robot.confirm()

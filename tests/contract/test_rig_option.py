@@ -23,7 +23,7 @@ from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 # One test that moves and two that do not.
-CHOSEN = "a_move_arrives or who_answers or agree_on_an_arm"
+CHOSEN = "a_move_arrives or who_answers or comes_often"
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from itertools import pairwise
 from typing import Any, ClassVar
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -50,7 +51,6 @@ class Feed:
     def __init__(self) -> None:
         self.t_ns = 10**12
         self._pictures: queue.Queue[bytes | NDArray[np.uint8] | None] = queue.Queue()
-        self.released = threading.Event()
         self.notices: list[str] = []
         """What the camera said of it."""
 
@@ -68,7 +68,7 @@ class Feed:
         return picture
 
     def close(self) -> None:
-        self.released.set()
+        pass
 
 
 @pytest.fixture
@@ -268,27 +268,30 @@ def test_frames_that_waited_in_a_buffer_are_late(latency_ms: int, arrivals_ms: l
 # ---------------------------------------------------------------- sources and settings
 
 
+class Answer(LoopbackServer):
+    """Gives every client the same answer, then a byte at a time."""
+
+    def __init__(self, answer: bytes, trickle: bytes) -> None:
+        super().__init__()
+        self.answer, self.trickle = answer, trickle
+
+    async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readuntil(b"\r\n\r\n")
+        writer.write(self.answer)
+        for byte in self.trickle:
+            await asyncio.sleep(0.01)
+            self.write(writer, bytes([byte]))
+
+
 @asynccontextmanager
 async def serving(answer: bytes, trickle: bytes = b"") -> AsyncIterator[str]:
-    """The address of a server that gives every client the same answer, then a byte at a time."""
-
-    over = asyncio.Event()
-
-    async def give(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        await reader.readuntil(b"\r\n\r\n")
-        writer.write(answer)
-        for byte in trickle:
-            await asyncio.sleep(0.01)
-            if reader.at_eof():
-                break
-            writer.write(bytes([byte]))
-        writer.close()
-        over.set()
-
-    async with await asyncio.start_server(give, HOST, 0) as server:
-        yield f"http://{HOST}:{server.sockets[0].getsockname()[1]}/"
-        if trickle:
-            await over.wait()
+    """The address of such a server."""
+    server = Answer(answer, trickle)
+    await server.start(HOST, 0)
+    try:
+        yield f"http://{HOST}:{server.port}/"
+    finally:
+        await server.stop()
 
 
 MULTIPART = b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=b\r\n\r\n"
@@ -359,34 +362,17 @@ async def test_a_recording_is_no_camera_and_a_stream_has_no_settings(recording: 
         await camera_at("rtsp://camera", locked=Locked(gain=1.0)).connect()
 
 
-class FakeDevice:
-    """A `cv2.VideoCapture` on a device that has settings; exposure goes in steps of 10, and only by hand."""
-
-    def __init__(self, *_: object) -> None:
-        self.values: dict[int, float] = {}
-
-    def isOpened(self) -> bool:
-        return True
-
-    def set(self, name: int, value: float) -> bool:
-        if name != cv2.CAP_PROP_EXPOSURE:
-            self.values[name] = value
-        elif self.values.get(cv2.CAP_PROP_AUTO_EXPOSURE) == 1.0:
-            self.values[name] = round(value / 10) * 10
-        return True
-
-    def get(self, name: int) -> float:
-        return self.values.get(name, 0.0)
-
-    def read(self) -> tuple[bool, np.ndarray]:
-        return True, page()
-
-    def release(self) -> None:
-        pass
-
-
 async def test_settings_are_locked_read_back_and_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    device = FakeDevice()
+    values: dict[int, float] = {}
+
+    def set_value(name: int, value: float) -> None:
+        """Exposure goes in steps of 10, and only by hand."""
+        if name != cv2.CAP_PROP_EXPOSURE:
+            values[name] = value
+        elif values.get(cv2.CAP_PROP_AUTO_EXPOSURE) == 1.0:
+            values[name] = round(value / 10) * 10
+
+    device = Mock(set=set_value, get=lambda name: values.get(name, 0.0), read=lambda: (True, page()))
     monkeypatch.setattr(cv2, "VideoCapture", lambda *_: device)
     camera = camera_at("0", locked=Locked(width=640, height=480, exposure=150.0, gain=4.0, focus=30.0))
     identity = await camera.connect()

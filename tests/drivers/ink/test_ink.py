@@ -19,7 +19,7 @@ from brushloop.drivers.errors import (
 from brushloop.drivers.ink.port import InkRefused
 from brushloop.drivers.ink.pump import ModbusPump, ModbusPumpConfig
 from brushloop.drivers.ink.simulator import PumpFirmware, StationFirmware
-from brushloop.drivers.ink.station import CONNECT_ATTEMPTS, InkStation, InkStationConfig, seal
+from brushloop.drivers.ink.station import CONNECT_ATTEMPTS, InkStation, InkStationConfig
 from tests.drivers.ink.conftest import PORT, Line, Plug, Scripted, loop
 from tests.simulated_time import LoopClock
 from tests.waiting import until
@@ -52,18 +52,12 @@ def given_ml(line: Line) -> float:
     return line.instrument.well.ml - 10.0
 
 
-async def test_a_session_reads_like_the_documented_one(scripted: Scripted):
-    exchanges = [
-        (seal(1, "light 0.500"), seal(1, "ok")),
-        (seal(2, "dose 1.250"), seal(2, "ok 1.250")),
-        (seal(3, "level"), seal(3, "ok 0.730")),
-        (seal(4, "dose 0.500"), seal(4, "err 4 reservoir is empty")),
-    ]
-    scripted(HELLO, *exchanges)
+async def test_a_session_sets_the_light_doses_and_tells_the_level_until_the_reservoir_is_empty(line: Line):
     station = await connected()
-    assert await station.light() == 0.5
+    assert await station.light() == line.instrument.light == 0.5
     await station.dose(1.25)
-    assert await station.level() == 0.73
+    assert (given_ml(line), await station.level()) == (1.25, 0.562)
+    line.instrument.reservoir_ml = 0.0
     with pytest.raises(InkRefused, match=r"refused with 4 \(reservoir is empty\).*Nothing was done.*Refill"):
         await station.dose(0.5)
 
