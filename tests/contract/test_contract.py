@@ -63,19 +63,11 @@ async def on_the_way_up(arm: Enabled) -> AsyncIterator[asyncio.Task[None]]:
 
 
 async def test_telemetry_comes_often_and_in_order(arm: AuboArcs):
-    samples: list[PoseSample] = []
-    enough = asyncio.Event()
-
-    def take(sample: PoseSample) -> None:
-        samples.append(sample)
-        if len(samples) == SAMPLES:
-            enough.set()
-
-    arm.listen(take)
+    samples: asyncio.Queue[PoseSample] = asyncio.Queue()
+    arm.listen(samples.put_nowait)
     async with asyncio.timeout(SAMPLES / LEAST_HZ):
-        await enough.wait()
+        taken = [await samples.get() for _ in range(SAMPLES)]
     arm.listen(None)
-    taken = samples[:SAMPLES]
     assert all(b.stamp.seq == a.stamp.seq + 1 for a, b in itertools.pairwise(taken))
     assert all(b.stamp.host_ns > a.stamp.host_ns for a, b in itertools.pairwise(taken))
 

@@ -47,6 +47,7 @@ def identify(rpc: Any, robot: Any) -> None:
     config = robot.getRobotConfig()
     info = rpc.getSystemInfo()
     SEEN["versions"] = [info.getInterfaceVersionCode(), info.getControlSoftwareVersionCode()]
+    SEEN["version"] = info.getControlSoftwareFullVersion()
     SEEN["types"] = [config.getRobotType(), config.getRobotSubType(), config.getControlBoxType(), config.getDof()]
 
 
@@ -72,6 +73,8 @@ def power(robot: Any) -> None:
     SEEN["running"] = until(lambda: state.getRobotModeType() == sdk.RobotModeType.Running)
     SEEN["safety"] = str(state.getSafetyModeType())
     SEEN["power on"] = state.isPowerOn()
+    SEEN["joint state"] = [str(s) for s in state.getJointState()]
+    SEEN["simulated"] = manage.isSimulationEnabled()
 
 
 def move(rpc: Any, robot: Any) -> None:
@@ -124,12 +127,6 @@ def blend(robot: Any) -> None:
     SEEN["blend"] = [nearest, len(ids - {-1}), off]
 
 
-def state(rpc: Any, robot: Any) -> None:
-    SEEN["version"] = rpc.getSystemInfo().getControlSoftwareFullVersion()
-    SEEN["joint state"] = [str(s) for s in robot.getRobotState().getJointState()]
-    SEEN["simulated"] = robot.getRobotManage().isSimulationEnabled()
-
-
 def subscribe(port: int) -> None:
     rtde = sdk.RtdeClient()
     pushed: list[tuple[list[float], list[float], bool, bool]] = []
@@ -179,7 +176,6 @@ def main(port: int, rtde_port: int) -> None:
     move(rpc, robot)
     joints(robot)
     blend(robot)
-    state(rpc, robot)
     subscribe(rtde_port)
     go_wrong(robot)
     SEEN["power off"] = robot.getRobotManage().poweroff()

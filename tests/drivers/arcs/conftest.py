@@ -59,6 +59,14 @@ class Cabinet(ArcsServer):
     def rests(self) -> bool:
         return self.cabinet.motion.exec_id(self.cabinet.now_s()) == -1
 
+    def passed(self) -> list[Pose]:
+        """Where the tip is from here on whenever its path bends, begins or ends; grows as it moves."""
+        poses: list[Pose] = []
+        motion = self.cabinet.world.motion
+        on_path = motion._on_path
+        motion._on_path = lambda start, end: (poses.extend((start, end)), on_path(start, end))[1]
+        return poses
+
     def answers(self, method: str, answer: object) -> None:
         """Give this answer to a method of the robot, and do nothing."""
         self._methods[f"rob1.{method}"] = lambda _: answer

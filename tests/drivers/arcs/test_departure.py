@@ -12,7 +12,6 @@ from brushloop.drivers.arcs.controller import Controller, ReturnCode, RobotMode,
 from brushloop.drivers.arcs.motion import until_settled
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.arcs.settings import Settings, require_same
-from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import (
     ArmMoved,
     MotionError,
@@ -91,18 +90,13 @@ async def test_an_arm_that_does_not_arrive_is_said_to_be_where_it_rests(arm: Aub
 # ---------------------------------------------------------------- what another client does meanwhile
 
 
-async def send(client: Controller, target: Pose) -> None:
-    """Move the arm there, as a client without any limits would."""
-    await client.move_line(target, 200.0, 800.0)
-    await until_settled(client.rest, target, planned_s=2.0)
-
-
 async def test_an_arm_that_was_moved_is_not_sent_anywhere_until_it_is_taken_up(
     arm: AuboArcs, other: Controller, cabinet: Cabinet
 ):
     await arm.move(ABOVE, **QUICK)
     await arm.confirm()
-    await send(other, ELSEWHERE)
+    await other.move_line(ELSEWHERE, 200.0, 800.0)
+    await until_settled(other.rest, ELSEWHERE, planned_s=2.0)
     sent = cabinet.taken
     for refused in (arm.move(LOW, **QUICK), arm.follow([LOW, ABOVE], **QUICK), arm.confirm()):
         with pytest.raises(ArmMoved, match=r"109\.\d mm and 10\.0 deg from where it was left"):

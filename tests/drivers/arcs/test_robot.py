@@ -195,32 +195,20 @@ async def test_nothing_moves_while_there_is_no_way_to_stop_it(arm: AuboArcs, cab
     assert to_go_mm(cabinet) == pytest.approx(200.0)
 
 
-class SlowNetwork:
-    """A connection's writer behind a network that delivers everything later, in order."""
-
-    def __init__(self, writer: asyncio.StreamWriter, delay_s: float) -> None:
-        self._writer = writer
-        self._delay_s = delay_s
-
-    def write(self, data: bytes) -> None:
-        asyncio.get_running_loop().call_later(self._delay_s, self._writer.write, data)
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self._writer, name)
-
-
 @pytest.mark.parametrize("delay_s", [0.25, 1.2], ids=["a stop overtakes it", "it counts as lost"])
 async def test_a_line_that_is_still_on_its_way_is_stopped_too(
     arm: AuboArcs, cabinet: Cabinet, monkeypatch: pytest.MonkeyPatch, delay_s: float
 ):
+    """Its network delivers everything later, in order."""
     connection, sent = arm._motion, asyncio.Event()
-    send = connection.call
+    send, loop = connection.call, asyncio.get_running_loop()
 
     async def delayed(method: str, params: Mapping[str, object] | None = None) -> object:
         if method.endswith("moveLine"):
             assert connection._stream is not None
-            reader, writer = connection._stream
-            monkeypatch.setattr(connection, "_stream", (reader, SlowNetwork(writer, delay_s)))
+            _, writer = connection._stream
+            write = writer.write
+            monkeypatch.setattr(writer, "write", lambda data: loop.call_later(delay_s, write, data))
             sent.set()
         return await send(method, params)
 

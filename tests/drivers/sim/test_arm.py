@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
@@ -38,7 +38,6 @@ def test_what_the_inverse_finds_is_right(q: tuple[float, ...], off: tuple[float,
 
 V, A = 100.0, 1000.0
 DT_S = 0.004
-Stretches = list[tuple[Pose, Pose]]
 
 
 def at(x_mm: float, y_mm: float = 0.0, heading_deg: float = 0.0) -> Pose:
@@ -48,23 +47,9 @@ def at(x_mm: float, y_mm: float = 0.0, heading_deg: float = 0.0) -> Pose:
 START, CORNER, BEYOND = at(0.0), at(100.0), at(100.0, 100.0)
 
 
-@pytest.fixture
-def travelled() -> Stretches:
-    return []
-
-
-@pytest.fixture
-def queue(travelled: Stretches) -> MotionQueue:
-    return MotionQueue(START, lambda start, end: travelled.append((start, end)))
-
-
-@pytest.fixture
-def cornered(queue: MotionQueue) -> MotionQueue:
-    return with_corner(queue)
-
-
-def with_corner(queue: MotionQueue) -> MotionQueue:
+def with_corner(on_path: Callable[[Pose, Pose], object] = lambda *_: None) -> MotionQueue:
     """Two lines at a right angle, of which the first may be left 20 mm before its end."""
+    queue = MotionQueue(START, on_path)
     queue.add(CORNER, V, A, 0.0, blend_mm=20.0)
     queue.add(BEYOND, V, A, 0.0)
     return queue
@@ -80,19 +65,20 @@ def speeds(walk: np.ndarray, dt_s: float = DT_S) -> np.ndarray:
 
 
 def assert_on_the_corners_path(walk: np.ndarray) -> None:
-    path = walked(with_corner(MotionQueue(START, lambda *_: None)), 4.0)
+    path = walked(with_corner(), 4.0)
     for point in walk[::30]:
         assert np.linalg.norm(path - point, axis=1).min() < 0.4
 
 
-def test_a_turn_on_the_spot_reads_metres_as_radians(queue: MotionQueue):
+def test_a_turn_on_the_spot_reads_metres_as_radians():
+    queue = MotionQueue(START, lambda *_: None)
     queue.add(at(0.0, heading_deg=90.0), 100.0, 1000.0, now_s=0.0)
     assert queue.exec_id(15.0) == 0  # pi / 2 at 0.1 rad/s
     assert queue.exec_id(16.0) == -1
 
 
-def test_a_corner_is_rounded_within_its_radius_and_taken_without_a_rest(cornered: MotionQueue):
-    walk = walked(cornered, 2.5)
+def test_a_corner_is_rounded_within_its_radius_and_taken_without_a_rest():
+    walk = walked(with_corner(), 2.5)
     near_mm = np.linalg.norm(walk - CORNER.position_mm, axis=1)
     assert 3.0 < near_mm.min() < 20.0
     off_the_lines = np.minimum(np.abs(walk[:, 1]), np.abs(walk[:, 0] - 100.0))
@@ -125,7 +111,8 @@ def test_no_way_is_taken_faster_or_harder_than_allowed_and_all_of_them_arrive(
 
 
 @pytest.mark.parametrize(("stop_s", "acc"), [(0.3, 50.0), (0.87, 50.0), (0.87, 5000.0)])
-def test_a_stop_follows_the_path_through_the_corner(cornered: MotionQueue, stop_s: float, acc: float):
+def test_a_stop_follows_the_path_through_the_corner(stop_s: float, acc: float):
+    cornered = with_corner()
     cornered.pose(stop_s)
     cornered.stop(acc, 10.0, stop_s)
     walk = walked(cornered, 6.0, begin_s=stop_s)
@@ -136,9 +123,9 @@ def test_a_stop_follows_the_path_through_the_corner(cornered: MotionQueue, stop_
 
 
 @pytest.mark.parametrize(("hold_s", "acc"), [(0.05, 2000.0), (0.86, 200.0), (0.86, 2000.0), (1.1, 2000.0)])
-def test_a_path_held_anywhere_goes_on_along_itself(
-    cornered: MotionQueue, travelled: Stretches, hold_s: float, acc: float
-):
+def test_a_path_held_anywhere_goes_on_along_itself(hold_s: float, acc: float):
+    travelled: list[tuple[Pose, Pose]] = []
+    cornered = with_corner(lambda start, end: travelled.append((start, end)))
     cornered.pose(hold_s)
     cornered.hold(acc, 10.0, hold_s)
     assert cornered.exec_id(8.0) in (0, 1)
