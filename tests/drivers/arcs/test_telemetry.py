@@ -220,41 +220,39 @@ def circle(t_s: float) -> Pose:
     return brush_pose(400.0 + 15.0 * math.cos(2.0 * t_s), 15.0 * math.sin(2.0 * t_s), 118.0)
 
 
-def lag_ms(
-    path: Path,
-    lag_s: float = 0.0,
-    *,
-    answer_s: float = 0.004,
-    silent: tuple[float, float] = (0.0, 0.0),
-    shown: Path | None = None,
-) -> float | None:
-    """What is measured in 4 s where poses arrive this late, 100 times a second, and 40 questions a second are answered.
+def late(path: Path, lag_s: float) -> Path:
+    return lambda t_s: path(t_s - lag_s)
 
-    `shown` is the path of the poses that arrive, if it is another one.
-    """
+
+def lag_ms(asked: Path, arrived: Path, answer_s: float = 0.004, silent_s: tuple[float, float] = (0.0, 0.0)) -> Any:
+    """What is measured in 6 s in which 100 poses a second arrive, and 40 questions a second are answered."""
     clock, rng = SimulatedTime(), random.Random(7)
     meter = LagMeter(clock)
-    for tick in range(round((4.0 + lag_s) * 100)):
+    for tick in range(600):
         t_s = 0.01 * tick
-        if not silent[0] < t_s < silent[1]:
-            meter.arrived(PoseSample(Stamp(round(1e9 * (100.0 + t_s))), (shown or path)(t_s - lag_s)))
+        if not silent_s[0] < t_s < silent_s[1]:
+            meter.arrived(PoseSample(Stamp(round(1e9 * (100.0 + t_s))), arrived(t_s)))
     for tick in range(160):
         t_s = tick / 40 + rng.uniform(0.0, 0.01)
         clock.now_s = 100.0 + t_s + rng.uniform(0.0, answer_s)
-        meter.asked(path(t_s), answer_s)
+        meter.asked(asked(t_s), answer_s)
     return meter.lag_ms()
 
 
 @pytest.mark.parametrize(
-    ("expected_ms", "change"),
+    ("expected_ms", "asked", "arrived", "more"),
     [
-        *((1e3 * lag_s, {"path": path, "lag_s": lag_s}) for path in (press, circle) for lag_s in (0.0, 0.12, 2.0)),
-        (0.0, {"path": press, "silent": (0.3, 0.8)}),
-        (None, {"path": press, "answer_s": 0.2}),
-        (None, {"path": lambda _: HIGH, "lag_s": 0.8}),
-        (None, {"path": circle, "shown": lambda _: HIGH}),
+        *((1e3 * lag_s, path, late(path, lag_s), {}) for path in (press, circle) for lag_s in (0.0, 0.12, 2.0)),
+        (0.0, circle, circle, {"silent_s": (0.3, 0.8)}),
+        (None, press, press, {"answer_s": 0.2}),
+        (None, lambda _: HIGH, lambda _: HIGH, {}),
+        (None, circle, lambda _: HIGH, {}),
     ],
 )
-def test_the_lag_is_measured_to_a_few_milliseconds_or_not_known(expected_ms: float | None, change: dict[str, Any]):
+def test_the_lag_is_measured_to_a_few_milliseconds_or_not_known(
+    expected_ms: float | None, asked: Path, arrived: Path, more: dict[str, Any]
+):
     """Not known where answers took long, the arm rested, or the poses are of another path."""
-    assert lag_ms(**change) == (expected_ms if expected_ms is None else pytest.approx(expected_ms, abs=15.0))
+    assert lag_ms(asked, arrived, **more) == (
+        expected_ms if expected_ms is None else pytest.approx(expected_ms, abs=15.0)
+    )

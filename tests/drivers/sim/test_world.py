@@ -120,20 +120,6 @@ def press(x_mm: float, y_mm: float, depth_mm: float, **lean: float) -> list[Pose
 SCRIPT = [*dip(), *press(30.0, 40.0, 11.0), *press(90.0, 70.0, 15.0, heading_deg=33.0, tilt_deg=10.0)]
 
 
-def drag(*corners_mm: tuple[float, float], depth_mm: float = 8.0) -> list[Pose]:
-    """Straight down at the first corner, along all of them, straight up."""
-    above = [on_paper(*corner, 40.0) for corner in (corners_mm[0], corners_mm[-1])]
-    return [above[0], *(on_paper(*corner, -depth_mm) for corner in corners_mm), above[1]]
-
-
-STROKES = [
-    *dip(),
-    *press(30.0, 110.0, 11.0),
-    *drag((40.0, 60.0), (70.0, 60.0), (70.0, 40.0)),
-    *press(90.0, 110.0, 13.0),
-]
-
-
 def run(script: Iterable[Pose], looks_s: Iterable[float] = (), **config: Any) -> World:
     """The world after the script, looked at at the given times of its own clock."""
     world = World(SimConfig(**config))
@@ -185,10 +171,9 @@ def test_a_brush_that_was_stopped_on_the_paper_leaves_its_mark_when_it_lifts():
 
 
 def test_a_contact_that_travels_is_one_drag_and_no_press():
-    world = run(STROKES)
-    assert len(world.presses) == 2
-    assert world.drags == 1
-    assert world.version == 3
+    drag = [on_paper(x_mm, y_mm, -8.0) for x_mm, y_mm in ((40.0, 60.0), (70.0, 60.0), (70.0, 40.0))]
+    world = run([*dip(), *press(30.0, 110.0, 11.0), on_paper(40.0, 60.0, 40.0), *drag, on_paper(70.0, 40.0, 40.0)])
+    assert (len(world.presses), world.drags, world.version) == (1, 1, 2)
     # 20 px per 2 mm around the first line, before the leash pulls the patch off it
     rows = slice(round((172.0 - 61.0) * 10), round((172.0 - 59.0) * 10))
     assert (world.paper.density[rows, 420:560] > 0.3).mean() > 0.9
