@@ -29,14 +29,14 @@ def test_the_host_clock_goes_on_when_wall_time_is_set_back(monkeypatch: pytest.M
     assert readings[-1] - before < 10**9
 
 
-LATE = [
-    lambda: CameraLate("the camera's delay is not steady: use a cable instead of Wi-Fi."),
-    lambda: Stale("force", 130.0, 100.0),
-    lambda: DeviceTimeout("camera", "fresh", "no valid new frame", remedy="Check cable, light and stream."),
-]
-
-
-@pytest.mark.parametrize("late", LATE)
+@pytest.mark.parametrize(
+    "late",
+    [
+        lambda: CameraLate("the camera's delay is not steady: use a cable instead of Wi-Fi."),
+        lambda: Stale("force", 130.0, 100.0),
+        lambda: DeviceTimeout("camera", "fresh", "no valid new frame", remedy="Check cable, light and stream."),
+    ],
+)
 def test_what_comes_late_on_a_loaded_computer_says_so(late: type[Exception], monkeypatch: pytest.MonkeyPatch):
     assert "computer" not in describe(late())
     monkeypatch.setattr(os, "getloadavg", lambda: (23.0, 9.0, 3.0))

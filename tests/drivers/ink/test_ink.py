@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import AsyncIterator
+from typing import TypeVar
 
 import pytest
 
@@ -24,6 +25,14 @@ from tests.drivers.ink.conftest import PORT, Line, Plug, Scripted, loop
 from tests.simulated_time import LoopClock
 from tests.waiting import until
 
+AnyDevice = TypeVar("AnyDevice", InkStation, ModbusPump)
+
+
+async def connected(device: AnyDevice) -> AnyDevice:
+    await device.connect()
+    return device
+
+
 # ---------------------------------------------------------------- the station
 
 HELLO = (b"000 identify*6A60\n", b"000 ok ink-station 1 1.0.0 real*8310\n")
@@ -33,12 +42,6 @@ LEVEL = b"001 level*243E\n"
 
 def a_station() -> InkStation:
     return InkStation(InkStationConfig(kind="ink-station", port=PORT, dose_ml=2.0, light=0.5), LoopClock())
-
-
-async def connected() -> InkStation:
-    station = a_station()
-    await station.connect()
-    return station
 
 
 @pytest.fixture
@@ -53,7 +56,7 @@ def given_ml(line: Line) -> float:
 
 
 async def test_a_session_sets_the_light_doses_and_tells_the_level_until_the_reservoir_is_empty(line: Line):
-    station = await connected()
+    station = await connected(a_station())
     assert await station.light() == line.instrument.light == 0.5
     await station.dose(1.25)
     assert (given_ml(line), await station.level()) == (1.25, 0.562)
@@ -74,7 +77,7 @@ async def test_a_reply_that_makes_no_sense_or_refuses_is_an_error(
     scripted: Scripted, exchanges: list[tuple[bytes, bytes]], error: type[DeviceError], says: str
 ):
     scripted(HELLO, *exchanges)
-    station = await connected()
+    station = await connected(a_station())
     with pytest.raises(error, match=says):
         await (station.level() if exchanges[0][0] == LEVEL else station.dose(0.5))
 
@@ -97,7 +100,7 @@ async def test_a_board_that_starts_slowly_is_waited_for_and_another_device_is_re
 
 @pytest.mark.parametrize("fault", ["deaf", "mute", "garbage", "late"])
 async def test_one_fault_gives_the_dose_once_and_one_that_lasts_is_an_error(fault: str, line: Line):
-    station = await connected()
+    station = await connected(a_station())
     line.faults = [fault]
     await station.dose(1.0)
     assert given_ml(line) == 1.0
@@ -111,7 +114,7 @@ async def test_one_fault_gives_the_dose_once_and_one_that_lasts_is_an_error(faul
 
 
 async def test_the_limit_per_minute_slides_and_counts_what_was_not_confirmed(line: Line):
-    station = await connected()
+    station = await connected(a_station())
     await station.dose(2.0)
     await asyncio.sleep(30.0)
     line.faults = ["deaf", "deaf"]
@@ -155,8 +158,7 @@ def pump_line(plug: Plug, rotor: PumpFirmware) -> Line:
 
 @pytest.fixture
 async def pump(pump_line: Line, rotor: PumpFirmware) -> AsyncIterator[ModbusPump]:
-    pump = a_pump()
-    await pump.connect()
+    pump = await connected(a_pump())
     yield pump
     await pump.close()
     assert not rotor.running
@@ -178,8 +180,7 @@ async def test_a_dose_sets_the_speed_starts_and_stops(scripted: Scripted):
 
 
 async def test_it_doses_before_every_nth_dip(pump_line: Line):
-    pump = a_pump(dose_ml=0.02, every_dips=3)
-    await pump.connect()
+    pump = await connected(a_pump(dose_ml=0.02, every_dips=3))
     assert [(await pump.replenish(), pump.dosed_ml)[1] for _ in range(7)] == [0.0, 0.0, 0.02, 0.02, 0.02, 0.04, 0.04]
     assert pump._table.doses_ml(7) == pytest.approx(0.04)
 
@@ -196,8 +197,7 @@ async def test_a_line_that_echoes_is_refused(scripted: Scripted):
 
 async def test_a_dose_that_the_pump_refuses_was_not_started(scripted: Scripted):
     scripted(*CONNECTED, (SPEED, REFUSED), *BYE)
-    pump = a_pump()
-    await pump.connect()
+    pump = await connected(a_pump())
     with pytest.raises(InkRefused, match=r"2 \(illegal register\). The pump was not started"):
         await pump.dose(0.01)
     await pump.close()
@@ -229,8 +229,7 @@ async def test_a_cancelled_dose_stops_the_pump_however_often_it_is_cancelled(
 async def test_where_the_stop_fails_too_the_pump_may_still_be_running_and_closing_tries_again(
     fault: str, cancelled: bool, rotor: PumpFirmware, pump_line: Line
 ):
-    pump = a_pump()
-    await pump.connect()
+    pump = await connected(a_pump())
     dose = await dosing(pump, rotor)
     pump_line.faults = [fault] * 6  # the dose and closing send a stop three times each
     if cancelled:

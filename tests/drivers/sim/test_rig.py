@@ -15,7 +15,7 @@ import stat
 import threading
 import time
 import tomllib
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -149,37 +149,9 @@ async def test_the_frames_of_a_round_are_one_burst_on_a_busy_computer(monkeypatc
     )
 
 
-Ask = Callable[..., Awaitable[dict[str, Any]]]
+async def test_only_its_owner_can_open_it_and_no_other_file_or_rig_is_pushed_aside(rig: LoopbackRig, tmp_path: Path):
+    path = tmp_path / "control"
 
-
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "control"
-
-
-@pytest.fixture
-async def ask(rig: LoopbackRig, path: Path) -> AsyncIterator[Ask]:
-    async def exchange(do: object, **request: object) -> dict[str, Any]:
-        return await asyncio.to_thread(ask_rig, path, {"do": do, **request})
-
-    async with ControlServer(rig, path):
-        yield exchange
-    assert not path.exists()
-
-
-async def test_a_person_ends_a_stop_that_was_asked_for_and_the_state_tells(ask: Ask):
-    before = await ask("state")
-    assert (before["phase"], before["moving"], before["presses"], before["ink_load"]) == ("parked", False, 0, 0.0)
-    assert (before["robot_mode"], before["safety_mode"], before["faults"]) == ("PowerOff", "Normal", 0)
-    assert before["tip_mm"] == [250.0, -230.0, 260.0]
-    await ask("add", fault={"device": "robot", "kind": "emergency-stop"})
-    while (await ask("state"))["safety_mode"] != "RobotEmergencyStop":
-        await asyncio.sleep(0.005)
-    assert await ask("release") == {"was": "RobotEmergencyStop"}
-    assert (await ask("state"))["safety_mode"] == "Normal"
-
-
-async def test_only_its_owner_can_open_it_and_no_other_file_or_rig_is_pushed_aside(rig: LoopbackRig, path: Path):
     async def refused(at: Path, words: str) -> None:
         with pytest.raises(RigRefused, match=words):
             async with ControlServer(rig, at):
@@ -201,19 +173,34 @@ async def test_only_its_owner_can_open_it_and_no_other_file_or_rig_is_pushed_asi
     await refused(path / "no", "cannot listen here")
 
 
-async def test_a_person_breaks_the_rig_and_mends_it(ask: Ask, path: Path):
+async def test_a_person_breaks_the_rig_sees_its_state_and_mends_it(rig: LoopbackRig, tmp_path: Path):
+    path = tmp_path / "control"
+
     async def fault(*words: str) -> Any:
         return await asyncio.to_thread(brushloop, "sim", "fault", path, *words)
 
-    added = await fault("robot", "mute", "--on", "moveLine", "--count", "3")
-    assert json.loads(added.stdout) == {"id": 1}
-    hung = {"device": "robot", "kind": "mute", "on": "moveLine", "count": 3}
-    assert json.loads((await fault("list")).stdout) == {"hanging": [{"id": 1, "fault": hung, "struck": 0}]}
-    assert (await fault("robot", "loud")).stderr.startswith("brushloop: kind = 'loud' is not one of robot's")
-    assert await ask("clear", id=7) == {"taken": 0}
-    assert json.loads((await fault("clear")).stdout) == {"taken": 1}
-    path = path.with_name("nobody")
-    assert "nobody: no rig answers here" in (await fault("clear")).stderr
+    async def ask(do: str, **request: object) -> dict[str, Any]:
+        return await asyncio.to_thread(ask_rig, path, {"do": do, **request})
+
+    async with ControlServer(rig, path):
+        before = await ask("state")
+        assert (before["phase"], before["moving"], before["presses"], before["ink_load"]) == ("parked", False, 0, 0.0)
+        assert (before["robot_mode"], before["safety_mode"], before["faults"]) == ("PowerOff", "Normal", 0)
+        assert before["tip_mm"] == [250.0, -230.0, 260.0]
+        added = await fault("robot", "mute", "--on", "moveLine", "--count", "3")
+        assert json.loads(added.stdout) == {"id": 1}
+        hung = {"device": "robot", "kind": "mute", "on": "moveLine", "count": 3}
+        assert json.loads((await fault("list")).stdout) == {"hanging": [{"id": 1, "fault": hung, "struck": 0}]}
+        assert (await fault("robot", "loud")).stderr.startswith("brushloop: kind = 'loud' is not one of robot's")
+        assert await ask("clear", id=7) == {"taken": 0}
+        assert json.loads((await fault("clear")).stdout) == {"taken": 1}
+        await fault("robot", "emergency-stop")
+        while (await ask("state"))["safety_mode"] != "RobotEmergencyStop":
+            await asyncio.sleep(0.005)
+        assert await ask("release") == {"was": "RobotEmergencyStop"}
+        assert (await ask("state"))["safety_mode"] == "Normal"
+    assert not path.exists()
+    assert "control: no rig answers here" in (await fault("clear")).stderr
 
 
 def test_corners_of_the_board_lie_where_the_optics_say_through_a_lens_that_distorts():
