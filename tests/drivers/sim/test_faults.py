@@ -3,32 +3,22 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from brushloop.drivers.sim.faults import Device, FaultBoard, Phase, fault_of
+from brushloop.drivers.sim import faults
+from brushloop.drivers.sim.faults import FaultBoard, Phase, fault_of
 
 
-class Scripted(FaultBoard):
-    """A board over a world whose state is set by the test, and a clock."""
-
-    def __init__(self) -> None:
-        self.at_s = 0.0
-        self.doing = Phase.PARKED
-        self.presses: list[None] = []
-        self.clock = self
-        super().__init__(self)  # type: ignore[arg-type]
-
-    def real_s(self) -> float:
-        return self.at_s
-
-    def phase(self) -> Phase:
-        return self.doing
-
-    def strikes_on(self, device: Device, ops: str) -> list[bool]:
-        self.begin_due(lambda _mode: None)
-        return [self.meet(device, op) is not None for op in ops.split()]
+@pytest.fixture
+def world(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """As much of a world as the board looks at: its presses, its clock, and what the arm is doing."""
+    world = SimpleNamespace(at_s=0.0, doing=Phase.PARKED, presses=[])
+    world.clock = SimpleNamespace(real_s=lambda: world.at_s)
+    monkeypatch.setattr(faults, "phase_of", lambda world: world.doing)
+    return world
 
 
 ARM = "rob1.MotionControl."
@@ -65,13 +55,14 @@ ARM = "rob1.MotionControl."
     ],
 )
 def test_a_fault_strikes_the_requests_that_its_conditions_name(
-    fault: dict[str, Any], moments: list[tuple[dict[str, Any], str, list[bool]]]
+    world: Any, fault: dict[str, Any], moments: list[tuple[dict[str, Any], str, list[bool]]]
 ) -> None:
-    board, hung = Scripted(), fault_of({"device": "robot", "kind": "mute"} | fault)
+    board, hung = FaultBoard(world), fault_of({"device": "robot", "kind": "mute"} | fault)
     board.hang(hung)
     for changes, ops, expected in moments:
-        vars(board).update(changes)
-        assert board.strikes_on(hung.device, ops) == expected
+        vars(world).update(changes)
+        board.begin_due(lambda _mode: None)
+        assert [board.meet(hung.device, op) is not None for op in ops.split()] == expected
     assert board.strikes == sum(sum(expected) for _, _, expected in moments)
 
 
@@ -86,5 +77,5 @@ def test_a_fault_strikes_the_requests_that_its_conditions_name(
 )
 def test_what_cannot_be_used_is_refused_with_one_printable_line(fields: dict[str, object], words: str) -> None:
     with pytest.raises(ValueError, match=re.escape(words)) as caught:
-        Scripted().hang(fault_of({"device": "robot", "kind": "mute"} | fields))
+        fault_of({"device": "robot", "kind": "mute"} | fields)
     assert str(caught.value).isprintable()
