@@ -9,6 +9,7 @@ python -m pytest tests/contract --rig rig.toml     a real arm; asks before it mo
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
 import sys
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -165,18 +166,16 @@ async def rig(request: pytest.FixtureRequest) -> AsyncIterator[RigConfig]:
     framing, _, rtde = request.param.partition(", ")
     config = SimConfig(rate=RATE, force_sensor=False, ink_device="none")
     server = ArcsServer(World(config, SimClock(RATE, asyncio.get_running_loop().time)))
-    await server.start(HOST, 0)
     pushing = RtdeServer(server)
-    await pushing.start(HOST, 0)
-    try:
+    async with contextlib.AsyncExitStack() as serving:
+        for started in (server, pushing):
+            await started.start(HOST, 0)
+            serving.push_async_callback(started.stop)
         path = request.getfixturevalue("tmp_path") / "rig.toml"
         path.write_text(rig_toml(config, ports={"arcs": server.port, "rtde": pushing.port}), encoding="utf-8")
         loopback = load_rig(path)
         how = {"framing": framing, "rtde_port": pushing.port if rtde else None}
         yield loopback.model_copy(update={"robot": loopback.robot.model_copy(update=how)})
-    finally:
-        await pushing.stop()
-        await server.stop()
 
 
 @pytest.fixture

@@ -135,13 +135,6 @@ async def test_a_move_arrives(enabled: Enabled):
 
 
 @pytest.mark.moves
-async def test_a_move_to_where_the_arm_stands_is_done_at_once(enabled: Enabled):
-    async with asyncio.timeout(1.0):
-        await enabled.robot.move(enabled.start, **GENTLY)
-    assert_there(await assert_still(enabled.robot), enabled.start)
-
-
-@pytest.mark.moves
 async def test_a_stop_in_mid_move_stops_short_and_a_later_move_works(enabled: Enabled):
     async with on_the_way_up(enabled) as move:
         await enabled.robot.stop()
@@ -165,7 +158,11 @@ async def test_a_move_that_is_cancelled_stops_the_arm(enabled: Enabled):
 
 
 @pytest.mark.moves
-async def test_a_stop_of_an_idle_arm_is_harmless_also_twice_and_at_once(enabled: Enabled):
+async def test_an_idle_arm_is_at_once_where_it_stands_and_a_stop_is_harmless_also_twice(
+    enabled: Enabled,
+):
+    async with asyncio.timeout(1.0):
+        await enabled.robot.move(enabled.start, **GENTLY)
     await enabled.robot.stop()
     await enabled.robot.stop()
     await asyncio.gather(enabled.robot.stop(), enabled.robot.stop())

@@ -58,9 +58,7 @@ class Bus:
         pass
 
 
-def sensor_on(channel: str, stale_ms: float = 1e6) -> SriM8123:
-    table = ForceTable(kind="sri-m8123", interface="virtual", channel=channel)
-    return SriM8123(table.model_copy(update={"stale_ms": stale_ms}), HostClock())
+TABLE = ForceTable(kind="sri-m8123", interface="virtual", channel="a board")
 
 
 @asynccontextmanager
@@ -68,7 +66,7 @@ async def sensing(board: ForceBoard, stale_ms: float = 1e6) -> AsyncIterator[Sri
     """A sensor that is connected to the board."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(can, "Bus", lambda *_, **__: Bus(board))
-        sensor = sensor_on("a board", stale_ms)
+        sensor = SriM8123(TABLE.model_copy(update={"stale_ms": stale_ms}), HostClock())
         await sensor.connect()
         yield sensor
         await sensor.close()
@@ -91,7 +89,7 @@ def readers() -> int:
 
 async def test_connecting_starts_the_board_and_closing_stops_it(board: ForceBoard, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(can, "Bus", lambda *_, **__: Bus(board))
-    sensor = sensor_on("a board")
+    sensor = SriM8123(TABLE, HostClock())
     identity = await sensor.connect()
     assert (identity.model, identity.simulated) == ("SRI M8123B2 on virtual a board", True)
     assert (sensor.latest().force_n, sensor.latest().torque_nm) == (WRENCH[:3], WRENCH[3:])
@@ -189,7 +187,7 @@ async def test_where_no_board_answers_or_no_adapter_is_there_connecting_says_so(
     interface: str, channel: str, ends: pytest.RaisesExc[DeviceError], monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(sri_m8123, "CONNECT_S", 0.2)
-    sensor = SriM8123(ForceTable(kind="sri-m8123", interface=interface, channel=channel), HostClock())
+    sensor = SriM8123(TABLE.model_copy(update={"interface": interface, "channel": channel}), HostClock())
     with ends:
         await sensor.connect()
     await sensor.close()

@@ -25,12 +25,10 @@ import cv2
 import numpy as np
 import pytest
 
-from brushloop.drivers.camera import CameraTable, OpenCvCamera
+from brushloop.drivers.camera import CameraTable
 from brushloop.drivers.camera.source import JpegStream
-from brushloop.drivers.devices import Stamp
 from brushloop.drivers.force.simulator import FRAME_S, ForceBoard, SocketcandServer
 from brushloop.drivers.force.sri_m8123 import COMMAND_ID, LOOPBACK_CHANNEL, START
-from brushloop.drivers.host import HostClock
 from brushloop.drivers.loopback import LoopbackServer, RigRefused
 from brushloop.drivers.loopback import ask as ask_rig
 from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
@@ -95,20 +93,17 @@ async def test_a_rig_with_a_client_is_not_idle(rig: LoopbackRig):
     await idle
 
 
+async def pictures_of(rig: LoopbackRig) -> JpegStream:
+    """Its camera's stream, which has sent a picture."""
+    source = tomllib.loads(rig.toml())["camera"]["source"]
+    return await asyncio.to_thread(JpegStream, CameraTable(kind="opencv", source=source))
+
+
 async def test_the_motion_queue_belongs_to_the_event_loops_thread(rig: LoopbackRig, monkeypatch: pytest.MonkeyPatch):
     seen: set[str] = set()
-    advance = rig.world.motion.advance
-
-    def spy(now_s: float) -> None:
-        seen.add(threading.current_thread().name)
-        advance(now_s)
-
-    monkeypatch.setattr(rig.world.motion, "advance", spy)
-    source = tomllib.loads(rig.toml())["camera"]["source"]
-    camera, clock = OpenCvCamera(CameraTable(kind="opencv", source=source), HostClock()), HostClock()
-    await camera.connect()
-    await camera.fresh(Stamp(clock.now_ns()))
-    await camera.close()
+    motion, advance = rig.world.motion, rig.world.motion.advance
+    monkeypatch.setattr(motion, "advance", lambda now_s: (seen.add(threading.current_thread().name), advance(now_s)))
+    (await pictures_of(rig)).close()
     assert seen == {threading.current_thread().name}
 
 
@@ -222,8 +217,7 @@ async def test_no_late_picture_overtakes_another_and_the_server_notices_that_its
     view = View(width_px=320, height_px=240, px_per_mm=0.9, fps=50.0, delay_s=0.05, delay_jitter_s=0.2)
     async with LoopbackRig(replace(SMALL, view=view)) as rig:
         rig.faults.hang(Fault(device=Device.CAMERA, kind="frozen", count=ALWAYS))  # numbers its pictures
-        source = tomllib.loads(rig.toml())["camera"]["source"]
-        stream = await asyncio.to_thread(JpegStream, CameraTable(kind="opencv", source=source))
+        stream = await pictures_of(rig)
         jpegs = [await asyncio.to_thread(stream.read) or b"" for _ in range(20)]
         numbers = [int(jpeg[6 : jpeg.index(b"\xff", 6)]) for jpeg in jpegs]  # of the comment
         assert numbers == sorted(numbers)
