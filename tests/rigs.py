@@ -100,8 +100,7 @@ class Lab:
     rig: LoopbackRig
     folder: Path
     processes: list[subprocess.Popen[str]] = field(default_factory=list)
-    make: type[Engine] = Engine
-    engines: list[Engine] = field(default_factory=list)
+    engines: list[SteppedEngine] = field(default_factory=list)
     loop: asyncio.AbstractEventLoop | None = None
     """In which a rig on sockets is served, by a thread of its own."""
 
@@ -131,21 +130,22 @@ class Lab:
         motion = self.rig.world.motion
         return motion.exec_id(self.rig.world.clock.now_s()) == -1 and motion.size == 0
 
-    def engine(self, **options: Any) -> Engine:
+    def engine(self, **options: Any) -> SteppedEngine:
         """As `brushloop collect` makes it; `options` are those of a `CollectRequest`."""
         request = CollectRequest(self.folder / "rig.toml", self.folder / "protocol.toml", self.sessions, **options)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("brushloop.collect.engine.engine.Engine", self.make)
-            self.engines.append(engine_for(Opening.load(request)))
-        return self.engines[-1]
+            patch.setattr("brushloop.collect.engine.engine.Engine", SteppedEngine)
+            engine: Any = engine_for(Opening.load(request))
+        self.engines.append(engine)
+        return engine
 
-    def started(self, **options: Any) -> Engine:
+    def started(self, **options: Any) -> SteppedEngine:
         """An engine on its way."""
         engine = self.engine(**options)
         engine.start()
         return engine
 
-    def run(self, **options: Any) -> Engine:
+    def run(self, **options: Any) -> SteppedEngine:
         """An engine at its end. Raises what ended it."""
         engine = self.started(**options)
         wait_for_end(engine)
@@ -368,7 +368,7 @@ def wireless_lab(folder: Path, config: SimConfig = COARSE) -> Iterator[Lab]:
         patch.setattr(Engine, "new_event_loop", staticmethod(lambda: MemoryLoop(rig.time)))
         patch.setattr("brushloop.collect.engine.engine.HostClock", lambda: rig.time)
         patch.setattr(start, "REFRESH_S", 0.01)
-        lab = Lab(rig, folder, make=SteppedEngine)
+        lab = Lab(rig, folder)
         yield lab
         for engine in lab.engines:
             end(engine)

@@ -1,10 +1,9 @@
-"""Runs of an engine as a test drives them: step by step where time is simulated, and waits that end."""
+"""Runs of an engine as a test drives them, step by step in simulated time, and waits that end."""
 
 from __future__ import annotations
 
 import asyncio
 import inspect
-import time
 from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,7 +14,6 @@ from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.open_or_resume import Opening
 from brushloop.collect.engine.snapshot import Snapshot
 from brushloop.collect.operator import Prompt
-from tests import waiting
 from tests.simulated_time import MemoryLoop, SimulatedTime
 
 PATIENCE_S = 600.0
@@ -75,7 +73,7 @@ class SteppedEngine(Engine):
         return doing.result()
 
 
-def until(engine: Engine, condition: Callable[[Snapshot], bool]) -> Snapshot:
+def until(engine: SteppedEngine, condition: Callable[[Snapshot], bool]) -> Snapshot:
     """The first snapshot that meets the condition; fails where it does not come in time, or the run is over."""
     met: list[Snapshot] = []
 
@@ -84,44 +82,44 @@ def until(engine: Engine, condition: Callable[[Snapshot], bool]) -> Snapshot:
         met.extend([now] if condition(now) else [])
         return bool(met)
 
-    in_time = _wait(engine, looked)
+    in_time = engine.wait_until(looked)
     if not met:
         why = "the run ended" if engine.finished else "the run went on" if in_time else "time ran out"
         pytest.fail(f"{why} while a test waited for {_source(condition)}: {engine.snapshot()}")
     return met[0]
 
 
-def wait_for_end(engine: Engine) -> None:
+def wait_for_end(engine: SteppedEngine) -> None:
     """Wait until the run is over, and raise what ended it; stops the run and fails where it does not end in time."""
-    if not _wait(engine, lambda: False):
+    if not engine.wait_until(lambda: False):
         now = engine.snapshot()
         end(engine)
         pytest.fail(f"a test waited in vain for the end of the run; it is: {now}")
     engine.join()
 
 
-def ended_by(engine: Engine, error: type[_E], says: str | None = None) -> _E:
+def ended_by(engine: SteppedEngine, error: type[_E], says: str | None = None) -> _E:
     """The error that ends the run, which must be of this kind and hold these words (a pattern)."""
     with pytest.raises(error, match=says) as caught:
         wait_for_end(engine)
     return caught.value
 
 
-def question(engine: Engine, words: str = "") -> Prompt:
+def question(engine: SteppedEngine, words: str = "") -> Prompt:
     """The next open question that holds these words."""
     prompt = until(engine, lambda now: now.prompt is not None and words in now.prompt.question).prompt
     assert prompt is not None
     return prompt
 
 
-def answer(engine: Engine, words: str, key: str) -> None:
+def answer(engine: SteppedEngine, words: str, key: str) -> None:
     """Answer the next question that holds these words."""
     number = question(engine, words).number
     assert engine.answer(number, key)
     until(engine, lambda now: now.prompt is None or now.prompt.number != number)
 
 
-def answered_alike(engine: Engine, key: str) -> list[str]:
+def answered_alike(engine: SteppedEngine, key: str) -> list[str]:
     """Run to the end, answering every question the same way; the questions. Raises what ended the run."""
     questions: dict[int, str] = {}
 
@@ -133,29 +131,16 @@ def answered_alike(engine: Engine, key: str) -> list[str]:
         return False
 
     engine.start()
-    _wait(engine, answering)
+    engine.wait_until(answering)
     wait_for_end(engine)
     return list(questions.values())
 
 
-def end(engine: Engine) -> None:
+def end(engine: SteppedEngine) -> None:
     """Stop a run that a test has left."""
     if not engine.finished:
         engine.stop()
-    if isinstance(engine, SteppedEngine):
-        engine.wait_until(lambda: False)
-
-
-def _wait(engine: Engine, met: Callable[[], bool]) -> bool:
-    """Wait until the condition is met or the run is over; False where neither comes in time."""
-    if isinstance(engine, SteppedEngine):
-        return engine.wait_until(met)
-    deadline = time.monotonic() + waiting.PATIENCE_S
-    while not met() and not engine.finished:
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.01)
-    return True
+    engine.wait_until(lambda: False)
 
 
 def _source(condition: Callable[[Snapshot], bool]) -> str:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-from brushloop.collect.engine.engine import Engine
 from brushloop.drivers.arcs import wire
 from brushloop.drivers.sim.config import SimConfig
 from tests import rigs
@@ -57,23 +55,14 @@ def wired_lab(tmp_path: Path) -> Iterator[Lab]:
         yield lab
 
 
-@dataclass
-class Collected:
-    """A session of four strokes, from its beginning to its end, armed and without a self-check."""
-
-    lab: Lab
-    """Its rig has ended; the world remembers what was pressed."""
-    engine: Engine
-
-    @property
-    def folder(self) -> Path:
-        return self.lab.session
-
-
 @pytest.fixture(scope="session")
-def collected(tmp_path_factory: pytest.TempPathFactory) -> Collected:
-    """For whoever only looks at what a run leaves; nobody writes into it."""
+def collected(tmp_path_factory: pytest.TempPathFactory) -> Lab:
+    """What a session of four strokes left, from its beginning to its end, armed and without a self-check.
+
+    The rig has ended, but the world remembers what was pressed. Nobody writes into it.
+    """
     with rigs.wireless_lab(tmp_path_factory.mktemp("collected"), COARSE) as lab:
         rigs.coarse(lab).write_protocol(tilts="[0.0, 10.0]")
         lab.edit_rig("", "\n[self_check]\nenabled = false\n")
-        return Collected(lab, lab.run(armed=True))
+        lab.run(armed=True)
+        return lab
