@@ -95,9 +95,6 @@ FAULTS: dict[str, dict[str, Any]] = {
     "emergency stop": {"kind": "emergency-stop"},
     "frozen camera": {"device": "camera", "kind": "frozen", "count": ALWAYS},
 }
-WAITED_OUT = ("mute", "late", "wrong id")
-SINGLE = ("late", "wrong id", "malformed", "protective stop", "emergency stop")
-"""What strikes one request of the driver's own wait; the others strike whoever asks."""
 
 
 @dataclass(frozen=True)
@@ -116,20 +113,12 @@ LOST, UNSAFE = Outcome(ConnectionLost), Outcome(RobotNotSafe)
 BLIND = Outcome(DeviceTimeout, "camera")
 
 
-PRESSING = ("descent", "at depth", "lift")
-
-
-def carried_out(name: str, phase: str) -> bool:
-    """Whether the controller makes the whole press, lift included, although the fault strikes it."""
-    return phase in PRESSING and TABLE[name][list(PHASES).index(phase)] in (DONE, SILENT)
-
-
 def but_for_a_press(outcome: Outcome) -> list[Outcome]:
     """The controller carries out a press that it was released for, and answers that are lost are asked for again."""
     return [outcome] * 6 + [DONE] * 3 + [outcome]
 
 
-TABLE: dict[str, list[Outcome]] = {
+ROWS: dict[str, list[Outcome]] = {
     # connecting and powering, then the eight phases in which the arm moves or has just moved
     "mute": [TIMEOUT] * 2 + [SILENT] * 8,
     "late": but_for_a_press(TIMEOUT),
@@ -142,6 +131,13 @@ TABLE: dict[str, list[Outcome]] = {
     "emergency stop": [UNSAFE] * 10,
     "frozen camera": [BLIND] * 10,
 }
+TABLE = {name: dict(zip(PHASES, outcomes, strict=True)) for name, outcomes in ROWS.items()}
+PRESSING = ("descent", "at depth", "lift")
+
+
+def carried_out(name: str, phase: str) -> bool:
+    """Whether the controller makes the whole press, lift included, although the fault strikes it."""
+    return phase in PRESSING and TABLE[name][phase] in (DONE, SILENT)
 
 
 def patches() -> list[Any]:
@@ -157,9 +153,11 @@ def patches() -> list[Any]:
 def fault_at(name: str, phase: str) -> Fault:
     fields: dict[str, Any] = {"device": "robot"} | FAULTS[name]
     if phase not in STILL and fields["device"] == "robot":
+        # What strikes once strikes a request of the driver's own wait, all else whoever asks.
+        once = fields.keys().isdisjoint({"count", "for_s"})
         if phase == "at depth":
-            fields |= {"phase": Phase.PRESSED} | ({"on": POLL} if name in SINGLE else {})
-        elif name in SINGLE:
+            fields |= {"phase": Phase.PRESSED} | ({"on": POLL} if once else {})
+        elif once:
             fields |= STRUCK
         else:
             fields |= {"nth": 10}
@@ -175,7 +173,7 @@ def arm_the_fault(lab: Lab, engine: Engine, name: str, phase: str) -> list[Pose 
     methods = rig.arcs._methods
     original: Callable[[dict[str, Any]], Any] = methods[moment.method]
     targets: list[Pose | None] = []
-    slow = SLOW / 2 if name in WAITED_OUT else SLOW  # the arm is still on its way when the time is out
+    slow = SLOW / 2 if TABLE[name]["connecting"] is TIMEOUT else SLOW  # or the arm is there when the time is out
 
     def now() -> bool:
         if not engine.snapshot().step.startswith(moment.step):
@@ -200,7 +198,7 @@ def arm_the_fault(lab: Lab, engine: Engine, name: str, phase: str) -> list[Pose 
             return result
         if not targets or moment.method not in (LINE, WAITING) or name == "frozen camera":
             lab.rig.clock.shift(FAST)
-        elif TABLE[name][0] is DONE or carried_out(name, phase):
+        elif TABLE[name]["connecting"] is DONE or carried_out(name, phase):
             wait_s = 1.6 / slow if phase == "at depth" else 1.0 if phase in PRESSING else 0.3
             asyncio.get_running_loop().call_later(wait_s, lab.rig.clock.shift, FAST)
         return result
@@ -227,7 +225,7 @@ def end_of(engine: Engine) -> BaseException | None:
 
 @pytest.mark.parametrize(("name", "phase"), patches())
 def test_a_fault_in_a_phase_ends_as_the_table_says(lab: Lab, name: str, phase: str) -> None:
-    expected = TABLE[name][list(PHASES).index(phase)]
+    expected = TABLE[name][phase]
     engine = lab.engine()
     targets = arm_the_fault(lab, engine, name, phase)
     engine.start()
@@ -272,7 +270,7 @@ def assert_it_stays_at_rest(lab: Lab) -> None:
 
 
 def assert_the_session_is_whole(lab: Lab, name: str, phase: str) -> None:
-    outcome = TABLE[name][list(PHASES).index(phase)]
+    outcome = TABLE[name][phase]
     if phase == "connecting" and outcome in (TIMEOUT, VIOLATION, LOST):
         assert not lab.sessions.is_dir(), "an arm that was not reached begins no session"
         return
