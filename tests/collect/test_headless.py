@@ -15,7 +15,7 @@ from brushloop.collect import start
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.snapshot import Snapshot
-from brushloop.collect.errors import CollectAborted, ConfigError, Parked
+from brushloop.collect.errors import CollectAborted, ConfigError
 from brushloop.collect.rig.devices import sole_driver
 from brushloop.collect.start import ending
 from brushloop.drivers import host as sole
@@ -39,7 +39,9 @@ def at_each_mark(lab: Lab, monkeypatch: pytest.MonkeyPatch, number: signal.Signa
     monkeypatch.setattr(lab.rig.world, "_leave_mark", leave_and_send)
 
 
-def test_a_signal_stops_the_run_and_the_same_command_goes_on(bare_lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_signal_stops_the_run_and_the_same_command_goes_on_where_no_other_has_the_session(
+    bare_lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
     lab = bare_lab
     lab.write_protocol()
     with monkeypatch.context() as patch:
@@ -49,6 +51,12 @@ def test_a_signal_stops_the_run_and_the_same_command_goes_on(bare_lab: Lab, monk
     assert ran.stderr.splitlines()[-1].startswith("brushloop: stopped; the same command resumes from here")
     assert "Traceback" not in ran.stderr
     assert lab.at_rest
+
+    elsewhere, at = SessionStore(lab.session, lambda: 1), lab.rig.world.tool()
+    refused = lab.command()
+    assert (refused.returncode, lab.rig.world.tool()) == (2, at), "nothing moves"
+    assert refused.stderr.splitlines()[-1].endswith("another brushloop has this session open")
+    elsewhere.release()
 
     again = lab.command()
     assert again.returncode == 0, again.stderr
@@ -79,22 +87,6 @@ def test_where_nobody_watches_any_more_the_step_ends_and_the_arm_parks(
     assert ran.stderr.splitlines()[-1].startswith("brushloop: parked on request; the same command resumes from here")
     assert lab.rig.faults.phase() is Phase.PARKED
     assert not lab.state.cut
-
-
-def test_a_session_that_is_open_elsewhere_is_refused_before_anything_moves(bare_lab: Lab) -> None:
-    lab = bare_lab
-    lab.write_protocol()
-    engine = lab.started()
-    until(engine, lambda now: now.strokes_done == 1)
-    engine.park()
-    ended_by(engine, Parked)
-    elsewhere = SessionStore(lab.session, lambda: 1)
-    at = lab.rig.world.tool()
-    ran = lab.command()
-    assert (ran.returncode, lab.rig.world.tool()) == (2, at)
-    assert ran.stderr.splitlines()[-1].endswith("another brushloop has this session open")
-    elsewhere.release()
-    assert lab.command().returncode == 0
 
 
 # One arm, one driver: whatever the temporary folder, whoever the user, and for no longer than the process lives

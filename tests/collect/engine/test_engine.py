@@ -18,7 +18,6 @@ from brushloop.sessions.events import CaptureResult
 from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.store import SessionStore
-from tests.collect.conftest import Collected
 from tests.rigs import SMALL_VIEW, Lab
 from tests.runs import answer, answered_alike, ended_by, question, until, wait_for_end
 
@@ -26,23 +25,23 @@ ELSEWHERE = replace(SMALL_VIEW, centre_mm=(SMALL_VIEW.centre_mm[0] + 3.0, SMALL_
 
 
 @pytest.mark.xdist_group("collected")
-def test_a_whole_session_is_collected_as_the_protocol_says_and_merged(collected: Collected) -> None:
-    now, recording = collected.engine.snapshot(), Recording(collected.folder)
+def test_a_whole_session_is_collected_as_the_protocol_says_and_merged(collected: Lab) -> None:
+    now, recording = collected.engines[-1].snapshot(), Recording(collected.session)
     assert (now.state, now.strokes_done, now.strokes_planned) == (State.DONE, 4, 4)
     assert now.source == recording.header.source == "loopback rig"
     captures = sorted(recording.captures(), key=lambda capture: capture.stroke.still)
     assert all(capture.image().shape == (384, 512) for capture in captures)
     assert {(c.stroke.depth_mm, c.stroke.tilt_deg) for c in captures} == {(11, 0), (11, 10), (15, 0), (15, 10)}
     # World's own answer sheet; the operator taught the touch height .03 mm too high. The first contact is zero touch.
-    for press, stroke in zip(collected.lab.presses, (capture.stroke for capture in captures), strict=True):
+    for press, stroke in zip(collected.presses, (capture.stroke for capture in captures), strict=True):
         assert stroke.depth_mm == pytest.approx(press.depth_mm + 0.03, abs=0.01)
         assert (stroke.tilt_deg, 0.0) == pytest.approx((press.tilt_deg, press.heading_deg), abs=0.01)
         assert stroke.anchor_mm == pytest.approx((press.x_mm, press.y_mm), abs=0.05)
         assert press.ink_load == 1.0
     assert any(UNCHECKED in line for line in now.messages), "it was armed, and its self-check is switched off"
-    assert "self_check" not in {step.kind for step in collected.lab.state.files.values()}
+    assert "self_check" not in {step.kind for step in collected.state.files.values()}
     with pytest.raises(ConfigError, match="Put a fresh sheet in, then confirm it with --sheet 1"):
-        collected.lab.engine()
+        collected.engine()
 
 
 def test_stop_in_mid_press_voids_the_patch_and_the_same_command_goes_on(lab: Lab) -> None:

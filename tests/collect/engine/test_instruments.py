@@ -26,7 +26,6 @@ from brushloop.drivers.sim.world import push_on
 from brushloop.sessions.events import DipResult, PressResult
 from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.records import Topic
-from tests.collect.conftest import Collected
 from tests.rigs import Lab
 from tests.runs import answer, ended_by, question, until, wait_for_end
 
@@ -51,13 +50,13 @@ def in_mid_press(lab: Lab, monkeypatch: pytest.MonkeyPatch, fault: Fault) -> Non
 
 
 @pytest.mark.xdist_group("collected")
-def test_force_and_ink_are_recorded_beside_the_poses(collected: Collected) -> None:
-    folder = collected.folder
+def test_force_and_ink_are_recorded_beside_the_poses(collected: Lab) -> None:
+    folder = collected.session
     with (folder / f"{folder.name}.mcap").open("rb") as file:
         seen = Counter(channel.topic for _, channel, _ in make_reader(file, validate_crcs=True).iter_messages())
     assert min(seen[topic] for topic in (Topic.TCP, Topic.JOINTS, Topic.WRENCH)) > 10
     assert seen[Topic.INK] == 4
-    peaks_n = [press.peak_force_n or 0.0 for press in collected.lab.state.results(PressResult)]
+    peaks_n = [press.peak_force_n or 0.0 for press in collected.state.results(PressResult)]
     assert len(peaks_n) == 4
     assert all(0.02 < peak_n < 0.5 for peak_n in peaks_n)
 
@@ -110,37 +109,31 @@ def test_a_sensor_that_fails_in_mid_press_ends_the_run_with_the_brush_lifted(
     assert lab.rig.world.tool().z_mm > 170.0, "a sensor is at fault, the arm is in order"
 
 
-def test_a_low_well_is_filled_before_the_brush_dips(lab: Lab) -> None:
-    well = lab.rig.world.well
-    well.ml = 0.4 * well.capacity_ml
-    lab.run()
-    assert well.share > 0.45
-    dips = lab.state.results(DipResult)
-    assert all(dip.ink_level is not None and dip.ink_level >= 0.5 for dip in dips)
-    assert max(dip.dosed_ml or 0.0 for dip in dips) >= 1.0
-
-
-def test_an_empty_reservoir_holds_the_run_before_a_dry_press_until_it_is_refilled(lab: Lab) -> None:
+def test_a_low_well_is_filled_before_the_brush_dips_and_nothing_is_pressed_until_the_ink_has_come(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert lab.rig.ink is not None
     firmware: Any = lab.rig.ink.instrument
-    lab.write_protocol("[11.0]", "[0.0]")
-    lab.rig.world.well.ml, firmware.reservoir_ml = 4.0, 0.2
+    well = lab.rig.world.well
+    well.ml = 1.0
+    with monkeypatch.context() as tube:
+        tube.setattr(well, "add", lambda _volume_ml: None)  # it has come off
+        with pytest.raises(DoseLost, match="Look at the tube"):
+            lab.run()
+    firmware.reservoir_ml = 0.2
     engine = lab.started(on_screen=True)
+    answer(engine, "Resume", "g")
     prompt = question(engine, "Refill the reservoir")
     assert not lab.presses
     assert lab.rig.world.tool().z_mm > 170.0, "a person is about to reach under the arm"
     firmware.reservoir_ml = 100.0
     assert engine.answer(prompt.number, "g")
     wait_for_end(engine)
-    assert len(lab.presses) == 1
-
-
-def test_a_dose_that_does_not_arrive_is_the_operators_to_mend(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    lab.rig.world.well.ml = 1.0
-    monkeypatch.setattr(lab.rig.world.well, "add", lambda _volume_ml: None)  # the tube has come off
-    with pytest.raises(DoseLost, match="Look at the tube"):
-        lab.run()
-    assert not lab.presses
+    assert len(lab.presses) == 2
+    assert well.share > 0.45
+    dips = lab.state.results(DipResult)
+    assert all(dip.ink_level is not None and dip.ink_level >= 0.5 for dip in dips)
+    assert max(dip.dosed_ml or 0.0 for dip in dips) >= 1.0
 
 
 @pytest.mark.parametrize("watched", [False, True])

@@ -139,13 +139,10 @@ async def test_nobody_waits_for_a_viewer_that_does_not_read(live: LiveView) -> N
         live.close()  # whoever waits for this viewer waits for ever
 
 
-def test_it_listens_on_this_machine_only(live: LiveView) -> None:
+def test_it_listens_on_this_machine_only_and_a_port_that_is_taken_is_reported_in_one_line(live: LiveView) -> None:
     assert live.url == f"ws://127.0.0.1:{live.port}"
     with pytest.raises(ConnectionRefusedError):  # a port on every address would answer
         socket.create_connection(("127.0.0.2", live.port), PATIENCE_S)
-
-
-def test_a_port_that_is_taken_is_reported_in_one_line(live: LiveView) -> None:
     with pytest.raises(ConfigError, match=rf"--live: cannot listen on 127.0.0.1:{live.port}: .*in use") as caught:
         LiveView(port=live.port)
     assert caught.value.exit_code == 2

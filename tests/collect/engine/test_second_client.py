@@ -76,18 +76,30 @@ def assert_up_along_the_tool_first(sent: list[Pose]) -> None:
     assert lean(up)[0] == pytest.approx(10.0, abs=0.05)
 
 
-def test_an_arm_that_was_put_under_the_paper_in_a_pause_first_goes_up_along_its_tool(lab: Lab) -> None:
-    engine = lab.started()
+def test_an_arm_that_was_moved_in_a_pause_first_goes_up_along_its_tool_once_it_is_within_its_limits(lab: Lab) -> None:
+    lab.write_protocol("[11.0]", "[0.0]", repeats=3)
+    engine, sent = lab.started(on_screen=True), lines_sent(lab)
     pause_after(engine)
     second_client(lab, engine, UNDER)
-    sent = lines_sent(lab)
+    sent.clear()
     engine.resume()
+    pause_after(engine, 2)
+    assert_up_along_the_tool_first(sent)
+    [warning] = [line for line in engine.snapshot().messages if "from where it was left" in line]
+    assert warning.startswith("warning: ")
+
+    second_client(lab, engine, brush_pose(480.0, 40.0, 250.0, tilt_deg=60.0))
+    sent.clear()
+    engine.resume()
+    prompt = question(engine, "the arm stands where tilt = 60.000 deg")
+    assert "Jog the arm up" in prompt.question
+    assert not sent
+    second_client(lab, engine, UNDER)
+    sent.clear()
+    engine.answer(prompt.number, "g")
     wait_for_end(engine)
     assert_up_along_the_tool_first(sent)
-    now = engine.snapshot()
-    assert now.strokes_done == 2
-    [warning] = [line for line in now.messages if "from where it was left" in line]
-    assert warning.startswith("warning: ")
+    assert engine.snapshot().strokes_done == 3
 
 
 def test_an_arm_that_was_moved_at_a_question_first_goes_up_along_its_tool(lab: Lab) -> None:
@@ -140,23 +152,6 @@ def test_what_a_second_client_did_in_a_pause_is_asked_about_before_anything_move
     assert engine.snapshot().strokes_done == 4
     assert lab.rig.arcs.cabinet.tcp_offset[2] == 0.18
     assert max(press.depth_mm for press in lab.rig.world.presses) < 11.1, "none went deeper than asked"
-
-
-def test_an_arm_that_was_left_outside_its_limits_is_not_moved_until_it_is_jogged_back(lab: Lab) -> None:
-    engine = lab.started(on_screen=True)
-    pause_after(engine)
-    second_client(lab, engine, brush_pose(480.0, 40.0, 250.0, tilt_deg=60.0))
-    sent = lines_sent(lab)
-    engine.resume()
-    prompt = question(engine, "the arm stands where tilt = 60.000 deg")
-    assert "Jog the arm up" in prompt.question
-    assert not sent
-    second_client(lab, engine, UNDER)
-    sent.clear()
-    engine.answer(prompt.number, "g")
-    wait_for_end(engine)
-    assert_up_along_the_tool_first(sent)
-    assert engine.snapshot().strokes_done == 2
 
 
 def test_a_tool_offset_that_changes_after_the_last_look_leaves_a_void_and_no_stroke(lab: Lab) -> None:

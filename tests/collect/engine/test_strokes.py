@@ -21,7 +21,7 @@ from brushloop.collect.engine import capture as capturing
 from brushloop.collect.engine.capture import mark_of
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.recorder import RunContext, meanwhile
-from brushloop.collect.engine.snapshot import LastCapture, Progress
+from brushloop.collect.engine.snapshot import LastCapture
 from brushloop.collect.errors import BadPicture, CollectAborted, ConfigError, NeedsOperator, Parked, StepError
 from brushloop.collect.motion import Procedures, dip_moves, wash_moves
 from brushloop.collect.photograph.photographer import Photographer
@@ -41,20 +41,6 @@ from tests.runs import answered_alike, ended_by, until, wait_for_end
 
 
 @pytest.fixture
-def screen(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What the screen said was being done, one after the other."""
-    said: list[str] = []
-    doing = Progress.doing
-
-    def noted(self: Progress, what: str) -> None:
-        said.extend([what] if said[-1:] != [what] else [])
-        doing(self, what)
-
-    monkeypatch.setattr(Progress, "doing", noted)
-    return said
-
-
-@pytest.fixture
 def went(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """What the arm did, one after the other."""
     names: list[str] = []
@@ -70,10 +56,9 @@ def went(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return names
 
 
-def test_nobody_looks_at_the_paper_between_dip_and_press(sharp_lab: Lab, went: list[str], screen: list[str]) -> None:
+def test_nobody_looks_at_the_paper_between_dip_and_press(sharp_lab: Lab, went: list[str]) -> None:
     sharp_lab.run()
     assert went[went.index("dip") :] == ["dip", "press", "photograph"]
-    assert screen[screen.index("dip") :][:4] == ["dip", "check that the sheet is blank", "dip", "press H13-a0-r01"]
     [wait_s] = [made.press.dip_to_touch_s for made in sharp_lab.state.results(PressResult)]
     assert wait_s is not None
     assert wait_s > 0.0
@@ -83,14 +68,13 @@ def test_nobody_looks_at_the_paper_between_dip_and_press(sharp_lab: Lab, went: l
 
 
 def test_a_brush_that_waited_with_its_ink_dips_again(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch, went: list[str], screen: list[str]
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, went: list[str]
 ) -> None:
     """A pause between dip and press is as good as any length: every wait counts as too long here."""
     monkeypatch.setattr(brush_steps, "STALE_INK_S", 0.0)
     lab.write_protocol("[11.0]", "[0.0]")
     lab.run()
-    assert went.count("dip") == 2
-    assert screen[screen.index("press H11-a0-r01") :][:3] == ["press H11-a0-r01", "dip", "press H11-a0-r01"]
+    assert went[went.index("dip") :] == ["dip", "dip", "press", "photograph"]
 
 
 # The arm goes where the next dip begins; the decision on a photograph still comes before the dip

@@ -295,24 +295,19 @@ class Made:
 
 @pytest.fixture
 def made(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> list[Made]:
-    steps: list[Made] = []
-    at_work: list[Made] = []
+    steps, sent = list[Made](), list[Pose]()
     do = Run._do
 
     async def noted(self: Run, step: Step, context: StepContext) -> StepResult:
-        procedures = context.run.procedures
-        at_work.append(Made(step, context, procedures.plane, procedures._dips))
+        procedures, before = context.run.procedures, len(sent)
+        steps.append(one := Made(step, context, procedures.plane, procedures._dips))
         try:
             return await do(self, step, context)
         finally:
-            steps.append(at_work.pop())
-
-    def added(target: Pose) -> None:
-        for one in at_work:
-            one.sent.append(target)
+            one.sent = sent[before:]
 
     monkeypatch.setattr(Run, "_do", noted)
-    noting(lab.rig.world.motion, added)
+    noting(lab.rig.world.motion, sent.append)
     return steps
 
 

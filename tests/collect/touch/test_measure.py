@@ -89,13 +89,24 @@ async def test_touches_by_camera_lie_within_150_um_of_the_truth_at_3_sigma(
     assert abs(float(np.mean(errors))) < 0.03
 
 
-@pytest.mark.parametrize(("method", "deeper_mm"), [("force", 2.5), ("camera", 4.5)])
-async def test_nothing_within_the_travel_ends_with_the_brush_lifted(
-    make_bench: MakeBench, method: str, deeper_mm: float
+@pytest.mark.parametrize(
+    ("touch", "paper_z_mm", "said"),
+    [
+        ({"method": "force"}, 117.5, "nothing was touched down to"),
+        ({"method": "camera"}, 115.5, "nothing was touched down to"),
+        (
+            {"method": "camera", "points_mm": [(90.0, 4.0), (4.0, 4.0), (4.0, 40.0)]},
+            120.0,
+            r"do not fit on the sheet: spot \d+ would lie at",
+        ),
+    ],
+)
+async def test_what_cannot_be_touched_ends_with_the_brush_lifted(
+    make_bench: MakeBench, touch: dict[str, Any], paper_z_mm: float, said: str
 ) -> None:
-    bench = make_bench(paper_z_mm=120.0 - deeper_mm)
-    with pytest.raises(StepError, match="nothing was touched down to"):
-        await measured(bench, method=method, **PATCHES)
+    bench = make_bench(paper_z_mm=paper_z_mm)
+    with pytest.raises(StepError, match=said):
+        await measured(bench, **(PATCHES | touch))
     assert bench.lifted
     assert not bench.world.presses
 
@@ -132,13 +143,6 @@ async def test_an_arm_that_was_stopped_or_failed_is_left_where_it_is(
     with pytest.raises(type(error)):
         await measured(bench, method="force")
     assert not bench.lifted
-
-
-async def test_a_patch_that_does_not_fit_on_the_sheet_is_refused(make_bench: MakeBench) -> None:
-    bench = make_bench()
-    with pytest.raises(StepError, match=r"do not fit on the sheet: spot \d+ would lie at"):
-        await measured(bench, method="camera", points_mm=[(90.0, 4.0), (4.0, 4.0), (4.0, 40.0)])
-    assert bench.lifted
 
 
 class Operator(Asker):
