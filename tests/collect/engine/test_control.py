@@ -77,38 +77,26 @@ LATE_CAMERA = DeviceTimeout("camera", "fresh", "no new frame")
 
 
 @pytest.mark.parametrize(
-    ("step", "error", "failures", "action"),
+    ("step", "error", "failures", "action", "looked_at_first"),
     [
-        (PRESS, StepVoid("rests too high"), 1, Action.RETRY),
-        (PRESS, StepVoid("rests too high"), MAX_FAILURES, Action.ASK),
-        (PRESS, MotionFailed("robot", "moveLine", "out of reach"), 1, Action.ABORT),
-        (PRESS, RobotNotSafe("robot", "moveLine", "safety mode is ProtectiveStop"), 1, Action.ASK),
-        (PRESS, Stuck("force", 120.0, 24), 1, Action.ASK),
-        (PRESS, SheetFull(42, 1), 1, Action.ASK),
-        (PRESS, LATE_CAMERA, 1, Action.ABORT),
-        (CAPTURE, LATE_CAMERA, 1, Action.RETRY),
-        (CAPTURE, LATE_CAMERA, MAX_FAILURES, Action.ASK),
-        (CAPTURE, DeviceTimeout("robot", "getTcpPose", "no reply"), 1, Action.ABORT),
+        (PRESS, StepVoid("rests too high"), 1, Action.RETRY, False),
+        (PRESS, StepVoid("rests too high"), MAX_FAILURES, Action.ASK, False),
+        (PRESS, MotionFailed("robot", "moveLine", "out of reach"), 1, Action.ABORT, True),
+        (PRESS, RobotNotSafe("robot", "moveLine", "safety mode is ProtectiveStop"), 1, Action.ASK, True),
+        (PRESS, LimitExceeded("robot", "tilt on the way", 16.0, 0.0, 15.0, "deg"), 1, Action.ABORT, False),
+        (PRESS, Stuck("force", 120.0, 24), 1, Action.ASK, False),
+        (PRESS, ForceTooHigh(6.0, 5.0), 1, Action.ASK, True),
+        (PRESS, SheetFull(42, 1), 1, Action.ASK, False),
+        (PRESS, LATE_CAMERA, 1, Action.ABORT, False),
+        (CAPTURE, LATE_CAMERA, 1, Action.RETRY, False),
+        (CAPTURE, LATE_CAMERA, MAX_FAILURES, Action.ASK, False),
+        (CAPTURE, DeviceTimeout("robot", "getTcpPose", "no reply"), 1, Action.ABORT, True),
     ],
 )
-def test_motion_is_never_blindly_repeated(
-    step: Step, error: StepVoid | DeviceError, failures: int, action: Action
+def test_motion_is_never_blindly_repeated_and_an_arm_at_fault_not_lifted_before_a_person_has_looked(
+    step: Step, error: StepVoid | DeviceError, failures: int, action: Action, looked_at_first: bool
 ) -> None:
     assert decide(step, error, failures) is action
-
-
-@pytest.mark.parametrize(
-    ("error", "looked_at_first"),
-    [
-        (MotionFailed("robot", "moveLine", "out of reach"), True),
-        (DeviceTimeout("robot", "getTcpPose", "no reply"), True),
-        (ForceTooHigh(6.0, 5.0), True),
-        (LimitExceeded("robot", "tilt on the way", 16.0, 0.0, 15.0, "deg"), False),
-        (LATE_CAMERA, False),
-        (StepVoid("rests too high"), False),
-    ],
-)
-def test_an_arm_at_fault_is_not_lifted_before_a_person_has_looked(error: Exception, looked_at_first: bool) -> None:
     assert arm_at_fault(error) is looked_at_first
 
 

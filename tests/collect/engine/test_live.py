@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import asyncio
-import base64
-import contextlib
 import json
 import socket
 import struct
 import sys
-from collections.abc import AsyncIterator, Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from mcap.reader import make_reader
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from brushloop.collect import start
@@ -37,7 +36,7 @@ from tests.waiting import PATIENCE_S
 if TYPE_CHECKING:
     from tests.rigs import Lab
 
-pytest.importorskip("foxglove", reason="needs the extra [live]")
+foxglove = pytest.importorskip("foxglove", reason="needs the extra [live]")
 aiohttp = pytest.importorskip("aiohttp", reason="a viewer is made with it")
 
 
@@ -52,88 +51,56 @@ def live() -> Iterator[LiveView]:
     live.close()
 
 
-@dataclass
-class Viewer:
-    """Speaks as much of Foxglove's protocol as it takes to look on."""
-
-    socket: Any
-    """An `aiohttp.ClientWebSocketResponse`."""
-    channels: dict[int, dict[str, Any]] = field(default_factory=dict)
-    """What was advertised, and is subscribed to."""
-
-    async def next(self) -> tuple[dict[str, Any], int, bytes] | None:
-        """(channel, log time in ns, message) that comes next; None where it is word of another kind."""
-        message = await self.socket.receive(PATIENCE_S)
-        if message.type is aiohttp.WSMsgType.BINARY:
-            number, log_ns = struct.unpack_from("<IQ", message.data, 1)
-            return self.channels[number], log_ns, message.data[13:]
-        answer = json.loads(message.data)
-        if answer["op"] == "advertise":
-            self.channels |= {channel["id"]: channel for channel in answer["channels"]}
-            await self._subscribe(channel["id"] for channel in answer["channels"])
-        if answer["op"] == "status" and answer["message"].startswith("Unknown channel"):
-            # foxglove-sdk advertises a channel a moment before it can be subscribed to.
-            await self._subscribe([int(answer["message"].split()[-1])])
-        return None
-
-    async def _subscribe(self, numbers: Iterable[int]) -> None:
-        subscriptions = [{"id": number, "channelId": number} for number in numbers]
-        await self.socket.send_json({"op": "subscribe", "subscriptions": subscriptions})
-
-
-@contextlib.asynccontextmanager
-async def watching(port: int) -> AsyncIterator[Viewer]:
-    async with (
-        aiohttp.ClientSession() as client,
-        client.ws_connect(f"http://{HOST}:{port}", protocols=["foxglove.sdk.v1"]) as socket,
-    ):
-        yield Viewer(socket)
-
-
-async def test_a_viewer_sees_what_is_recorded_but_stills_and_small_jpegs_of_what_the_camera_sees(
-    live: LiveView,
+def test_a_viewer_sees_what_is_recorded_but_stills_and_small_jpegs_of_what_the_camera_sees(
+    live: LiveView, tmp_path: Path
 ) -> None:
+    """The SDK writes the same to a file as it sends to a viewer."""
     pose = Outgoing(Topic.TCP, 7, 7, 0, pose_message(7, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0)))
-    frame = Frame(Stamp(5), 5, np.full((1536, 2048), 200, np.uint8))
+    with foxglove.open_mcap(tmp_path / "seen.mcap", context=live._context):
+        live.offer(Outgoing(Topic.STILL, 7, 7, 0, image_message(7, b"", "png")))
+        live.offer(pose)
+        live.offer(wrench(7))
+        live.frame(Frame(Stamp(5), 5, np.full((1536, 2048), 200, np.uint8)))
+    with (tmp_path / "seen.mcap").open("rb") as file:
+        seen = {channel.topic: (schema, message) for schema, channel, message in make_reader(file).iter_messages()}
+    assert seen.keys() == {Topic.TCP, Topic.WRENCH, Topic.PREVIEW}
 
-    async def offered_again_and_again() -> None:
-        """As by a robot: a subscription takes effect at some time between two messages."""
-        while True:
-            live.offer(Outgoing(Topic.STILL, 7, 7, 0, image_message(7, b"", "png")))
-            live.offer(pose)
-            live.offer(wrench(7))
-            live.frame(frame)
-            await asyncio.sleep(0.02)
-
-    seen: dict[str, tuple[dict[str, Any], int, bytes]] = {}
-    async with watching(live.port) as viewer, alongside(offered_again_and_again(), "offers"):
-        while len(seen) < 3:
-            if (message := await viewer.next()) is not None:
-                seen[message[0]["topic"]] = message
-        assert {channel["topic"] for channel in viewer.channels.values()} == {Topic.TCP, Topic.WRENCH, Topic.PREVIEW}
-
-    channel, log_ns, data = seen[Topic.TCP]
-    assert (channel["schemaName"], log_ns) == ("foxglove.PoseInFrame", 7)
-    assert base64.b64decode(channel["schema"]) == build_file_descriptor_set(PoseInFrame).SerializeToString()
-    assert PoseInFrame.FromString(data) == pose.message
-    channel, log_ns, data = seen[Topic.WRENCH]
-    assert (channel["schemaName"], log_ns) == ("brushloop.Wrench", 7)
-    assert json.loads(channel["schema"]) == Wrench.model_json_schema()
-    assert Wrench.model_validate_json(data) == wrench(7).message
-    _, log_ns, data = seen[Topic.PREVIEW]
-    shown = CompressedImage.FromString(data)
+    schema, message = seen[Topic.TCP]
+    assert (schema.name, message.log_time) == ("foxglove.PoseInFrame", 7)
+    assert schema.data == build_file_descriptor_set(PoseInFrame).SerializeToString()
+    assert PoseInFrame.FromString(message.data) == pose.message
+    schema, message = seen[Topic.WRENCH]
+    assert (schema.name, message.log_time) == ("brushloop.Wrench", 7)
+    assert json.loads(schema.data) == Wrench.model_json_schema()
+    assert Wrench.model_validate_json(message.data) == wrench(7).message
+    _, message = seen[Topic.PREVIEW]
+    shown = CompressedImage.FromString(message.data)
     image = cv2.imdecode(np.frombuffer(shown.data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    assert (log_ns, shown.format) == (5, "jpeg")
+    assert (message.log_time, shown.format) == (5, "jpeg")
     assert image is not None
     assert image.shape == (768, 1024)
     assert abs(float(image.mean()) - 200.0) < 2.0
 
 
-async def test_nobody_waits_for_a_viewer_that_does_not_read(live: LiveView) -> None:
-    live.offer(wrench(0))
-    async with watching(live.port) as viewer:
-        while not viewer.channels:
-            await viewer.next()
+async def test_nobody_waits_for_a_viewer_that_looks_once_and_then_reads_no_more(live: LiveView) -> None:
+    async def offered_again_and_again() -> None:
+        """As by a robot: a subscription takes effect at some time between two messages."""
+        while True:
+            live.offer(wrench(7))
+            await asyncio.sleep(0.02)
+
+    channels: list[int] = []
+    async with (
+        aiohttp.ClientSession() as client,
+        client.ws_connect(f"http://{HOST}:{live.port}", protocols=["foxglove.sdk.v1"]) as viewer,
+    ):
+        async with alongside(offered_again_and_again(), "offers"):
+            while (message := await viewer.receive(PATIENCE_S)).type is not aiohttp.WSMsgType.BINARY:
+                channels += [channel["id"] for channel in json.loads(message.data).get("channels", [])]
+                # Again at every word: foxglove-sdk advertises a channel a moment before it can be subscribed to.
+                subscriptions = [{"id": number, "channelId": number} for number in channels]
+                await viewer.send_json({"op": "subscribe", "subscriptions": subscriptions})
+        assert struct.unpack_from("<Q", message.data, 5) == (7,), "the log time"
         for t_ns in range(40 * BACKLOG):
             live.offer(wrench(t_ns))
         live.close()  # whoever waits for this viewer waits for ever

@@ -253,6 +253,10 @@ def test_a_rig_in_order_is_reported_with_all_that_was_answered_and_left_as_it_wa
     assert all(line["took_ms"] > 0.0 for line in lines)
     assert lab.rig.arcs.cabinet.power.mode == "PowerOff"
     assert lab.rig.world.motion._next_id == 0
+    before = report.read_bytes()
+    again = brushloop("doctor", "--config", lab.folder / "rig.toml", "--report", report)
+    assert (again.returncode, report.read_bytes()) == (2, before), "an archive is never overwritten"
+    assert "is not overwritten" in again.stderr
 
 
 def test_names_addresses_and_paths_stay_in_the_lab(rig: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -270,14 +274,6 @@ def test_names_addresses_and_paths_stay_in_the_lab(rig: Path, monkeypatch: pytes
         assert secret not in scrubbed, scrubbed
     assert scrubbed.startswith("robot: connect: <host>:30004 as ")
     assert scrubbed.endswith("on <host>; 200 rounds/s, 0.1600 mm/px")
-
-
-def test_an_archive_is_never_overwritten(rig: Path, tmp_path: Path) -> None:
-    report = tmp_path / "report.zip"
-    report.write_bytes(b"mine")
-    ran = brushloop("doctor", "--config", rig, "--report", report)
-    assert (ran.returncode, report.read_bytes()) == (2, b"mine")
-    assert "is not overwritten" in ran.stderr
 
 
 def test_on_the_first_day_there_is_no_rig_yet_and_the_archive_holds_what_is_known(lab: Lab) -> None:
