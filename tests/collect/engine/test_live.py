@@ -10,7 +10,6 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -31,10 +30,8 @@ from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.messages import image_message, pose_message
 from brushloop.sessions.records import Topic, Wrench
 from brushloop.sessions.verify import verify_session
+from tests.rigs import Lab
 from tests.waiting import PATIENCE_S
-
-if TYPE_CHECKING:
-    from tests.rigs import Lab
 
 foxglove = pytest.importorskip("foxglove", reason="needs the extra [live]")
 aiohttp = pytest.importorskip("aiohttp", reason="a viewer is made with it")

@@ -4,25 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
 from brushloop.collect.engine.control import State
+from brushloop.collect.engine.engine import Engine
 from brushloop.collect.errors import CollectAborted
 from brushloop.drivers.arcs.controller import Controller
 from brushloop.drivers.arcs.motion import until_settled
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import MotionFailed, PathDisturbed, SettingsChanged
 from brushloop.drivers.geometry import brush_pose, from_wire, lean, to_wire
 from brushloop.sessions.events import PressResult
 from tests.collect.sent import noting
+from tests.rigs import Lab
 from tests.runs import ended_by, question, until, wait_for_end
-
-if TYPE_CHECKING:
-    from brushloop.collect.engine.engine import Engine
-    from brushloop.drivers.devices import Pose
-    from tests.rigs import Lab
-
 
 PAPER_Z_MM, SAFE_Z_MM = 120.0, 180.0
 UNDER = brush_pose(480.0, 40.0, PAPER_Z_MM - 20.0, tilt_deg=10.0)

@@ -1,30 +1,49 @@
-"""A plan is walked without a rig: limits, sheets, dips, ink, time, warnings; and the moves of a press and a figure."""
+"""A plan is walked without a rig: limits, sheets, dips, ink, time, warnings; `brushloop collect plan` shows it; and the
+moves of a press and a figure are those that it has checked."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import AsyncIterator, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
 
+import cv2
 import pytest
+from typer.testing import CliRunner
 
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.collect.cli import app
 from brushloop.collect.engine.recorder import StepContext
 from brushloop.collect.engine.run import Run
 from brushloop.collect.errors import ConfigError, StepVoid
 from brushloop.collect.motion import Path as MotionPath
 from brushloop.collect.motion import Procedures, inking_moves, stroke_moves
-from brushloop.collect.plan import make_plan, path_s
+from brushloop.collect.plan import draw_plan, make_plan, path_s
 from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
-from brushloop.collect.protocols.steps import MARKING, Drawn, PressStep, Step, StepKind
+from brushloop.collect.protocols.steps import MARKING, PressStep, Step, StepKind
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.rig.devices import Rig, limits_of
 from brushloop.collect.rig.paper import PaperPlane, Sheet
-from brushloop.collect.walk import StepMoves, all_poses, check_poses, check_protocol, moves_of, sheet_of, walk
+from brushloop.collect.walk import (
+    StepMoves,
+    all_poses,
+    ask_reach,
+    check_poses,
+    check_protocol,
+    moves_of,
+    sheet_of,
+    walk,
+)
+from brushloop.drivers.arcs.controller import RobotMode
 from brushloop.drivers.devices import Identity, Pose, QueuedLine
+from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import rig_toml
+from brushloop.drivers.sim.world import World
 from brushloop.sessions.events import StepResult
 from brushloop.sessions.records import Condition
 from tests.collect.sent import not_checked, not_sent, noting
@@ -134,7 +153,8 @@ def test_a_drawn_stroke_goes_through_its_points_at_its_depths(config: RigConfig)
     assert isinstance(again.step, PressStep)
     assert (draw.step.press.stroke_id, again.step.press.stroke_id) == ("shi-r01", "shi-r02")
     assert draw.step.press.condition.depth_mm == 9.0, "the deepest of its points"
-    moves = moves_of(config, PaperPlane(config.paper.touch_z_mm), draw.step, draw.patches)
+    plane = PaperPlane(config.paper.touch_z_mm)
+    moves = moves_of(config, plane, draw.step, draw.patches)
     ways = [part for part in moves.segments if isinstance(part, MotionPath)]
     drawn = draw.step.drawn
     assert drawn is not None
@@ -146,6 +166,8 @@ def test_a_drawn_stroke_goes_through_its_points_at_its_depths(config: RigConfig)
         (460.0 - patch.y_mm - y_mm, -110.0 + patch.x_mm + x_mm, config.paper.touch_z_mm - depth_mm)
     )
     assert moves.dips == 1
+    [(high, _), (clear, _), *_] = StepMoves(stroke_moves(config, plane, patch, drawn.strokes[1], 15.0)).poses
+    assert high.quaternion == pytest.approx(clear.quaternion), "the wrist turns where the brush is upright and high"
 
 
 def test_a_path_has_one_ramp(tmp_path: Path) -> None:
@@ -172,6 +194,115 @@ def test_a_self_check_takes_a_patch_before_the_first_stroke(tmp_path: Path) -> N
     small = small.model_copy(update={"paper": small.paper.model_copy(update={"cell_mm": (20.0, 24.0)})})
     with pytest.raises(ConfigError, match=r"rig.toml: paper.cell_mm: a triangle of 24 by 15 mm does not fit"):
         check_protocol(tmp_path / "rig.toml", EXAMPLES / "protocol.toml", small, example("protocol.toml"))
+
+
+# The command: tables, a picture, and the controller's word on reach
+
+
+@pytest.fixture
+def rig_path(config: RigConfig, tmp_path: Path) -> Path:
+    return tmp_path / "rig.toml"
+
+
+@pytest.fixture
+async def cabinet(rig_path: Path) -> AsyncIterator[ArcsServer]:
+    """One that listens where `rig.toml` says."""
+    server = ArcsServer(World(SimConfig(rate=20.0)))
+    await server.start("127.0.0.1", 0)
+    rig_path.write_text(RIG.replace("port = 30004\n", f"port = {server.port}\n"))
+    yield server
+    await server.stop()
+
+
+def plan(rig_path: Path, name: str, *options: str) -> str:
+    arguments = ["plan", "--config", str(rig_path), "--protocol", str(EXAMPLES / name), *options]
+    ran = CliRunner().invoke(app, arguments, catch_exceptions=False)
+    assert ran.exit_code == 0
+    return ran.stdout
+
+
+def test_a_plan_is_shown_as_tables_and_a_picture_that_cannot_be_made_is_refused_before_anything_else(
+    rig_path: Path,
+) -> None:
+    words = " ".join(plan(rig_path, "protocol.toml").split())
+    for expected in ("4 of 42 patches", "a fresh one before", "150 press", "not counting"):
+        assert expected in words
+    rig_path.write_text("[robot")  # is not even read
+    with pytest.raises(CalibrationError, match=r"plan\.xyz: must end in \.png or \.svg or \.pdf or \.jpg$") as refused:
+        plan(rig_path, "protocol.toml", "--picture", str(rig_path.with_name("plan.xyz")))
+    assert refused.value.exit_code == 2
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in EXAMPLES.glob("*.toml")))
+def test_every_example_passes_and_has_a_picture_whatever_its_names(rig_path: Path, tmp_path: Path, name: str) -> None:
+    path, config = tmp_path / "plan.png", load_rig(rig_path)
+    for each in EXAMPLES.glob("*.csv"):
+        (tmp_path / each.name).write_bytes(each.read_bytes())
+    # No font here has that character, and a dollar would begin a formula.
+    (tmp_path / name).write_text((EXAMPLES / name).read_text().replace('"shi"', '"永$x"'))
+    wanted = load_protocol(tmp_path / name)
+    check_protocol(rig_path, tmp_path / name, config, wanted)
+    plan = make_plan(config, wanted)
+    assert plan.seconds > 10.0
+    draw_plan(config, wanted, plan, path)
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    assert min(image.shape) > 400
+    assert image.std() > 10.0
+
+
+async def test_the_controller_is_asked_for_every_pose_and_nothing_is_powered_set_or_moved(
+    rig_path: Path, cabinet: ArcsServer
+) -> None:
+    config, asked = load_rig(rig_path), list[str]()
+    cabinet.cabinet.tcp_offset = [0.01, 0.0, 0.05, 0.0, 0.0, 0.4]  # another tool than ours is set there
+    for name, method in list(cabinet._methods.items()):
+        cabinet._methods[name] = lambda p, name=name, method=method: (asked.append(name), method(p))[1]
+    wanted = example("protocol-write.toml")
+    count = await ask_reach(rig_path, config, all_poses(config, wanted, PaperPlane(120.0)))
+    assert count > 40
+    names = {name.split(".")[-1] for name in asked}
+    assert names == {"getRobotNames", "getTcpOffset", "getJointPositions", "inverseKinematics"}
+    assert cabinet.cabinet.power.mode == RobotMode.POWER_OFF
+    assert cabinet.cabinet.tcp_offset[0] == 0.01
+
+
+async def test_the_first_pose_out_of_reach_of_our_tool_is_named_whatever_is_set_on_the_controller(
+    rig_path: Path, cabinet: ArcsServer
+) -> None:
+    """The same pose is as far away with either tool set; only a wrong conversion would bring it into reach."""
+    config, refused = load_rig(rig_path), list[str]()
+    row = [(brush_pose(x_mm, 0.0, 200.0), 10.0, f"{x_mm:.0f}") for x_mm in range(700, 1200, 20)]
+    for offset in ([0.0] * 6, [0.0, 0.0, 0.18, 0.0, 0.0, 0.0], [0.05, -0.1, 0.3, 0.0, 0.0, 1.0]):
+        cabinet.cabinet.tcp_offset = offset
+        with pytest.raises(ConfigError, match=r"paper: .* no joint solution for (\d+): x = \1") as caught:
+            await ask_reach(rig_path, config, row)
+        refused.append(str(caught.value))
+    assert refused == [refused[0]] * 3
+    cabinet._methods["rob1.RobotConfig.getTcpOffset"] = lambda _: [math.nan] * 6
+    with pytest.raises(ProtocolViolation, match="getTcpOffset: expected 6 finite numbers"):
+        await ask_reach(rig_path, config, row)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((), "rig.toml: no such file: `brushloop rig new`"),
+        (("--config", "p.toml"), "p.toml: is a protocol, not a rig: give it to --protocol"),
+        (("--config", "r.toml", "--protocol", "r.toml"), "r.toml: is a rig, not a protocol: give it to --config"),
+        (("--config", "r.toml"), "protocol.toml: no such file: choose another one"),
+    ],
+)
+@pytest.mark.parametrize("command", ["strokes", "plan"])
+def test_files_that_are_missing_or_swapped_are_named(
+    rig_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, arguments: tuple[str, ...], words: str
+) -> None:
+    rig_path.rename(rig_path.with_name("r.toml"))
+    rig_path.with_name("p.toml").write_text((EXAMPLES / "protocol.toml").read_text())
+    monkeypatch.chdir(rig_path.parent)
+    with pytest.raises(ConfigError) as refused:
+        CliRunner().invoke(app, [command, *arguments], catch_exceptions=False)
+    assert str(refused.value).startswith(words)
 
 
 # A press is believed where the brush was seen at its depth
@@ -238,25 +369,13 @@ async def test_a_press_that_was_not_seen_at_its_depth_is_void(config: RigConfig,
 PLANE = PaperPlane(120.0)
 
 
-def first_drawn(config: RigConfig) -> Drawn:
-    steps = (walked.step for walked in walk(config, example("protocol-write.toml")))
-    return next(step.drawn for step in steps if isinstance(step, PressStep) and step.drawn is not None)
-
-
 def test_a_stroke_may_come_down_on_its_way(config: RigConfig) -> None:
-    """Points above the paper: a flying start. The brush is as far above it as asked when the way begins."""
+    """Points above the paper: the brush is as far above it as asked when the way begins."""
     patch = sheet_of(config, example("protocol-write.toml")).patch(0)
     points = [(10.0, 10.0, -4.0, 3.0, 0.0), (20.0, 10.0, 5.0, 3.0, 0.0), (30.0, 10.0, -4.0, 3.0, 0.0)]
     *down, path, _, _ = (StepMoves([each]) for each in stroke_moves(config, PLANE, patch, points, 15.0))
     assert [move.poses[0][0].z_mm for move in down] == pytest.approx([180.0, 132.0, 132.0, 124.0])
     assert [pose.z_mm for pose, _ in path.poses] == pytest.approx([115.0, 124.0])
-
-
-def test_the_wrist_turns_where_the_brush_is_upright_and_high(config: RigConfig) -> None:
-    patch = sheet_of(config, example("protocol-write.toml")).patch(0)
-    moves = stroke_moves(config, PLANE, patch, first_drawn(config).strokes[1], 15.0)
-    [(high, _), (clear, _), *_] = StepMoves(moves).poses
-    assert high.quaternion == pytest.approx(clear.quaternion)
 
 
 # Every target that reaches the arm's queue is one that the plan has checked, for every kind of step
@@ -293,8 +412,8 @@ class Made:
     sent: list[Pose] = field(default_factory=list)
 
 
-@pytest.fixture
-def made(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> list[Made]:
+def noted_steps(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> list[Made]:
+    """Every step from here on."""
     steps, sent = list[Made](), list[Pose]()
     do = Run._do
 
@@ -311,13 +430,13 @@ def made(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> list[Made]:
     return steps
 
 
-def rounded(pose: Pose) -> tuple[float, ...]:
-    return tuple(round(v, 6) for v in (*pose.position_mm, *pose.quaternion))
+def rounded(poses: Iterable[tuple[Pose, ...]]) -> set[tuple[float, ...]]:
+    return {tuple(round(v, 6) for v in (*pose.position_mm, *pose.quaternion)) for pose, *_ in poses}
 
 
 @pytest.mark.parametrize("text", KINDS.values(), ids=KINDS)
-def test_what_a_run_sends_the_plan_has_checked(lab: Lab, made: list[Made], text: str) -> None:
-    rig_path, path = lab.folder / "rig.toml", lab.folder / "protocol.toml"
+def test_what_a_run_sends_the_plan_has_checked(lab: Lab, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+    rig_path, path, made = lab.folder / "rig.toml", lab.folder / "protocol.toml", noted_steps(lab, monkeypatch)
     lab.edit_rig("", EXTRAS)
     wanted, config = protocol(lab.folder, text), load_rig(rig_path)
     check_protocol(rig_path, path, config, wanted)
@@ -330,6 +449,5 @@ def test_what_a_run_sends_the_plan_has_checked(lab: Lab, made: list[Made], text:
         assert not not_checked(config, one.sent, [*planned.segments, *again]), one.step
         if one not in last:  # after the last capture the arm does not set out for a dip
             assert not not_sent(config, planned, one.sent), one.step
-        checked = {rounded(pose) for pose, _, _ in all_poses(config, wanted, one.plane)}
-        assert {rounded(pose) for pose, _ in planned.poses} <= checked, one.step
+        assert rounded(planned.poses) <= rounded(all_poses(config, wanted, one.plane)), one.step
     assert {one.step.kind for one in made} >= {StepKind.ZERO_TOUCH, StepKind.BOARD}

@@ -8,7 +8,6 @@ import json
 import re
 import zipfile
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
@@ -24,10 +23,7 @@ from brushloop.drivers.sim.faults import Device, Fault
 from brushloop.drivers.sim.rig import rig_toml
 from tests.command import brushloop
 from tests.drivers.arcs.test_rpc import Replayed
-
-if TYPE_CHECKING:
-    from tests.rigs import Lab
-
+from tests.rigs import Lab
 
 RIG = rig_toml(SimConfig())
 

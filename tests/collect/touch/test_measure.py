@@ -7,7 +7,7 @@ import math
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,10 +26,7 @@ from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import MotionFailed
 from brushloop.sessions.events import ZeroTouchResult
 from tests.collect.sent import not_checked, not_sent
-
-if TYPE_CHECKING:
-    from conftest import Bench, MakeBench
-
+from tests.collect.touch.conftest import Bench, MakeBench
 
 CORNERS = [(0.0, 0.0), (110.0, 0.0), (0.0, 80.0), (110.0, 80.0)]
 THREE: dict[str, Any] = {"points_mm": [(6.0, 4.0), (104.0, 4.0), (50.0, 76.0)]}

@@ -7,7 +7,6 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 from unittest.mock import AsyncMock
 
 import cv2
@@ -23,9 +22,7 @@ from brushloop.collect.rig.paper import Sheet, to_base
 from brushloop.collect.touch.selfcheck import LEGS_MM, Triangle, judge, partners, self_check, triangle_on
 from brushloop.drivers.devices import Pose
 from brushloop.sessions.events import SelfCheckResult
-
-if TYPE_CHECKING:
-    from conftest import Bench, MakeBench
+from tests.collect.touch.conftest import Bench, MakeBench
 
 PLACES: Triangle = ((12.0, 8.0), (100.0, 8.0), (12.0, 68.0))
 COMMANDED = np.array(PLACES)

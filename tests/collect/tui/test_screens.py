@@ -1,8 +1,12 @@
-"""The screens around and during a run: what they show as literal text, and what their keys do."""
+"""The operator's screens: what they show, as literal text, and what their keys do; and no arm is left unwatched:
+signals, lost terminals, defects of the screen."""
 
 from __future__ import annotations
 
+import functools
 import io
+import os
+import signal
 import subprocess
 import sys
 from contextlib import nullcontext
@@ -13,16 +17,181 @@ from typing import Any
 import numpy as np
 import pytest
 from textual.geometry import Region
+from textual.pilot import Pilot
 from textual.widget import Widget
 from textual.widgets import Static
 
-from brushloop.collect.engine.control import State
-from brushloop.collect.engine.snapshot import Picture
-from brushloop.collect.operator import Choice, Prompt
+from brushloop.collect.engine.control import FINAL, State
+from brushloop.collect.engine.snapshot import Picture, Snapshot
+from brushloop.collect.errors import CollectAborted, ConfigError
+from brushloop.collect.tui import run_screen, terminal
+from brushloop.collect.tui.app import OperatorApp, ScreenCrashed, run_app
 from brushloop.collect.tui.pictures import CellPicture, look_for_pixels, picture_widget
-from brushloop.collect.tui.run_screen import RunScreen
+from brushloop.collect.tui.run_screen import COMMAND_GOES_ON, GOES_ON, OVER, RunScreen
+from brushloop.collect.tui.terminal import TerminalDriver, _LostWrites
+from brushloop.collect.tui.widgets import SOFTWARE_STOP, AskScreen
 from brushloop.sessions.recording import remarks_of
-from tests.collect.tui.fake import FakeBrowser, FakeEngine, a_review, app_of, full_picture, picture, settled, watched
+from tests.collect.tui.fake import (
+    FAILED,
+    SPLIT,
+    FakeBrowser,
+    FakeEngine,
+    Watched,
+    a_review,
+    app_of,
+    full_picture,
+    picture,
+    settled,
+    watched,
+)
+from tests.waiting import until
+
+KEYS = ("space", "r", "k", "n", "j", "b")
+SPACE = {
+    **dict.fromkeys((State.IDLE, State.RECOVERING, State.RUNNING), "pause"),
+    **dict.fromkeys((State.PAUSING, State.PAUSED), "resume"),
+}
+"""What the space bar asks of the engine; nothing in the other states."""
+
+
+def asks(app: OperatorApp) -> bool:
+    return isinstance(app.screen, AskScreen) and app.screen.own
+
+
+async def test_in_every_state_of_a_run_stop_keys_stop_and_space_pauses_or_resumes_where_it_says_so() -> None:
+    async with watched(picture()) as run:
+        for state in sorted(set(State) - FINAL):
+            text = await run.look(picture(state=state))
+            run.engine.calls.clear()
+            await run.press("space", "s", "ctrl+c")
+            asked = [SPACE[state]] if state in SPACE else []
+            assert run.engine.calls == [*asked, "stop", "stop"], state
+            assert all(f"space {call.title()}" in text for call in asked), text
+
+
+@pytest.mark.parametrize("over", ["q", "question_mark", "enter", "prompt"])
+async def test_the_stop_key_stops_over_whatever_lies_on_the_screen(over: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(terminal, "STOP_SHOWN_S", 600.0)  # a busy machine looks late
+    async with watched(full_picture()) as run:
+        if over == "prompt":
+            await run.look(picture(state=State.ASKING, prompt=SPLIT))
+        else:
+            await run.press(over)
+        await run.look()
+        assert over == "question_mark" or not isinstance(run.app.screen, RunScreen)
+        await run.press("s")
+        assert run.engine.calls == ["stop"]
+        assert "STOP SENT" in await run.look()
+        await run.press("escape")
+        assert isinstance(run.app.screen, RunScreen) is (over != "prompt")
+
+
+async def test_requests_are_passed_on_and_shown_until_they_are_carried_out() -> None:
+    async with watched(picture()) as run:
+        for key, request in (("r", "RETAKE"), ("k", "SKIP"), ("n", "NEW_SHEET"), ("j", "JOG")):
+            run.engine.calls.clear()
+            assert "asked" not in await run.look(picture())
+            await run.press(key)
+            assert run.engine.calls == [f"request {request}"]
+            text = await run.look()
+            assert f"asked: {run.engine.now.requests[0]}" in text
+            assert "red button: emergency stop" in text
+
+
+@pytest.mark.parametrize("now", [picture(), picture(state=State.ASKING, prompt=SPLIT)], ids=["running", "asking"])
+async def test_q_asks_while_the_run_is_on_and_parks_before_it_leaves(now: Snapshot) -> None:
+    async with watched(now) as run:
+        for quit_key, no_key in (("q", "n"), ("ctrl+q", "escape")):
+            await run.press(quit_key, quit_key)
+            assert asks(run.app)
+            await run.press(no_key)
+            assert not asks(run.app)
+        assert run.engine.calls == []
+        await run.press("q", "y")
+        assert run.engine.calls == ["park"]
+        await until_over(run.pilot)
+    assert run.app.return_code == 0
+
+
+async def test_while_the_arm_is_being_stopped_q_asks_nothing_and_the_red_button_is_named() -> None:
+    async with watched(picture(state=State.STOPPING)) as run:
+        assert "not seen at rest yet: press the red button" in await run.look()
+        await run.press("q")
+        assert not asks(run.app)
+        assert run.engine.calls == []
+
+
+async def test_an_arm_that_was_not_seen_at_rest_is_never_said_to_rest() -> None:
+    unseen = replace(FAILED, rest_unknown=True, parked=False, target_mm=(0.0, 0.0, 0.0))
+    async with watched(unseen) as run:
+        assert SOFTWARE_STOP in await run.look(), "not how to go on"
+        await run.press("q")
+        text = await run.look()
+        assert "may still be moving" in text
+        assert "it rests where" not in text
+        await run.press("y")
+        assert not run.app.is_running
+
+
+async def test_a_key_that_bounces_after_an_answer_asks_for_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with watched(picture()) as run:
+        for number, bounce_s, then in ((3, 0.0, ["request SKIP"]), (4, 1e9, [])):
+            monkeypatch.setattr(run_screen, "BOUNCE_S", bounce_s)
+            run.engine.calls.clear()
+            await run.look(picture(state=State.ASKING, prompt=replace(SPLIT, number=number)))
+            await run.press("k")
+            await run.look(picture())
+            await run.press("k")
+            assert run.engine.calls == [f"answer {number} k", *then]
+
+
+@pytest.mark.parametrize("state", sorted(FINAL))
+async def test_what_is_over_can_only_be_left(state: State) -> None:
+    async with watched(picture(state=state, parked=True, target_mm=(0.0, 0.0, 0.0))) as run:
+        text = await run.look()
+        assert OVER in text
+        assert state.upper() in text
+        assert (COMMAND_GOES_ON in text) is (state is not State.DONE)
+        assert (SOFTWARE_STOP in text) is (state is State.DONE)
+        assert "s STOP" not in text
+        await run.press(*KEYS)
+        assert run.engine.calls == []
+        await run.press("q")
+        assert not run.app.is_running
+
+
+@pytest.mark.parametrize("outcome", ["resumes", "a refusal", "a signal"])
+async def test_enter_resumes_a_stopped_session_and_leaves_the_question_to_the_engine(outcome: str) -> None:
+    stopped: Any = FakeEngine(picture(state=State.STOPPED, folder="sessions/2026-11-21-grid-01"))
+    stopped.stop()
+    resumed = FakeEngine(picture())
+    asked: list[str] = []
+
+    def again(session_id: str) -> Any:
+        asked.append(session_id)
+        if outcome == "a refusal":
+            raise ConfigError("rig.toml", "", "goes on with no open session")
+        app.leaving = outcome == "a signal"  # which comes while files are read
+        return resumed
+
+    app = OperatorApp(again, stopped)
+    async with app.run_test(size=(80, 24)) as pilot:
+        text = await Watched(stopped, app, pilot).look()
+        assert "Resume the session" in text
+        assert GOES_ON in text
+        await pilot.press("enter")
+        await app.workers.wait_for_complete()
+        assert asked == ["2026-11-21-grid-01"]
+        assert stopped.calls == ["stop", "join"]
+        if outcome == "a refusal":
+            assert [note.message for note in app._notifications] == ["rig.toml: goes on with no open session"]
+        if outcome == "resumes":
+            assert "RUNNING" in await Watched(resumed, app, pilot).look()
+    assert resumed.calls == (["start"] if outcome == "resumes" else [])
+    assert app.engine is (resumed if outcome == "resumes" else stopped)
+
+
+# What is shown, and the screens around a run
 
 
 async def test_what_comes_from_outside_is_shown_as_it_is() -> None:
@@ -75,21 +244,13 @@ async def test_b_marks_the_last_capture_and_takes_it_back_while_the_run_is_on(tm
         assert not remarks_of(tmp_path)[last.still].bad
 
 
-PROMPT = Prompt(
-    "Sheet 1 is full. Put a fresh one in, then go on.",
-    (Choice("g", "sheet 2 is in, and blank"), Choice("x", "stop the run")),
-    "x",
-    number=7,
-)
-
-
 async def test_a_key_answers_the_question_that_is_shown_and_the_next_one_comes() -> None:
-    asking = picture(state=State.ASKING, step="wait for an answer", prompt=PROMPT)
+    asking = picture(state=State.ASKING, step="wait for an answer", prompt=SPLIT)
     async with watched(asking) as run:
         assert "Waits until it is answered" in await run.look()
         await run.press("z", "escape", "g")
-        assert [call for call in run.engine.calls if call.startswith("answer")] == ["answer 7 g"]
-        asking = replace(asking, prompt=replace(PROMPT, question="Is there ink?", number=8))
+        assert [call for call in run.engine.calls if call.startswith("answer")] == ["answer 3 g"]
+        asking = replace(asking, prompt=replace(SPLIT, question="Is there ink?", number=8))
         assert "Is there ink?" in await run.look(asking)
         assert "RUNNING" in await run.look(picture())
         assert isinstance(run.app.screen, RunScreen)
@@ -193,3 +354,67 @@ async def test_without_a_protocol_file_that_of_the_newest_session_is_taken(
     kept.touch()
     async with app_of(browser=FakeBrowser()).run_test(size=(120, 40)) as pilot:
         assert f"protocol {kept}" in await settled(pilot)
+
+
+# However the screen ends, the arm is stopped or parked
+
+
+def without_terminal(monkeypatch: pytest.MonkeyPatch, pilot: object) -> None:
+    monkeypatch.setattr(OperatorApp, "run", functools.partialmethod(OperatorApp.run, headless=True, auto_pilot=pilot))
+
+
+async def until_over(pilot: Pilot[None]) -> None:
+    await until(lambda: not pilot.app.is_running, "the end of the screen")
+
+
+@pytest.mark.parametrize(
+    ("number", "call"), [(signal.SIGTERM, "stop"), (signal.SIGINT, "stop"), (signal.SIGHUP, "park")]
+)
+def test_a_signal_stops_the_arm_a_lost_terminal_parks_it_and_both_end_the_screen(
+    number: int, call: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def send(pilot: Pilot[None]) -> None:
+        os.kill(os.getpid(), number)
+        await until_over(pilot)
+
+    without_terminal(monkeypatch, send)
+    engine = FakeEngine(picture())
+    before = signal.getsignal(number)
+    with pytest.raises(CollectAborted):
+        run_app(app_of(engine))
+    assert engine.calls == ["start", call, "join"]
+    assert signal.getsignal(number) == before
+
+
+def test_a_screen_that_breaks_stops_the_arm(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Broken(FakeEngine):
+        def snapshot(self):
+            if self.looks > 2:
+                raise ZeroDivisionError
+            return super().snapshot()
+
+    without_terminal(monkeypatch, until_over)
+    engine = Broken(picture())
+    with pytest.raises(ScreenCrashed):
+        run_app(app_of(engine))
+    assert engine.calls == ["start", "stop", "join"]
+    assert "ZeroDivisionError" in capsys.readouterr().err
+
+
+def test_a_lost_terminal_hurts_nobody_and_does_not_start_the_driver_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Gone(io.StringIO):
+        def write(self, _text: str) -> int:
+            raise OSError(5, "Input/output error")
+
+        def flush(self) -> None:
+            raise OSError(5, "Input/output error")
+
+    file = _LostWrites(Gone())
+    assert file.write("abc") == 3
+    file.flush()
+    started: list[str] = []
+    monkeypatch.setattr(TerminalDriver, "start_application_mode", lambda _driver: started.append("start"))
+    TerminalDriver.__new__(TerminalDriver).resume_application_mode()
+    assert started == []
