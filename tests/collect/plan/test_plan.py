@@ -170,12 +170,9 @@ def test_a_drawn_stroke_goes_through_its_points_at_its_depths(config: RigConfig)
     assert high.quaternion == pytest.approx(clear.quaternion), "the wrist turns where the brush is upright and high"
 
 
-def test_a_path_has_one_ramp(tmp_path: Path) -> None:
+def test_a_path_has_one_ramp_and_the_ink_of_a_plan_is_what_a_pump_doses(tmp_path: Path) -> None:
     start, *poses = (brush_pose(x_mm, 0.0, 200.0) for x_mm in (300.0, 310.0, 320.0))
     assert path_s(start, MotionPath(poses, 20.0), 800.0, limits_of(rig(tmp_path))) == pytest.approx(1.025)
-
-
-def test_the_ink_of_a_plan_is_what_a_pump_doses(tmp_path: Path) -> None:
     wanted = protocol(tmp_path, 'kind = "grid"\ndepths_mm = [11.0]\ntilts_deg = [0.0]\nrepeats = 12\n')
     assert make_plan(rig(tmp_path, text=PUMP), wanted).ink_ml == pytest.approx(2 * 0.3)
     assert make_plan(rig(tmp_path), wanted).ink_ml is None
