@@ -201,14 +201,6 @@ class Cabinet:
         )
         return ReturnCode.OK if added else ReturnCode.REQUEST_IGNORED
 
-    def move_joint(self, p: Params) -> int:
-        """Queue a move that is straight in joints."""
-        q = numbers("moveJoint", p["q"])
-        if (code := self._admit(p)) != ReturnCode.OK:
-            return code
-        added = self.motion.add_joints(tuple(q), p["v"], p["a"], self.now_s())
-        return ReturnCode.OK if added else ReturnCode.REQUEST_IGNORED
-
     def _admit(self, p: Params) -> int:
         """Return code for queueing a move: OK if it may be queued."""
         if (code := self._may_move()) != ReturnCode.OK:
@@ -251,7 +243,8 @@ def methods(cabinet: Cabinet) -> dict[str, Callable[[Params], Any]]:
     power, motion, now_s = cabinet.power, cabinet.motion, cabinet.now_s
     of_robot: dict[str, Callable[[Params], Any]] = {
         "MotionControl.moveLine": cabinet.move_line,
-        "MotionControl.moveJoint": cabinet.move_joint,
+        # A line to the same place: no driver here moves in joints.
+        "MotionControl.moveJoint": lambda p: cabinet.move_line({**p, "pose": cabinet.fk(p)[0]}),
         "MotionControl.stopLine": lambda p: cabinet.stop(p["acc"], p["acc_rot"]),
         "MotionControl.stopMove": lambda _: cabinet.hold(),
         "MotionControl.startMove": lambda _: cabinet.resume(),
@@ -280,7 +273,7 @@ def methods(cabinet: Cabinet) -> dict[str, Callable[[Params], Any]]:
         "RobotState.isPowerOn": lambda _: power.joint_state != "Poweroff",
         "RobotState.isSteady": lambda _: motion.steady(now_s()),
         "RobotState.getTcpPose": lambda _: to_wire(cabinet.configured(cabinet.world.tool())),
-        "RobotState.getJointPositions": lambda _: motion.joints(now_s()),
+        "RobotState.getJointPositions": lambda _: motion.near_joints(cabinet.world.tool()),
         "RobotState.getJointState": lambda _: [power.joint_state] * 6,
         "RobotAlgorithm.forwardKinematics": cabinet.fk,
         "RobotAlgorithm.inverseKinematics": cabinet.ik,

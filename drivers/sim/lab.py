@@ -23,8 +23,17 @@ from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL
 from brushloop.drivers.geometry import of_vector, product, turned, unit
 from brushloop.drivers.loopback import LoopbackServer, RigRefused
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
-from brushloop.drivers.sim.kinematics import Joints, inverse, matrix_of
-from brushloop.drivers.sim.lab_facts import CAMERA_PORTS, LIFT_MM, PICTURE_PX, PIN_TILT_DEG, Trap, draw, held, trapped
+from brushloop.drivers.sim.lab_facts import (
+    CAMERA_PORTS,
+    LIFT_MM,
+    PICTURE_PX,
+    PIN_TILT_DEG,
+    Trap,
+    draw,
+    held,
+    reaches,
+    trapped,
+)
 from brushloop.drivers.sim.rig import PORTS, LoopbackRig
 from brushloop.drivers.sim.scene import MjpegServer, Scene
 
@@ -32,6 +41,8 @@ HAND_MM, BY_EYE_MM = 0.3, 1.0
 """Standard deviation of a tip that touches a thing, and of one that is brought near it by eye, along each axis."""
 SEEN_SIGMAS = 2.5
 """A person sees errors beyond this many standard deviations, and corrects the part that is beyond."""
+GUIDED_MM_S, GUIDED_MM_S2 = 200.0, 800.0
+"""How fast a person guides the tip."""
 LOOK_S = 0.005
 PUSH_N, PUSH_S = 2.0, 1.0
 PUSHES = ((0.0, 0.0, -PUSH_N), (PUSH_N, 0.0, 0.0), (0.0, PUSH_N, 0.0))
@@ -240,19 +251,13 @@ class UnknownLab(LoopbackRig):
         The last stretch leads down, or along the brush; a place that the arm does not reach is passed over.
         """
         reached = self.world.tool()
-        near = self.world.motion.joints(self.world.clock.now_s())
         above = _withdrawn(aim) if along_brush else replace(aim, z_mm=aim.z_mm + LIFT_MM)
-        way: list[Joints] = []
-        for pose in (_withdrawn(reached), above, aim):
-            joints = inverse(matrix_of(pose) @ np.linalg.inv(self.world.motion.tool), near)
-            if joints is not None:
-                way.append(joints)
-                near, reached = joints, pose
         self.world.hand_guided = True
         try:
-            for joints in way:
-                now_s = self.world.clock.now_s()
-                self.world.motion.add_joints(joints, speed_rad_s=0.35, acc_rad_s2=1.0, now_s=now_s)
+            for pose in (_withdrawn(reached), above, aim):
+                if reaches(self.config, [pose]):
+                    self.world.motion.add(pose, GUIDED_MM_S, GUIDED_MM_S2, self.world.clock.now_s())
+                    reached = pose
             while self.world.target() is not None:
                 await asyncio.sleep(LOOK_S)
         finally:

@@ -17,13 +17,12 @@ import numpy as np
 
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import distance, interpolate
-from brushloop.drivers.sim.kinematics import HOME, Joints, Matrix, forward, inverse, matrix_of, pose_of
+from brushloop.drivers.sim.kinematics import HOME, Joints, Matrix, inverse, matrix_of, pose_of
 
 STEADY_LAG_S = 0.08
 """The controller reports steady a little after its queue is empty."""
 SAME_POSE_MM = 1e-4
 SAME_POSE_DEG = 1e-4
-SAME_JOINT_RAD = 1e-6
 RESTS_KEPT = 64
 SHORTEST_CUT = 1e-6
 CORNER_SHARE = 0.5
@@ -46,8 +45,6 @@ class Path:
     """Where the tip is after some of the length; the ends are exact."""
     angular: bool
     stretches: int = STRETCHES
-    joints: Callable[[float], Joints] | None = None
-    """The joints after some of the length; None where the path is not given in joints."""
 
 
 def line(start: Pose, end: Pose, travel_mm: float, turn_rad: float) -> Path:
@@ -77,19 +74,6 @@ def corner(a: Path, b: Path, cut: float) -> Path:
     return Path(2.0 * cut, pose, angular=False)
 
 
-def joint_line(start: Joints, end: Joints, tool: Matrix) -> Path:
-    """Straight in joints; its length is the angle of the joint that turns farthest."""
-    length = max(abs(a - b) for a, b in zip(start, end, strict=True))
-
-    def joints(done: float) -> Joints:
-        if done >= length - ROUNDING:
-            return end
-        share = max(done, 0.0) / length
-        return tuple(a + share * (b - a) for a, b in zip(start, end, strict=True))
-
-    return Path(length, lambda done: pose_of(forward(joints(done)) @ tool), angular=True, joints=joints)
-
-
 @dataclass(frozen=True, slots=True)
 class Piece:
     """A stretch of the whole path; a corner belongs to the move that it leads into."""
@@ -114,10 +98,6 @@ class Piece:
     def pose(self, along: float) -> Pose:
         """Where the tip is."""
         return self.path.pose(min(along, self.stop) - self.origin)
-
-    def joints(self, along: float) -> Joints | None:
-        """The joints; None where the path is not given in joints."""
-        return None if self.path.joints is None else self.path.joints(min(along, self.stop) - self.origin)
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,16 +207,6 @@ class MotionQueue:
         self._append(path, speed, acc_mm_s2 * unit, now_s, blend_mm)
         return True
 
-    def add_joints(self, joints: Joints, speed_rad_s: float, acc_rad_s2: float, now_s: float) -> bool:
-        """Append a straight move in joint space, from rest to rest; False if the queue already ends there."""
-        self.advance(now_s)
-        exact = self._pieces[-1].joints(self._pieces[-1].stop) if self._pieces else None
-        path = joint_line(exact or self.near_joints(self._last()), joints, self.tool)
-        if path.length <= SAME_JOINT_RAD:
-            return False
-        self._append(path, speed_rad_s, acc_rad_s2, now_s)
-        return True
-
     def advance(self, now_s: float) -> None:
         """Retire every piece that is over by `now_s`."""
         while len(self._knots) > 1 and self._knots[1].at_s <= now_s:
@@ -289,12 +259,6 @@ class MotionQueue:
         self.advance(now_s)
         return self._pieces[0].ident if self._pieces else -1
 
-    def joints(self, now_s: float) -> Joints:
-        """Joint positions for the present pose of the tip."""
-        self.advance(now_s)
-        exact = self._pieces[0].joints(self._at(now_s).along) if self._pieces else None
-        return exact or self.near_joints(self.pose(now_s))
-
     def near_joints(self, tip: Pose) -> Joints:
         """The joints for a tip pose, near the last known ones; the last known ones if no solution is found."""
         self.near = inverse(matrix_of(tip) @ np.linalg.inv(self.tool), self.near) or self.near
@@ -329,7 +293,6 @@ class MotionQueue:
             lengths: list[float] = np.linspace(piece.start, piece.stop, piece.path.stretches + 1).tolist()
             places = [piece.pose(along) for along in lengths]
             self._rest = places[-1]
-            self.near = piece.joints(piece.stop) or self.near
             for start, end in itertools.pairwise(places if piece.stop > piece.start else ()):
                 self._on_path(start, end)
 
