@@ -41,7 +41,7 @@ from brushloop.collect.tui.commission_app import CommissionApp
 from brushloop.collect.tui.review_screen import ReviewScreen
 from brushloop.collect.tui.start_screen import SessionBrowser, StartScreen
 from brushloop.collect.tui.widgets import AskScreen
-from brushloop.drivers.host import HostClock
+from brushloop.drivers.host import Clock
 from brushloop.drivers.sim.brush.footprint import Flaw
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.lab import UnknownLab
@@ -314,7 +314,7 @@ class _Person:
 
 
 async def _day(lab: UnknownLab, loop: asyncio.AbstractEventLoop) -> None:
-    visit, taken = Visit(Path("rig.toml"), HostClock(), armed=True), set[str]()
+    visit, taken = Visit(Path("rig.toml"), Clock(), armed=True), set[str]()
     app = CommissionApp(visit, lambda: Wizard(visit).run())
     async with app.run_test(size=DAY_SIZE) as pilot:
         person = _Person(app, pilot, lab, loop)

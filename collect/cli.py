@@ -109,9 +109,9 @@ def doctor(
     rig = load_rig(config)
 
     from brushloop.collect.rig.doctor import doctor_table, examine, write_report  # slow to import
-    from brushloop.drivers.host import HostClock
+    from brushloop.drivers.host import Clock
 
-    findings = asyncio.run(examine(rig, HostClock()))
+    findings = asyncio.run(examine(rig, Clock()))
     say(doctor_table(findings))
     if report is not None:
         asyncio.run(write_report(report, rig.model_dump(mode="json"), rig.robot, findings))
@@ -145,12 +145,12 @@ def _commission(rig: Path, step: str | None, *, arm: bool) -> None:
     from brushloop.collect.commission.visit import Visit
     from brushloop.collect.errors import ConfigError
     from brushloop.collect.tui.commission_app import run_commission
-    from brushloop.drivers.host import HostClock
+    from brushloop.drivers.host import Clock
 
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise ConfigError("rig", "", "a rig is taught on a screen: run this command in a terminal")
 
-    visit = Visit(rig, HostClock(), armed=arm)
+    visit = Visit(rig, Clock(), armed=arm)
 
     async def work() -> Path | None:
         from brushloop.collect.commission.wizard import Wizard

@@ -17,21 +17,13 @@ import sys
 import time
 from collections.abc import AsyncGenerator, Coroutine
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from filelock import FileLock, Timeout
 
 
-class Clock(Protocol):
-    """A source of nanoseconds since the epoch that never goes backwards."""
-
-    def now_ns(self) -> int:
-        """Nanoseconds since 1970-01-01 UTC; never less than the value returned before."""
-        ...
-
-
-class HostClock:
-    """Wall time read once, then carried forward by the monotonic clock.
+class Clock:
+    """Wall time read once, then carried forward by the monotonic clock: it never goes backwards.
 
     An NTP step or an operator who sets the clock during a session must not reorder a recording.
     """

@@ -290,7 +290,8 @@ class SceneCamera:
             await asyncio.sleep((due_ns - now_ns) / 1e9)
             if self._rig.faults.meet(Device.CAMERA) is None:
                 seq = 0 if self._newest is None else self._newest.stamp.seq + 1
-                self._newest = Frame(Stamp(due_ns, None, seq), due_ns - self._latency_ns, self._rig.scene.render())
+                image = self._rig.scene.render(self._rig.world.tool())
+                self._newest = Frame(Stamp(due_ns, None, seq), due_ns - self._latency_ns, image)
             elif due_ns - began_ns > self._table.timeout_s * 1e9:
                 raise DeviceTimeout("camera", "fresh", f"no valid new frame in {self._table.timeout_s:g} s")
         return self._newest
@@ -366,7 +367,7 @@ def wireless_lab(folder: Path, config: SimConfig = COARSE) -> Iterator[Lab]:
         patch.setattr("os.fsync", lambda _: None)
         patch.setattr("brushloop.collect.engine.engine.connected", rig.connected)
         patch.setattr(Engine, "new_event_loop", staticmethod(lambda: MemoryLoop(rig.time)))
-        patch.setattr("brushloop.collect.engine.engine.HostClock", lambda: rig.time)
+        patch.setattr("brushloop.collect.engine.engine.Clock", lambda: rig.time)
         patch.setattr(start, "REFRESH_S", 0.01)
         lab = Lab(rig, folder)
         yield lab

@@ -27,7 +27,7 @@ from brushloop.collect.rig.devices import Rig
 from brushloop.collect.walk import walk
 from brushloop.drivers.camera import CameraTable, OpenCvCamera
 from brushloop.drivers.devices import Stamp
-from brushloop.drivers.host import HostClock
+from brushloop.drivers.host import Clock
 from brushloop.drivers.ink.simulator import Well
 from brushloop.drivers.sim import scene
 from brushloop.drivers.sim.config import SimConfig
@@ -137,7 +137,7 @@ async def test_a_fault_is_a_kind_and_what_it_does(monkeypatch: pytest.MonkeyPatc
     recipe("fault").add()
     async with LoopbackRig(replace(BARE, table=SMALL_TABLE)) as rig:
         url = f"http://127.0.0.1:{rig.camera.port}/stream.mjpg"
-        camera = OpenCvCamera(CameraTable(kind="opencv", source=url), HostClock())
+        camera = OpenCvCamera(CameraTable(kind="opencv", source=url), Clock())
         await camera.connect()
         sound = (await camera.fresh(Stamp(time.time_ns()))).image
         rig.faults.hang(Fault(device=Device.CAMERA, kind="upside-down", count=ALWAYS))

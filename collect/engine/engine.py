@@ -37,7 +37,7 @@ from brushloop.collect.rig.devices import Rig, connected
 from brushloop.collect.walk import check_protocol, sheet_of
 from brushloop.drivers.devices import Frame
 from brushloop.drivers.errors import DeviceError, NotConnected, Stale
-from brushloop.drivers.host import Clock, HostClock
+from brushloop.drivers.host import Clock
 from brushloop.sessions.disk import check_writable
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.journal import JOURNAL_NAME, replay
@@ -304,4 +304,4 @@ def engine_for(opening: Opening) -> Engine:
     request, resume = opening.request, find_resumable(opening)
     check_protocol(request.config, request.protocol, opening.rig, opening.protocol)
     check_writable(resume or request.out)
-    return Engine(opening, resume, HostClock())
+    return Engine(opening, resume, Clock())

@@ -154,13 +154,12 @@ class Scene:
         config, view = self._world.config, self._world.config.view
         return _draw(config.table, config.seed, view.noise, (view.height_px, view.width_px))
 
-    def render(self, tool: Pose | None = None) -> NDArray[np.uint8]:
-        """A (height, width) gray image of the world now.
+    def render(self, tool: Pose) -> NDArray[np.uint8]:
+        """A (height, width) gray image of the world now, the tool at this pose; it may run in another thread.
 
-        Without `tool` it advances the world, as only the thread that owns the world may do; with it, it may run in
-        another thread. Do not write to the array: it is returned again while the picture does not change.
+        Do not write to the array: it is returned again while the picture does not change.
         """
-        tool, held = tool or self._world.tool(), self.held
+        held = self.held
         if self._shown != (self._world.version, held):
             self._shown = self._world.version, held
             self._lit = self._light_sheet() if held is None else self._light_board(held)

@@ -24,7 +24,7 @@ from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.devices import Identity, Pose
 from brushloop.drivers.errors import DeviceError, LimitExceeded
 from brushloop.drivers.geometry import distance
-from brushloop.drivers.host import HostClock
+from brushloop.drivers.host import Clock
 from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import HOST, rig_toml
@@ -87,7 +87,7 @@ def permission_refused(config: pytest.Config, rig: RigConfig, tests: int) -> str
 
 async def _look(rig: RigConfig) -> tuple[Identity, Pose, tuple[str, str]]:
     """Connect and ask; powers, sets and moves nothing."""
-    robot = make_robot(rig, HostClock(), lambda _text: None)
+    robot = make_robot(rig, Clock(), lambda _text: None)
     try:
         return await robot.connect(), await robot.where(), await robot.modes()
     finally:
@@ -187,7 +187,7 @@ def the_only_driver(rig: RigConfig) -> Iterator[None]:
 @pytest.fixture
 async def arm(rig: RigConfig, the_only_driver: None) -> AsyncIterator[AuboArcs]:
     """Connected; nothing was powered from here."""
-    robot = make_robot(rig, HostClock(), print)
+    robot = make_robot(rig, Clock(), print)
     try:
         await robot.connect()
         yield robot

@@ -21,7 +21,7 @@ from brushloop.drivers.arcs.wire import RpcConnection
 from brushloop.drivers.devices import Pose, PoseSample, QueuedLine
 from brushloop.drivers.errors import LimitExceeded, MotionError, NotConnected
 from brushloop.drivers.geometry import distance
-from brushloop.drivers.host import HostClock
+from brushloop.drivers.host import Clock
 from tests.contract.conftest import ACC_MM_S2, LIFT_MM, SLOW_MM_S, SPEED_MM_S, Enabled, raised
 
 GENTLY = {"speed_mm_s": SPEED_MM_S, "acc_mm_s2": ACC_MM_S2}
@@ -101,7 +101,7 @@ async def test_connecting_says_who_answers_and_with_closing_leaves_the_arm_where
 ):
     poses: list[Pose] = []
     for _ in range(2):
-        robot = make_robot(rig, HostClock(), print)
+        robot = make_robot(rig, Clock(), print)
         with pytest.raises(NotConnected):
             robot.latest()
         try:
@@ -188,7 +188,7 @@ async def test_lines_that_are_handed_over_as_one_are_carried_out_with_their_dwel
 async def test_closing_in_mid_move_leaves_no_motion(rig: RigConfig, enabled: Enabled):
     async with on_the_way_up(enabled):
         await enabled.robot.close()
-    other = make_robot(rig, HostClock(), print)
+    other = make_robot(rig, Clock(), print)
     try:
         await other.connect()
         stopped = await assert_still(other)

@@ -22,7 +22,7 @@ from brushloop.drivers.camera import CameraTable, Locked, OpenCvCamera, found_se
 from brushloop.drivers.camera.source import Capture, JpegStream, open_source
 from brushloop.drivers.devices import Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout
-from brushloop.drivers.host import HostClock
+from brushloop.drivers.host import Clock
 from brushloop.drivers.loopback import LoopbackServer
 from brushloop.drivers.sim.rig import HOST
 from brushloop.drivers.sim.scene import black, renumbered, torn
@@ -112,7 +112,7 @@ async def asked(camera: OpenCvCamera, feed: Feed) -> asyncio.Task[Any]:
 
 def camera_at(source: str, **more: Any) -> OpenCvCamera:
     table = {"kind": "opencv", "source": source, "timeout_s": 60.0, **more}
-    return OpenCvCamera(CameraTable.model_validate(table), HostClock())
+    return OpenCvCamera(CameraTable.model_validate(table), Clock())
 
 
 async def test_no_frame_is_older_than_asked_by_the_latency_and_the_first_is_as_old_as_the_connection(

@@ -21,7 +21,7 @@ from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout,
 from brushloop.drivers.force import sri_m8123
 from brushloop.drivers.force.simulator import CanFrame, ForceBoard
 from brushloop.drivers.force.sri_m8123 import ForceTable, RoundAssembler, SriM8123, Wrench, encode_round
-from brushloop.drivers.host import HostClock
+from brushloop.drivers.host import Clock
 from tests.waiting import until
 
 WRENCH: Wrench = (1.0, -2.0, 3.5, 0.25, -0.5, 0.125)
@@ -66,7 +66,7 @@ async def sensing(board: ForceBoard, stale_ms: float = 1e6) -> AsyncIterator[Sri
     """A sensor that is connected to the board."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(can, "Bus", lambda *_, **__: Bus(board))
-        sensor = SriM8123(TABLE.model_copy(update={"stale_ms": stale_ms}), HostClock())
+        sensor = SriM8123(TABLE.model_copy(update={"stale_ms": stale_ms}), Clock())
         await sensor.connect()
         yield sensor
         await sensor.close()
@@ -89,7 +89,7 @@ def readers() -> int:
 
 async def test_connecting_starts_the_board_and_closing_stops_it(board: ForceBoard, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(can, "Bus", lambda *_, **__: Bus(board))
-    sensor = SriM8123(TABLE, HostClock())
+    sensor = SriM8123(TABLE, Clock())
     identity = await sensor.connect()
     assert (identity.model, identity.simulated) == ("SRI M8123B2 on virtual a board", True)
     assert (sensor.latest().force_n, sensor.latest().torque_nm) == (WRENCH[:3], WRENCH[3:])
@@ -187,7 +187,7 @@ async def test_where_no_board_answers_or_no_adapter_is_there_connecting_says_so(
     interface: str, channel: str, ends: pytest.RaisesExc[DeviceError], monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(sri_m8123, "CONNECT_S", 0.2)
-    sensor = SriM8123(TABLE.model_copy(update={"interface": interface, "channel": channel}), HostClock())
+    sensor = SriM8123(TABLE.model_copy(update={"interface": interface, "channel": channel}), Clock())
     with ends:
         await sensor.connect()
     await sensor.close()

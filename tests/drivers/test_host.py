@@ -12,14 +12,14 @@ import pytest
 
 from brushloop.collect.errors import CameraLate, describe
 from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, Stale
-from brushloop.drivers.host import HostClock
+from brushloop.drivers.host import Clock
 from brushloop.drivers.ink.simulator import PtyLine, StationFirmware
 from brushloop.drivers.ink.station import InkStation, InkStationConfig
 from tests.waiting import until
 
 
 def test_the_host_clock_goes_on_when_wall_time_is_set_back(monkeypatch: pytest.MonkeyPatch):
-    clock = HostClock()
+    clock = Clock()
     before = clock.now_ns()
     hour_ago = time.time_ns() - 3600 * 10**9
     monkeypatch.setattr(time, "time_ns", lambda: hour_ago)
@@ -45,7 +45,7 @@ def test_what_comes_late_on_a_loaded_computer_says_so(late: type[Exception], mon
 
 
 def station_at(path: str) -> InkStation:
-    return InkStation(InkStationConfig(kind="ink-station", port=path, dose_ml=2.0, light=0.5), HostClock())
+    return InkStation(InkStationConfig(kind="ink-station", port=path, dose_ml=2.0, light=0.5), Clock())
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from brushloop.collect.engine.recorder import Recorder
 from brushloop.drivers.devices import PoseSample, Stamp
 from brushloop.drivers.geometry import Pose
-from brushloop.drivers.host import HostClock
+from brushloop.drivers.host import Clock
 from brushloop.sessions.events import PressResult
 from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.messages import image_message
@@ -39,7 +39,7 @@ def each(make):
         ),
     }
     outgoing = [Outgoing(topic, t_ns, t_ns, n, message) for n, (topic, message) in enumerate(messages.items())]
-    recorder = Recorder(SimpleNamespace(write=outgoing.append), HostClock())
+    recorder = Recorder(SimpleNamespace(write=outgoing.append), Clock())
     recorder.paper((400.0, -100.0, 5.0), (0.0, 0.0, 0.0, 1.0))
     recorder.log("brush is dry")
     pose = Pose(1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0)

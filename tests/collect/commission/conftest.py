@@ -18,7 +18,7 @@ from brushloop.collect.errors import CollectAborted
 from brushloop.collect.operator import Asker, Prompt
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.paper import to_base
-from brushloop.drivers.host import HostClock
+from brushloop.drivers.host import Clock
 from brushloop.drivers.sim.lab import UnknownLab
 from brushloop.drivers.sim.lab_facts import Trap
 from brushloop.drivers.sim.world import tool_of
@@ -39,7 +39,7 @@ class Person(Asker):
 
     def visit(self, rig_path: Path, *, armed: bool = False) -> Visit:
         """A visit that asks this person, who remembers what every visit showed."""
-        visit = Visit(rig_path, HostClock(), armed=armed)
+        visit = Visit(rig_path, Clock(), armed=armed)
         visit.asker, visit.findings = self, self.shown
         return visit
 

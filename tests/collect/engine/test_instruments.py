@@ -18,7 +18,7 @@ from brushloop.collect.motion import Procedures
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.devices import ForceSample, Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceError, MotionFailed, Stuck
-from brushloop.drivers.host import HostClock
+from brushloop.drivers.host import Clock
 from brushloop.drivers.ink.port import DoseLost
 from brushloop.drivers.sim import world
 from brushloop.drivers.sim.faults import Device, Fault
@@ -231,7 +231,7 @@ def delays_ms(ahead_ns: list[int], delays: list[int]) -> list[float]:
     The device's clock is this far ahead of the host's, and the samples took so many ms to arrive.
     """
     kept: list[Outgoing] = []
-    recorder = Recorder(cast(Any, SimpleNamespace(write=kept.append)), HostClock())
+    recorder = Recorder(cast(Any, SimpleNamespace(write=kept.append)), Clock())
     for number, (ahead, delay_ms) in enumerate(zip(ahead_ns, delays, strict=True)):
         taken_ns = 1_700_000_000 * SECOND + number * 10 * MS
         stamp = Stamp(taken_ns + delay_ms * MS, taken_ns + ahead, number)

@@ -15,7 +15,7 @@ from brushloop.collect.errors import ConfigError
 from brushloop.collect.protocols.steps import StepKind
 from brushloop.collect.tui.start_screen import SessionBrowser
 from brushloop.collect.walk import walk
-from brushloop.drivers.host import HostClock
+from brushloop.drivers.host import Clock
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import rig_toml
 from brushloop.sessions.events import CaptureResult, Condition, Press, PressResult
@@ -43,7 +43,7 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def begin(session_id: str = "grid-01") -> None:
     header = Header(session_id=session_id, source=Source.LOOPBACK, software="brushloop 0")
-    SessionStore.create(Path("sessions") / session_id, header, opening().snapshots, HostClock().now_ns).release()
+    SessionStore.create(Path("sessions") / session_id, header, opening().snapshots, Clock().now_ns).release()
 
 
 def opening(config: Path = Path("rig.toml"), **options: Any) -> Opening:
@@ -177,7 +177,7 @@ def test_a_sheet_stays_in_until_each_stroke_on_it_is_photographed() -> None:
 def test_open_sessions_are_listed_oldest_first_without_the_closed(lab: Path) -> None:
     for name in ("grid-00", "grid-02"):
         begin(name)
-    store = SessionStore(lab / "sessions" / "grid-01", HostClock().now_ns)
+    store = SessionStore(lab / "sessions" / "grid-01", Clock().now_ns)
     store.close()
     store.release()
     assert [folder.name for folder in open_sessions(lab / "sessions")] == ["grid-00", "grid-02"]

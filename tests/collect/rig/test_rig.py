@@ -17,7 +17,7 @@ from brushloop.collect.rig.check import check_rig, places_of
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.doctor import Scrubber, examine
 from brushloop.drivers.arcs.controller import SafetyMode
-from brushloop.drivers.host import HostClock
+from brushloop.drivers.host import Clock
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.faults import Device, Fault
 from brushloop.drivers.sim.rig import rig_toml
@@ -193,7 +193,7 @@ async def test_whatever_is_wrong_is_reported_with_a_remedy_and_every_other_devic
     lab.rig.faults.hang(Fault(device=Device.FORCE, kind="no-second", count=10_000))
     lab.edit_rig("DICT_5X5_1000", "DICT_4X4_1000")
     lab.rig.arcs.cabinet.safety_stop()
-    findings = await examine(load_rig(lab.folder / "rig.toml"), HostClock())
+    findings = await examine(load_rig(lab.folder / "rig.toml"), Clock())
     assert not any(finding.well for finding in findings)
     problems = ("board corners found", "no whole round", "no reply", "ProtectiveStop")
     remedies = ("into view", "wiring", "", "pendant")

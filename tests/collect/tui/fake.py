@@ -32,7 +32,7 @@ from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.commission_app import CommissionApp
 from brushloop.collect.tui.review_screen import Review, ReviewCapture, ReviewScreen
 from brushloop.collect.tui.start_screen import SessionBrowser
-from brushloop.drivers.host import HostClock
+from brushloop.drivers.host import Clock
 from brushloop.model.fitted import FittedPress
 from brushloop.sessions.events import CaptureResult, Press
 from brushloop.sessions.records import Check, Condition, Header, Source
@@ -368,7 +368,7 @@ class Asking:
     def __init__(self, *questions: Callable[[Visit], Awaitable[object]]) -> None:
         self.questions = questions
         self.answers: list[object] = []
-        self.visit = Visit(Path("rig.toml"), HostClock(), armed=False)
+        self.visit = Visit(Path("rig.toml"), Clock(), armed=False)
         self.app = CommissionApp(self.visit, self)
 
     async def __call__(self) -> None:

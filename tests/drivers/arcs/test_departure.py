@@ -50,7 +50,7 @@ async def test_what_is_configured_is_set_in_the_wires_units_and_a_brush_askew_on
     assert box.tcp_offset == pytest.approx([0.004, -0.007, 0.18, math.radians(2.0), math.radians(-1.5), 0.0])
     assert (box.power.mode, box.world.tool()) == (RobotMode.RUNNING, before), "nothing has moved"
     await arm.move(NEAR, **QUICK)
-    joints = box.motion.joints(box.now_s())
+    joints = box.motion.near_joints(cabinet.tool)
     flange = from_wire(box.fk({"q": [*joints]})[0])
     assert distance(flange, NEAR)[0] < 0.1
     assert lean(pose_of(forward(joints)))[0] == pytest.approx(2.5, abs=0.05)

@@ -200,8 +200,9 @@ async def test_a_person_breaks_the_rig_sees_its_state_and_mends_it(rig: Loopback
 
 def test_corners_of_the_board_lie_where_the_optics_say_through_a_lens_that_distorts():
     config = SimConfig(view=BENT_VIEW)
-    table, scene = config.table, Scene(World(config))
-    corners, ids, _, _ = cv2.aruco.CharucoDetector(board(table)).detectBoard(scene.render())
+    table, world = config.table, World(config)
+    scene = Scene(world)
+    corners, ids, _, _ = cv2.aruco.CharucoDetector(board(table)).detectBoard(scene.render(world.tool()))
     on_board = np.array(board(table).getChessboardCorners(), np.float64)[ids.ravel().astype(np.intp), :2]
     left, bottom = table.board_origin_mm
     height_mm = table.board_squares[1] * table.board_square_mm
