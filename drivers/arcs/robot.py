@@ -13,7 +13,7 @@ from collections.abc import AsyncGenerator, Callable, Sequence
 
 from brushloop.drivers.arcs.controller import LOOPBACK_CONTROL_BOX, Controller, RobotMode
 from brushloop.drivers.arcs.motion import POLL_S, OwnPath, arrived, as_sent, durations_s, feed, queue_all, until_settled
-from brushloop.drivers.arcs.settings import ArcsTable, Settings, make_ready, power_on, read_back, require_same
+from brushloop.drivers.arcs.settings import ArcsTable, Settings, make_ready, power_on, read_back
 from brushloop.drivers.arcs.stopping import Stopper
 from brushloop.drivers.arcs.telemetry import Telemetry
 from brushloop.drivers.arcs.wire import DEVICE, open_arcs
@@ -208,7 +208,7 @@ class AuboArcs:
         await self._motion.require_safe(op)
         if await self._motion.mode() != RobotMode.RUNNING:
             raise NotPowered(DEVICE, op)
-        require_same(op, settings, current)
+        current.require(op, settings)
 
     async def _resting(self, op: str) -> Pose:
         """Where the arm rests. Raises `ArmMoved` if it moves, `RobotNotSafe` if a safety stop holds its path."""
@@ -278,14 +278,11 @@ class AuboArcs:
                     if under_way:
                         raise
         finally:
-            await self._hang_up()
-
-    async def _hang_up(self) -> None:
-        await self._telemetry.stop()
-        for controller in (self._motion, self._stop, self._state):
-            await controller.close()
-        self._connected = self._enabled = False
-        self._settings = None
+            await self._telemetry.stop()
+            for controller in (self._motion, self._stop, self._state):
+                await controller.close()
+            self._connected = self._enabled = False
+            self._settings = None
 
     async def _ready(self) -> None:
         """Before each motion, make sure that it can be stopped and that the controller does not hold its path."""

@@ -78,15 +78,19 @@ class Settings:
             "operational mode": self.operational_mode,
         }
 
-    def same(self, other: Settings) -> tuple[bool, ...]:
-        """Whether each setting is the same, in the order of `words`."""
-        return (
-            max(distance(self.tool, other.tool)) <= TOLERANCE,  # one rotation has several sets of angles
-            math.dist(self.payload, other.payload) <= TOLERANCE,
-            abs(self.collision_level - other.collision_level) <= TOLERANCE,
-            abs(self.speed_fraction - other.speed_fraction) <= TOLERANCE,
-            self.operational_mode == other.operational_mode,
+    def require(self, op: str, wanted: Settings) -> None:
+        """Raise `SettingsChanged` naming every setting that is not as wanted."""
+        same = (
+            max(distance(self.tool, wanted.tool)) <= TOLERANCE,  # one rotation has several sets of angles
+            math.dist(self.payload, wanted.payload) <= TOLERANCE,
+            abs(self.collision_level - wanted.collision_level) <= TOLERANCE,
+            abs(self.speed_fraction - wanted.speed_fraction) <= TOLERANCE,
+            self.operational_mode == wanted.operational_mode,
         )
+        settings = zip(self.words().items(), wanted.words().values(), same, strict=True)
+        changes = [f"{name} is {now}, not {before}" for (name, now), before, unchanged in settings if not unchanged]
+        if changes:
+            raise SettingsChanged(DEVICE, op, "; ".join(changes))
 
 
 def _figures(number: float) -> str:
@@ -109,14 +113,6 @@ async def read_back(controller: Controller) -> Settings:
     [fraction] = await controller.ask_numbers("MotionControl.getSpeedFraction", 1)
     mode = str(await controller.ask("RobotManage.getOperationalMode"))
     return Settings(from_wire(offset), (mass_kg, *(1e3 * v for v in centre_m)), level, fraction, mode)
-
-
-def require_same(op: str, wanted: Settings, current: Settings) -> None:
-    """Raise `SettingsChanged` naming every setting that was found different."""
-    names = zip(current.words().items(), wanted.words().values(), current.same(wanted), strict=True)
-    changes = [f"{name} is {now}, not {before}" for (name, now), before, same in names if not same]
-    if changes:
-        raise SettingsChanged(DEVICE, op, "; ".join(changes))
 
 
 async def make_ready(controller: Controller, table: ArcsTable) -> Settings:
@@ -147,7 +143,7 @@ async def make_ready(controller: Controller, table: ArcsTable) -> Settings:
     for method, params in commands.items():
         accepted(method, await controller.ask(f"RobotConfig.{method}", **params))
     settings = await read_back(controller)
-    require_same("power on", wanted, settings)
+    settings.require("power on", wanted)
     return settings
 
 

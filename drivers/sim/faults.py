@@ -48,27 +48,6 @@ class Phase(StrEnum):
     """At rest anywhere else."""
 
 
-def phase_of(world: World) -> Phase:
-    """What the arm does now. Use it in the thread that owns the world."""
-    tip, to = world.tool(), world.target()
-    x_mm, y_mm, depth_mm = world.on_sheet(tip)
-    end_depth_mm = depth_mm if to is None else world.on_sheet(to)[2]
-    over_sheet = world.is_over_sheet(x_mm, y_mm)
-    if world.is_over_well(x_mm, y_mm) and max(depth_mm, end_depth_mm) > -world.config.table.well_depth_mm:
-        return Phase.DIPPING
-    if to is None:
-        if over_sheet and depth_mm >= -ON_PAPER_MM:
-            return Phase.PRESSED
-        return Phase.PARKED if math.dist(tip.position_mm, world.config.home_mm) <= HOME_MM else Phase.RESTING
-    if over_sheet and depth_mm > 0.0 and 0.0 <= end_depth_mm - depth_mm <= ALL_BUT_THERE_MM:
-        return Phase.PRESSED
-    if over_sheet and end_depth_mm > depth_mm and end_depth_mm >= -ON_PAPER_MM:
-        return Phase.DESCENDING
-    if over_sheet and end_depth_mm < depth_mm and depth_mm >= -LIFT_MM:
-        return Phase.LIFTING
-    return Phase.TRAVELLING
-
-
 ALWAYS = 1_000_000
 """A count that no session reaches."""
 
@@ -186,8 +165,25 @@ class FaultBoard:
         """Of all faults so far."""
 
     def phase(self) -> Phase:
-        """What the arm does now."""
-        return phase_of(self._world)
+        """What the arm does now. Use it in the thread that owns the world."""
+        world = self._world
+        tip, to = world.tool(), world.target()
+        x_mm, y_mm, depth_mm = world.on_sheet(tip)
+        end_depth_mm = depth_mm if to is None else world.on_sheet(to)[2]
+        over_sheet = world.is_over_sheet(x_mm, y_mm)
+        if world.is_over_well(x_mm, y_mm) and max(depth_mm, end_depth_mm) > -world.config.table.well_depth_mm:
+            return Phase.DIPPING
+        if to is None:
+            if over_sheet and depth_mm >= -ON_PAPER_MM:
+                return Phase.PRESSED
+            return Phase.PARKED if math.dist(tip.position_mm, world.config.home_mm) <= HOME_MM else Phase.RESTING
+        if over_sheet and depth_mm > 0.0 and 0.0 <= end_depth_mm - depth_mm <= ALL_BUT_THERE_MM:
+            return Phase.PRESSED
+        if over_sheet and end_depth_mm > depth_mm and end_depth_mm >= -ON_PAPER_MM:
+            return Phase.DESCENDING
+        if over_sheet and end_depth_mm < depth_mm and depth_mm >= -LIFT_MM:
+            return Phase.LIFTING
+        return Phase.TRAVELLING
 
     def hang(self, fault: Fault) -> int:
         """Add a fault; return the number by which it can be removed."""

@@ -11,7 +11,7 @@ import pytest
 from brushloop.drivers.arcs.controller import Controller, ReturnCode, RobotMode, SafetyMode
 from brushloop.drivers.arcs.motion import until_settled
 from brushloop.drivers.arcs.robot import AuboArcs
-from brushloop.drivers.arcs.settings import Settings, require_same
+from brushloop.drivers.arcs.settings import Settings
 from brushloop.drivers.errors import (
     ArmMoved,
     MotionError,
@@ -203,7 +203,7 @@ def test_a_tool_that_is_read_back_in_other_angles_is_the_same_tool_and_one_turne
         offset = from_wire([0.0, 0.0, 0.18, *map(math.radians, turn_deg)])
         return Settings(offset, (0.0,) * 4, 6.0, 1.0, "Automatic")
 
-    require_same("enable", tool(180.0, 0.0, 0.0), tool(-180.0, 0.0, 0.0))
-    require_same("enable", tool(180.0, 0.0, 30.0), tool(0.0, 180.0, -150.0))
+    tool(-180.0, 0.0, 0.0).require("enable", tool(180.0, 0.0, 0.0))
+    tool(0.0, 180.0, -150.0).require("enable", tool(180.0, 0.0, 30.0))
     with pytest.raises(SettingsChanged, match=r"\(-179\.99, 0, 0\) deg, not .*\(-?180, 0, 0\)"):
-        require_same("enable", tool(180.0, 0.0, 0.0), tool(-179.99, 0.0, 0.0))
+        tool(-179.99, 0.0, 0.0).require("enable", tool(180.0, 0.0, 0.0))

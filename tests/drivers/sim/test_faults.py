@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from brushloop.drivers.sim import faults
 from brushloop.drivers.sim.faults import FaultBoard, Phase, fault_of
 
 
@@ -17,7 +16,7 @@ def world(monkeypatch: pytest.MonkeyPatch) -> Any:
     """As much of a world as the board looks at: its presses, its clock, and what the arm is doing."""
     world = SimpleNamespace(at_s=0.0, doing=Phase.PARKED, presses=[])
     world.clock = SimpleNamespace(real_s=lambda: world.at_s)
-    monkeypatch.setattr(faults, "phase_of", lambda world: world.doing)
+    monkeypatch.setattr(FaultBoard, "phase", lambda _: world.doing)
     return world
 
 
