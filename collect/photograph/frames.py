@@ -111,22 +111,22 @@ class Frames:
     def __init__(self, reference: Thumbnail | None) -> None:
         self._reference = reference
         self._before: Thumbnail | None = None
-        self._waiting: tuple[Callable[[View], bool], float, asyncio.Future[View | None]] | None = None
-        """What a caller waits for, until when, and its answer."""
-        self._failure: Exception | None = None
+        self._next: asyncio.Future[View] = asyncio.get_running_loop().create_future()
+        """The view that comes next, or why none does."""
         self.seen: Series = []
         """Of every frame so far: arrival, and how far it differs from the reference, 0 to 1."""
 
     async def first(self, wanted: Callable[[View], bool], *, within_s: float) -> View | None:
         """The first frame from now on that is wanted; None if none is within `within_s`.
 
-        One caller waits at a time, and is shown every frame. Raises `DeviceError` if no frame comes.
+        Raises `DeviceError` if no frame comes.
         """
-        if self._failure is not None:
-            raise self._failure
         loop = asyncio.get_running_loop()
-        self._waiting = wanted, loop.time() + within_s, (answer := loop.create_future())
-        return await answer
+        until_s = loop.time() + within_s
+        while not wanted(view := await asyncio.shield(self._next)):
+            if loop.time() > until_s:
+                return None
+        return view
 
     async def follow(self, camera: Camera) -> None:
         """Take frame after frame, until cancelled or the camera fails."""
@@ -135,22 +135,14 @@ class Frames:
             while True:
                 frame = await camera.fresh(after)
                 after = Stamp(frame.exposed_after_ns + 1)
-                self._show(await asyncio.to_thread(self._view, frame))
+                view = await asyncio.to_thread(self._view, frame)
+                self._before = view.small
+                self.seen.append((frame.stamp.host_ns / 1e9, view.changed))
+                self._next.set_result(view)
+                self._next = asyncio.get_running_loop().create_future()
         except Exception as error:
-            self._failure = error
-            if self._waiting is not None and not self._waiting[2].done():
-                self._waiting[2].set_exception(error)
-
-    def _show(self, view: View) -> None:
-        self._before = view.small
-        self.seen.append((view.frame.stamp.host_ns / 1e9, view.changed))
-        if self._waiting is None or self._waiting[2].done():
-            return
-        wanted, until_s, answer = self._waiting
-        if wanted(view):
-            answer.set_result(view)
-        elif asyncio.get_running_loop().time() > until_s:
-            answer.set_result(None)
+            self._next.set_exception(error)
+            self._next.exception()  # whoever looks at no frame need not know it
 
     def _view(self, frame: Frame) -> View:
         small = thumbnail(frame.image)
