@@ -274,9 +274,13 @@ def all_poses(rig: RigConfig, protocol: ProtocolConfig, plane: PaperPlane) -> It
     """Everything that the protocol can command over this plane, taught or measured by touch, on every patch."""
     parked, sheet = park_move(rig), sheet_of(rig, protocol)
     yield parked.target, parked.speed_mm_s, "park"
-    distinct: dict[object, Step] = {}
+    distinct: dict[object, Step] = {}  # by all that the moves of a step depend on
     for walked in walk(rig, protocol):
-        distinct.setdefault((walked.step.kind, _moved(walked.step)), walked.step)
+        step = replace(walked.step, index=0)
+        if isinstance(step, PressStep | CaptureStep):
+            distinct.setdefault((step.kind, step.press.condition, repr(step.drawn)), step)
+        else:
+            distinct.setdefault(step, step)
     for step in distinct.values():
         if step.kind not in MARKING:
             yield from step_poses(rig, plane, step)
@@ -294,17 +298,6 @@ def step_poses(rig: RigConfig, plane: PaperPlane, step: Step, patches: Sequence[
     # Assume that a wash is due: when one is due depends on the step at which the process starts.
     dips = 0 if rig.ink.wash is None else rig.ink.wash.every_dips - 1
     yield from ((pose, speed, where) for pose, speed in moves_of(rig, plane, step, patches, dips=dips).poses)
-
-
-def _moved(step: Step) -> object:
-    """What the moves of a step depend on, beside its kind: steps alike in this are checked once."""
-    match step:
-        case PressStep(press=press, drawn=drawn):
-            return press.condition if drawn is None else repr(drawn)
-        case CaptureStep():
-            return None
-        case _:
-            return replace(step, index=0)
 
 
 async def ask_reach(rig_path: Path, config: RigConfig, poses: Iterable[PlannedPose]) -> int:
