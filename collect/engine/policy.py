@@ -122,15 +122,7 @@ Fact = tuple[str, str, bool | None]
 
 def accept_question(result: StepResult, config: RigConfig) -> Prompt:
     """Ask whether the result is good enough. The default is to stop: nothing goes on without an answer."""
-    match result:
-        case BoardResult():
-            facts = list(_board(result, config))
-        case ZeroTouchResult():
-            facts = list(_touch(result, config))
-        case SelfCheckResult():
-            facts = list(_self_check(result, config))
-        case _:
-            facts = []
+    facts = list(_facts(result, config))
     good = all(within is not False for _name, _value, within in facts)
     verdict = f"{TITLES[result.kind]}: " + ("all within limits." if good else "not everything is within limits.")
     lines = [f"{SIGNS[within]} {name:<{NAME}} {value}" for name, value, within in facts]
@@ -145,42 +137,41 @@ def _within(name: str, value: float, limit: float, shown: str) -> Fact:
     return name, f"{shown}  (at most {limit:g})", abs(value) <= limit
 
 
-def _board(result: BoardResult, config: RigConfig) -> Iterator[Fact]:
-    delay_ms, jitter_ms = result.camera_delay_ms, result.camera_jitter_ms
-    yield "corners found", str(result.corners), None
-    yield "scale (pix2len)", f"{result.mm_per_px:.4f} mm/px", None
-    yield _within("residual of corners", result.rms_px, WORST_RMS_PX, f"{result.rms_px:.2f} px")
-    if delay_ms is not None and jitter_ms is not None:
-        yield _within("delay of the camera", delay_ms, config.camera.max_delay_ms, f"{delay_ms:.0f} ms")
-        yield _within("the delay varies by", jitter_ms, config.camera.max_jitter_ms, f"{jitter_ms:.0f} ms")
-    for check in result.checks:
-        name = {"blurred": "blur of edges", "exposure": "paper's brightness"}.get(check.name, check.name)
-        yield name, f"{check.score:.3g} {check.unit}  (limit {check.threshold:g})", check.passed
-
-
-def _touch(result: ZeroTouchResult, config: RigConfig) -> Iterator[Fact]:
-    touch, method = config.touch, result.method
-    taught = method == "taught"
-    yield "method", "the taught height" if taught else method, None
-    for number, point in enumerate(result.points, 1):
-        where = f"point {number} ({point.x_mm:.0f}, {point.y_mm:.0f})"
-        yield where, f"{point.z_mm:.3f} mm", None
-        if not taught:
-            yield _within("  its touches span", point.span_mm, touch.repeatability_mm, f"{point.span_mm:.3f} mm")
-    if not taught:
-        yield _within("from the height before", result.moved_mm, touch.moved_mm, f"{result.moved_mm:+.3f} mm")
-    residuals = [abs(residual_mm) for residual_mm in result.residuals_mm]
-    if len(residuals) > 3:
-        yield _within("off the plane", max(residuals), touch.residual_mm, f"{max(residuals):.3f} mm")
-    plane = "taken as level: fewer than three points" if len(residuals) < 3 else f"leans by {result.slope_deg:.2f}°"
-    yield "plane", plane, None
-
-
-def _self_check(result: SelfCheckResult, config: RigConfig) -> Iterator[Fact]:
-    limits = config.self_check
-    off_mm, turn_deg = math.hypot(*result.offset_mm), result.turn_deg
-    scale_x, scale_y = (100.0 * (scale - 1.0) for scale in result.scale)
-    yield _within("marks lie off by", off_mm, limits.offset_mm, f"{off_mm:.2f} mm")
-    yield _within("turned by", turn_deg, limits.turn_deg, f"{turn_deg:+.2f}°")
-    yield "lengths off by", f"{scale_x:+.2f} % in x, {scale_y:+.2f} % in y", None
-    yield "largest residual", f"{max(result.residuals_mm):.2f} mm", None
+def _facts(result: StepResult, config: RigConfig) -> Iterator[Fact]:
+    """What a step of the set-up measured; nothing of other steps."""
+    match result:
+        case BoardResult(camera_delay_ms=delay_ms, camera_jitter_ms=jitter_ms):
+            yield "corners found", str(result.corners), None
+            yield "scale (pix2len)", f"{result.mm_per_px:.4f} mm/px", None
+            yield _within("residual of corners", result.rms_px, WORST_RMS_PX, f"{result.rms_px:.2f} px")
+            if delay_ms is not None and jitter_ms is not None:
+                yield _within("delay of the camera", delay_ms, config.camera.max_delay_ms, f"{delay_ms:.0f} ms")
+                yield _within("the delay varies by", jitter_ms, config.camera.max_jitter_ms, f"{jitter_ms:.0f} ms")
+            for check in result.checks:
+                name = {"blurred": "blur of edges", "exposure": "paper's brightness"}.get(check.name, check.name)
+                yield name, f"{check.score:.3g} {check.unit}  (limit {check.threshold:g})", check.passed
+        case ZeroTouchResult(method=method, points=points):
+            touch, taught = config.touch, method == "taught"
+            yield "method", "the taught height" if taught else method, None
+            for number, point in enumerate(points, 1):
+                where = f"point {number} ({point.x_mm:.0f}, {point.y_mm:.0f})"
+                yield where, f"{point.z_mm:.3f} mm", None
+                if not taught:
+                    span_mm = point.span_mm
+                    yield _within("  its touches span", span_mm, touch.repeatability_mm, f"{span_mm:.3f} mm")
+            if not taught:
+                yield _within("from the height before", result.moved_mm, touch.moved_mm, f"{result.moved_mm:+.3f} mm")
+            off_mm = [abs(residual_mm) for residual_mm in result.residuals_mm]
+            if len(off_mm) > 3:
+                yield _within("off the plane", max(off_mm), touch.residual_mm, f"{max(off_mm):.3f} mm")
+            level = "taken as level: fewer than three points"
+            yield "plane", level if len(off_mm) < 3 else f"leans by {result.slope_deg:.2f}°", None
+        case SelfCheckResult(turn_deg=turn_deg):
+            off_mm = math.hypot(*result.offset_mm)
+            scale_x, scale_y = (100.0 * (scale - 1.0) for scale in result.scale)
+            yield _within("marks lie off by", off_mm, config.self_check.offset_mm, f"{off_mm:.2f} mm")
+            yield _within("turned by", turn_deg, config.self_check.turn_deg, f"{turn_deg:+.2f}°")
+            yield "lengths off by", f"{scale_x:+.2f} % in x, {scale_y:+.2f} % in y", None
+            yield "largest residual", f"{max(result.residuals_mm):.2f} mm", None
+        case _:
+            pass
