@@ -257,8 +257,8 @@ class Engine:
 
         Raises `ConfigError` if nobody can answer, `CollectAborted` if the answer is no.
         """
-        robot, real = rig.config.robot, not rig.robot_identity.simulated
-        hardware = f"{rig.robot_identity.model} at {robot.host}:{robot.port} is real hardware"
+        robot, arm = rig.config.robot, rig.identities["robot"]
+        real, hardware = not arm.simulated, f"{arm.model} at {robot.host}:{robot.port} is real hardware"
         if self._resumes is not None and self._request.on_screen:
             state = replay(self._resumes / JOURNAL_NAME)
             self._run.progress.count(state)

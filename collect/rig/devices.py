@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import socket
-from collections.abc import AsyncGenerator, Callable, Generator
-from dataclasses import dataclass
+from collections.abc import AsyncGenerator, Callable, Generator, Mapping
+from dataclasses import dataclass, field
 
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.config import RigConfig
@@ -27,18 +27,15 @@ class Rig:
     clock: Clock
     robot: Robot
     camera: Camera
-    robot_identity: Identity
-    camera_identity: Identity
     force: ForceSensor | None = None
     ink: InkDevice | None = None
-    force_identity: Identity | None = None
-    ink_identity: Identity | None = None
+    identities: Mapping[str, Identity] = field(default_factory=dict[str, Identity])
+    """By the names of the devices above."""
 
     @property
     def simulated(self) -> bool:
         """Whether any device belongs to the loopback rig."""
-        known = (self.robot_identity, self.camera_identity, self.force_identity, self.ink_identity)
-        return any(identity.simulated for identity in known if identity is not None)
+        return any(identity.simulated for identity in self.identities.values())
 
 
 def limits_of(config: RigConfig) -> Limits:
@@ -87,8 +84,10 @@ async def connected(config: RigConfig, clock: Clock, on_notice: Callable[[str], 
     ink = None if config.ink.device is None else config.ink.device.device(clock)
     async with contextlib.AsyncExitStack() as stack:
         stack.enter_context(sole_driver(config.robot.host, config.robot.port))
-        camera_is = await stack.enter_async_context(identified(camera))
-        force_is = None if force is None else await stack.enter_async_context(identified(force))
-        ink_is = None if ink is None else await stack.enter_async_context(identified(ink))
-        robot_is = await stack.enter_async_context(identified(robot))
-        yield Rig(config, clock, robot, camera, robot_is, camera_is, force, ink, force_is, ink_is)
+        devices = {"camera": camera, "force": force, "ink": ink, "robot": robot}
+        identities = {
+            name: await stack.enter_async_context(identified(device))
+            for name, device in devices.items()
+            if device is not None
+        }
+        yield Rig(config, clock, robot, camera, force, ink, identities)

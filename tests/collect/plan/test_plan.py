@@ -37,7 +37,7 @@ from brushloop.collect.walk import (
     walk,
 )
 from brushloop.drivers.arcs.controller import RobotMode
-from brushloop.drivers.devices import Identity, Pose, QueuedLine
+from brushloop.drivers.devices import Pose, QueuedLine
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.arcs_server import ArcsServer
@@ -304,8 +304,6 @@ def test_files_that_are_missing_or_swapped_are_named(
 
 # A press is believed where the brush was seen at its depth
 
-NOBODY = Identity("made up", "", True)
-
 
 class MadeUpRobot:
     """Goes nowhere; it says that it has seen its targets, `off_mm` higher, and of those only the slice `seen`."""
@@ -326,7 +324,7 @@ class MadeUpRobot:
 
 async def pressed(config: RigConfig, robot: MadeUpRobot, depth_mm: float = 13.0, dwell_s: float = 0.2) -> float:
     nothing = cast(Any, None)
-    procedures = Procedures(Rig(config, nothing, cast(Any, robot), nothing, NOBODY, nothing))
+    procedures = Procedures(Rig(config, nothing, cast(Any, robot), nothing))
     return await procedures.press(Sheet(config.paper).patch(7), Condition(depth_mm, 10.0), dwell_s)
 
 

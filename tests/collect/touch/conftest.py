@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from brushloop.collect.motion import Procedures, photograph_moves
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.devices import Rig, limits_of
-from brushloop.drivers.devices import Frame, Identity, Pose, QueuedLine, Stamp
+from brushloop.drivers.devices import Frame, Pose, QueuedLine, Stamp
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.rig import rig_toml
@@ -53,8 +53,7 @@ class Bench:
         config = load_rig(self.folder / "rig.toml")
         self.limits = limits_of(config)
         devices: Any = self
-        identity = Identity("world without wires", "", True)
-        self.rig = Rig(config, self.time, devices, devices, identity, identity, force=devices)
+        self.rig = Rig(config, self.time, devices, devices, force=devices)
         self.effector = Procedures(self.rig)
         self.effector.dip = self.dip
         self.effector.photographer.photograph = self.see_sheet
