@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import hashlib
 from collections.abc import AsyncGenerator, Sequence
-from contextlib import AbstractAsyncContextManager
 from pathlib import Path
 
 import cv2
@@ -93,7 +92,7 @@ class CameraStep(Step):
                 raise NotAccepted(f"no such board: {error}".splitlines()[0] + ".", "Read the print again.") from None
         if "camera.source" not in visit.notebook.values:
             await self._source(visit)
-        async with taught_camera(visit) as camera:
+        async with opened(visit) as camera:
             visit.working("looking for the board")
             await _board_in(visit, await still(camera, visit.clock), "camera", lying=True)
             await self._lens(visit, camera)
@@ -213,20 +212,16 @@ def board_of(notebook: Notebook) -> BoardSpec:
 
 
 @contextlib.asynccontextmanager
-async def opened(visit: Visit, source: str) -> AsyncGenerator[OpenCvCamera]:
-    """A connected camera, its settings locked as far as they were taught.
+async def opened(visit: Visit, source: str | None = None) -> AsyncGenerator[OpenCvCamera]:
+    """A connected camera, the taught one unless another is named; its settings are locked as far as they were taught.
 
     Raises `DeviceError`, also for a setting that the camera does not keep.
     """
     locked = Locked.model_validate(visit.notebook.table("camera.locked."))
+    source = str(visit.notebook.get("camera.source")) if source is None else source
     camera = OpenCvCamera(CameraTable(kind="opencv", source=source, latency_ms=LATE_MS, locked=locked), visit.clock)
     async with identified(camera):
         yield camera
-
-
-def taught_camera(visit: Visit) -> AbstractAsyncContextManager[OpenCvCamera]:
-    """The camera that was taught."""
-    return opened(visit, visit.notebook.get("camera.source"))
 
 
 async def still(camera: OpenCvCamera, clock: Clock) -> Gray:

@@ -10,7 +10,7 @@ import numpy as np
 
 from brushloop.calibrate.files import read_gray
 from brushloop.collect.commission.arm import Point, tips, touch
-from brushloop.collect.commission.camera import shown_live, still, taught_camera
+from brushloop.collect.commission.camera import opened, shown_live, still
 from brushloop.collect.commission.sheet import corners_of
 from brushloop.collect.commission.visit import NO, YES, Notebook, Step, Taught, Visit, choice_of, number_of, rig_of
 from brushloop.collect.errors import ConfigError, NotAccepted
@@ -95,7 +95,7 @@ class PlacesStep(Step):
         # One place alone may be left, after going back or a power cut: its picture needs the arm there again.
         visit.forget(*AWAY)
         pictures: list[Thumbnail] = []
-        async with taught_camera(visit) as camera:
+        async with opened(visit) as camera:
             for kind, how in AWAY.items():
                 async with shown_live(visit, camera):
                     await touch(visit, f"{kind} 0", how)

@@ -203,7 +203,7 @@ def parked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Vis
         flanges = [brush_pose(*away_mm), brush_pose(*PARK_MM)]
         monkeypatch.setattr(arm, "taught_flange", AsyncMock(side_effect=flanges))
         monkeypatch.setattr(places, "still", AsyncMock(side_effect=[away, parked]))
-        for context in ("taught_camera", "shown_live"):
+        for context in ("opened", "shown_live"):
             monkeypatch.setattr(places, context, lambda *_: contextlib.nullcontext())
         return visit
 
