@@ -107,7 +107,7 @@ class Photograph:
 
     def check_frame(self) -> Verdict:
         """Check exposure and blur, as before any press or for the board's picture."""
-        return Verdict((exposure(self.image, self.limits), *blurred(self.image, self.plane, self.limits)))
+        return Verdict(tuple(judge_frame(self.image, self.plane, self.limits)))
 
     def check_press(self, patch: Patch, depth_mm: float) -> Verdict:
         """Judge one press of commanded depth `depth_mm`, by the checks that no earlier failure makes meaningless."""
@@ -199,8 +199,9 @@ def _at_least(name: Failure, score: float, unit: str, limit: float, reason: str)
     return _check(name, score, unit, limit, reason, passed=score >= limit)
 
 
-def exposure(image: Gray, limits: QualityConfig) -> Check:
-    """The paper is neither dark nor saturated."""
+def judge_frame(image: Gray, plane: Plane, limits: QualityConfig) -> Iterator[Check]:
+    """The checks of a photograph, whatever it shows."""
+    # The paper is neither dark nor saturated.
     level = measure.paper_level(image)
     reason = ""
     if level < limits.dark_level:
@@ -208,17 +209,12 @@ def exposure(image: Gray, limits: QualityConfig) -> Check:
     if level >= limits.bright_level:
         reason = f"The picture is too bright: paper at {level:.0f} of 255. Expose shorter or dim the light."
     limit = limits.dark_level if level < 0.5 * (limits.dark_level + limits.bright_level) else limits.bright_level
-    return _check(Failure.EXPOSURE, level, "of 255", limit, reason, passed=not reason)
-
-
-def blurred(image: Gray, plane: Plane, limits: QualityConfig) -> tuple[Check, ...]:
-    """Edges are sharp where the picture has most contrast; no check without an edge, as when a bare sheet fills it."""
-    sigma_px = measure.blur_px(measure.busiest_tile(image))
-    if sigma_px is None:
-        return ()
-    sigma_mm = sigma_px * plane.mm_per_px
-    reason = f"The picture is blurred by {sigma_mm:.2f} mm. Focus the lens, clean it, and see that nothing shakes."
-    return (_check(Failure.BLURRED, sigma_mm, "mm", limits.blur_mm, reason),)
+    yield _check(Failure.EXPOSURE, level, "of 255", limit, reason, passed=not reason)
+    # Edges are sharp where the picture has most contrast; there is none where a bare sheet fills it.
+    if (sigma_px := measure.blur_px(measure.busiest_tile(image))) is not None:
+        sigma_mm = sigma_px * plane.mm_per_px
+        reason = f"The picture is blurred by {sigma_mm:.2f} mm. Focus the lens, clean it, and see that nothing shakes."
+        yield _check(Failure.BLURRED, sigma_mm, "mm", limits.blur_mm, reason)
 
 
 def cut(ink: Ink, plane: Plane, shape: tuple[int, ...], anchor_mm: Point, limits: QualityConfig) -> Check:
