@@ -295,10 +295,6 @@ class Procedures:
             raise StepVoid(f"zero touch rests {off_mm:+.3f} mm from the taught height; limit {TOUCH_TOLERANCE_MM} mm")
         return rests_mm
 
-    async def approach(self, x_mm: float, y_mm: float, z_mm: float) -> None:
-        """Go over a point of the sheet, then down to where a slow approach begins."""
-        await self.go(over(self._config, x_mm, y_mm), slowly(self._config, x_mm, y_mm, z_mm))
-
     async def lower(self, x_mm: float, y_mm: float, z_mm: float, speed_mm_s: float) -> float:
         """Go to a height over a point of the sheet; returns the height at which the arm rests, in mm."""
         await self.go(Move(upright(self._config, x_mm, y_mm, z_mm), speed_mm_s))

@@ -37,9 +37,9 @@ LEAST_OFF_DEG, LEAST_AGREEING = 1.0, 5
 class TipFit:
     """Where the tip is, and how well that is known."""
 
-    offset_mm: tuple[float, float, float]
+    offset_mm: list[float]
     """Flange to tip, along the flange's axes."""
-    pin_mm: tuple[float, float, float]
+    pin_mm: list[float]
     """The point that was touched, in the base frame."""
     worst_mm: float
     """Largest distance of the tip from the point in a touch."""
@@ -77,8 +77,8 @@ def find_tip(flanges: Sequence[Pose]) -> TipFit:
     seen_mm = math.sqrt(float((off**2).sum()) / (3 * len(flanges) - 6))
     spread = max(seen_mm, HAND_MM) * np.sqrt(np.diag(np.linalg.inv(equations.T @ equations)))
     return TipFit(
-        offset_mm=_triple(solution[:3]),
-        pin_mm=_triple(solution[3:]),
+        offset_mm=solution[:3].tolist(),
+        pin_mm=solution[3:].tolist(),
         worst_mm=float(np.linalg.norm(off, axis=1).max()),
         touch_mm=math.sqrt(3.0) * seen_mm,
         error_mm=float(np.linalg.norm(spread[:3])),
@@ -146,11 +146,6 @@ def _angles_deg(directions: Floats, toward: Floats) -> Floats:
     """(n,) angles between (n, 3) directions and one, of any lengths."""
     across = np.linalg.norm(np.cross(directions, toward), axis=1)
     return np.degrees(np.arctan2(across, directions @ toward))
-
-
-def _triple(values: Floats) -> tuple[float, float, float]:
-    x, y, z = (float(v) for v in values)
-    return x, y, z
 
 
 MOST_TOUCHES = 24
@@ -278,7 +273,7 @@ class TipStep(Step):
         touches = list(notebook.touched("pin").values())
         fit = find_tip(touches)
         how = f"the same pin touched from {len(touches)} sides by hand"
-        offset = Taught(list(fit.offset_mm), how, fit.error_mm, f"residuals up to {fit.worst_mm:.2f} mm")
+        offset = Taught(fit.offset_mm, how, fit.error_mm, f"residuals up to {fit.worst_mm:.2f} mm")
         if (axis := measured_axis(notebook)) is None:
             turn = Taught([0.0, 0.0, 0.0], "taken as square to the flange", known="not measured")
         else:

@@ -17,7 +17,7 @@ from brushloop.calibrate.board.lens import apply
 from brushloop.calibrate.board.pix2len import local_scale, see_board
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.errors import StepError
-from brushloop.collect.motion import Dip, Move, Procedures, slowly, upright
+from brushloop.collect.motion import Dip, Move, Procedures, over, slowly, upright
 from brushloop.collect.photograph.frames import undistorted
 from brushloop.collect.rig.config import PaperConfig, RigConfig, TouchConfig
 from brushloop.collect.rig.paper import PaperPlane, fit_plane
@@ -227,9 +227,10 @@ class FirstInkTouch:
             await self._dip()
             self._since_dip = 0
         x, y, z = spot
-        await self._procedures.approach(x, y, z + self._config.above_mm)
-        down = Move(upright(self._rig.config, x, y, z), self._config.speed_mm_s)
-        up = slowly(self._rig.config, x, y, self._rig.config.motion.safe_z_mm)
+        rig = self._rig.config
+        await self._procedures.go(over(rig, x, y), slowly(rig, x, y, z + self._config.above_mm))
+        down = Move(upright(rig, x, y, z), self._config.speed_mm_s)
+        up = slowly(rig, x, y, rig.motion.safe_z_mm)
         await self._procedures.queue([down, up])
         self._since_dip += 1
         self._last = None

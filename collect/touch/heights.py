@@ -13,6 +13,7 @@ from brushloop.sessions.events import TouchedPoint, ZeroTouchResult
 
 SPAN_SIGMAS = 5.0
 """Three touches at one height span more than this many of their standard errors only once in a thousand times."""
+LEVEL = PaperPlane(0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,12 +64,11 @@ class Touch:
     sigma_mm: float | None = None
 
 
-def at_one_point(touches: list[Touch], config: TouchConfig, guide: PaperPlane | None = None) -> TouchedPoint:
+def at_one_point(touches: list[Touch], config: TouchConfig, lean: PaperPlane = LEVEL) -> TouchedPoint:
     """The mean of the touches of one point. Raises `StepError` if they span more than their own errors explain.
 
-    `guide` is the known lean of the sheet, for touches that lie some millimetres apart.
+    `lean` is the known lean of the sheet, for touches that lie some millimetres apart.
     """
-    lean = guide or PaperPlane(0.0)
     heights = [t.z_mm - lean.touch_z_mm(t.x_mm, t.y_mm) for t in touches]
     span_mm = max(heights) - min(heights)
     limit_mm = max(config.repeatability_mm, SPAN_SIGMAS * max(t.sigma_mm or 0.0 for t in touches))

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 
 from brushloop.collect.errors import NeedsOperator, StepError
-from brushloop.collect.motion import Dip, Procedures
+from brushloop.collect.motion import Dip, Procedures, over, slowly
 from brushloop.collect.operator import Asker, Choice, Prompt
 from brushloop.collect.rig.config import PaperConfig, TouchConfig
 from brushloop.collect.rig.paper import Sheet
@@ -58,12 +58,13 @@ async def _by_force_or_jog(
     asker: Asker,
     tell: Callable[[str], None],
 ) -> list[TouchedPoint]:
-    known, points = KnownHeights(procedures.rig.config.paper, config), list[TouchedPoint]()
+    rig = procedures.rig.config
+    known, points = KnownHeights(rig.paper, config), list[TouchedPoint]()
     spring: Spring | None = None
     for point in points_mm:
         reach, touches = known.reach(*point), list[Touch]()
         rest = resting(procedures, tap, point, config)
-        await procedures.approach(*point, reach.start_z_mm)
+        await procedures.go(over(rig, *point), slowly(rig, *point, reach.start_z_mm))
         for count in range(len(points) * config.touches + 1, (len(points) + 1) * config.touches + 1):
             name = f"touch {count} of {len(points_mm) * config.touches}"
             if config.method == "jog":
