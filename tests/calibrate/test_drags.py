@@ -167,19 +167,13 @@ def page(defect: str) -> np.ndarray:
     return image
 
 
-@pytest.fixture(scope="module")
-def flawed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def test_defects_are_listed_and_the_source_is_told_everywhere(tmp_path: Path) -> None:
     """One whole stroke, three with a defect, and one that the photograph cuts."""
-    folder = tmp_path_factory.mktemp("flawed")
     lines = ["file,length_mm,depth_mm,px_per_mm,start_x_px,start_y_px"]
     for k, name in enumerate(("whole", "torn", "hollow", "glare", "cut")):
-        cv2.imwrite(str(folder / f"{name}.png"), page(name))
+        cv2.imwrite(str(tmp_path / f"{name}.png"), page(name))
         lines.append(f"{name}.png,40,{3 + k},10,{LEFT},{TOP}")
-    return imported(folder, lines, tmp_path_factory.mktemp("flawed-session") / "drags", "drag", simulated=True)
-
-
-def test_defects_are_listed_and_the_source_is_told_everywhere(flawed: Path, tmp_path: Path) -> None:
-    validation = validate_drags(flawed, None)
+    validation = validate_drags(imported(tmp_path, lines, tmp_path / "drags", "drag", simulated=True), None)
     drags = validation.drags
     assert [drags.placed[k].stroke.stroke_id for k in drags.sound] == ["whole"]
     assert [name for name, _ in drags.left_out] == ["cut"]

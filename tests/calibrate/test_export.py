@@ -27,6 +27,7 @@ from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Check, Quality, Topic, Wrench
 from tests.calibrate.simulated_rigs import collected, sheet, true_mask
 from tests.command import refused, said
+from tests.sessions.conftest import no_space
 
 
 @pytest.fixture
@@ -112,11 +113,8 @@ def test_without_pyarrow_the_error_names_the_remedy_and_nothing_is_left(closed, 
 
 
 def test_a_full_disk_leaves_nothing_and_a_folder_that_holds_anything_is_left_as_it_is(closed, to, monkeypatch):
-    def full(_):
-        raise OSError(28, "No space left")
-
     with monkeypatch.context() as patch:
-        patch.setattr("brushloop.sessions.disk.fsync_folder", full)
+        patch.setattr("brushloop.sessions.disk.fsync_folder", no_space)
         with pytest.raises(SessionError, match="No space left"):
             export(ExportRequest(closed, to, "csv"))
     assert list(to.parent.glob("*exported*")) == []

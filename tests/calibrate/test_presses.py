@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import shutil
 from collections import Counter
 from collections.abc import Callable
@@ -30,6 +29,7 @@ from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Stroke
 from tests.calibrate.given import CALIBRATION
 from tests.photographed import imported, imported_presses
+from tests.sessions.conftest import no_space
 
 CONDITIONS = [(11.0, 0.0), (15.0, 5.0), (20.0, 10.0)]
 
@@ -131,10 +131,7 @@ def test_two_commands_at_once_do_no_harm(session: Path) -> None:
 
 
 def test_a_folder_that_cannot_be_written_does_not_stop_the_work(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: Any, **__: Any) -> None:
-        raise OSError(errno.ENOSPC, "no space left")
-
-    monkeypatch.setattr(Path, "mkdir", full)
+    monkeypatch.setattr(Path, "mkdir", no_space)
     assert len(read(session)) == 3
     assert not (session / work.FOLDER).exists()
 

@@ -1,4 +1,4 @@
-"""Intervals, tests, the ceiling and the order of a design behave as they must on cases that can be computed by hand.
+"""Intervals, tests and the ceiling behave as they must on cases that can be computed by hand.
 
 The ceiling is the score of a perfect model: here the stray of every press is drawn, so that one can be drawn.
 """
@@ -18,7 +18,6 @@ from brushloop.calibrate.stats import (
     paired,
     summarise,
 )
-from brushloop.model.presses import farthest_first
 from brushloop.model.similarity import binary_scores
 
 CONDITIONS = 6
@@ -152,9 +151,3 @@ def test_a_model_is_near_where_the_interval_of_the_difference_says_so() -> None:
     assert is_near(found.avg, found.avg_interval, points=0.9) is None
     assert is_near(found.avg, found.avg_interval, points=0.1) is False
     assert is_near(2.0, None) is False
-
-
-def test_points_are_each_as_far_as_possible_from_those_before() -> None:
-    places = np.array([[0.0], [1.0], [2.0], [3.0], [4.0]])
-    assert farthest_first(places, 0, 5) == [0, 4, 2, 1, 3]
-    assert farthest_first(places, 2, 3) == [2, 0, 4]

@@ -9,7 +9,6 @@ import pty
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from unittest.mock import AsyncMock, Mock
 
@@ -26,20 +25,14 @@ ROOT = Path(__file__).parents[2]
 CHOSEN = "a_move_arrives or who_answers or comes_often"
 
 
-@pytest.fixture
-def rig_toml(tmp_path: Path) -> Iterator[Path]:
-    """Of a loopback rig that serves."""
-    with in_thread(LoopbackRig(SimConfig(rate=5.0, force_sensor=False, ink_device="none"))) as (rig, _):
-        path = tmp_path / "rig.toml"
-        path.write_text(rig.toml(), encoding="utf-8")
-        yield path
-
-
-def test_it_says_what_it_will_do_and_after_a_yes_it_moves(rig_toml: Path):
+def test_it_says_what_it_will_do_and_after_a_yes_it_moves(tmp_path: Path):
+    path, output = tmp_path / "rig.toml", ""
     ours, theirs = pty.openpty()
-    chosen = ["tests/contract", "--rig", str(rig_toml), "-k", CHOSEN, "-p", "no:cacheprovider", "--color=no"]
-    command, output = [sys.executable, "-m", "pytest", *chosen], ""
-    with subprocess.Popen(command, cwd=ROOT, start_new_session=True, stdin=theirs, stdout=theirs, stderr=theirs) as run:
+    with in_thread(LoopbackRig(SimConfig(rate=5.0, force_sensor=False, ink_device="none"))) as (rig, _):
+        path.write_text(rig.toml(), encoding="utf-8")
+        chosen = ["tests/contract", "--rig", str(path), "-k", CHOSEN, "-p", "no:cacheprovider", "--color=no"]
+        terminal = dict.fromkeys(("stdin", "stdout", "stderr"), theirs)
+        run = subprocess.Popen([sys.executable, "-m", "pytest", *chosen], cwd=ROOT, start_new_session=True, **terminal)
         os.close(theirs)
         try:
             # Linux reports by an error that the other end has gone.
@@ -53,6 +46,7 @@ def test_it_says_what_it_will_do_and_after_a_yes_it_moves(rig_toml: Path):
             assert run.wait(PATIENCE_S) == 0, output
         finally:
             run.kill()
+            run.wait()
             os.close(ours)
     assert "3 passed" in output
     for expected in (

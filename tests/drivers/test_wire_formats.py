@@ -139,18 +139,6 @@ Read = Callable[[bytes], object]
 """Raises `DeviceError` for what it refuses, and returns None for what it passes over."""
 
 
-def pushed(payload: bytes) -> object:
-    head, values = decode_message(payload)
-    assert (type(head), type(values)) == (int, list)
-    return head, values
-
-
-def greeted(said: bytes) -> object:
-    outputs = outputs_of(said)
-    assert all(type(name) is str and isinstance(ident, int) for name, ident in outputs.items())
-    return outputs
-
-
 def joined(data: bytes) -> object:
     """The wrenches in a row of frames, each an id of two bytes and what it holds; then a sound round."""
     parts = RoundAssembler()
@@ -187,8 +175,8 @@ SHARED = b"\x82\x00\xd8\x1c\x82\x01\xd8\x1d\x00"
 GREETING = b'{"protocol":"rtde","version":1,"input":{"set_recipe":100},"output":{"R1_actual_TCP_pose":1021}}\n\n'
 READERS: dict[str, tuple[Read, list[bytes], int]] = {
     "a reply": (lambda payload: answer_in(payload, "a", "getTcpPose"), REPLIES, 4000),
-    "a push": (pushed, PUSHES, 5000),
-    "a greeting": (greeted, [GREETING, b'{"protocol":"rtde","output":{}}\n\n'], 4000),
+    "a push": (decode_message, PUSHES, 5000),
+    "a greeting": (outputs_of, [GREETING, b'{"protocol":"rtde","output":{}}\n\n'], 4000),
     "rounds of the force board": (joined, [ROUND * 3], 2000),
 }
 

@@ -103,12 +103,3 @@ def test_flags_say_what_is_wrong() -> None:
     [flags] = [recovered.flags[0] for recovered in off if recovered.tilt_deg[0] == 0.0]
     assert Flag.UPRIGHT in flags
     assert not flags & {Flag.AT_BOUND, Flag.DID_NOT_CONVERGE}
-
-
-def test_what_makes_no_sense_is_refused() -> None:
-    with pytest.raises(ValueError, match="anchor_sigma_mm = -1"):
-        Inverter(MODELS["ccd-bsm"], anchor_sigma_mm=-1.0)
-    with pytest.raises(ValueError, match="expected \\(B, 128, 128\\)"):
-        INVERT(np.zeros((1, 64, 64)), ANCHOR)
-    with pytest.raises(ValueError, match=r"expected 0\.001 <= low < high"):
-        Range((5.0, 5.0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import itertools
 from collections import Counter
@@ -25,6 +26,11 @@ from brushloop.sessions.store import SessionStore
 from tests.journal_lines import read_lines
 
 BOARD = BoardResult(still=1000, corners=54, mm_per_px=0.05, rms_px=0.1, size_px=(24, 24), sheet_px=())
+
+
+def no_space(*_: object, **__: object) -> None:
+    """In place of a call of the system, on a full disk."""
+    raise OSError(errno.ENOSPC, "No space left on device")
 
 
 class Make:

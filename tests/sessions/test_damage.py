@@ -1,6 +1,5 @@
 """Every damage by name: what verify tells, what repair gives back, and how the session goes on afterwards."""
 
-import errno
 import itertools
 import shutil
 from dataclasses import dataclass, field
@@ -18,6 +17,7 @@ from brushloop.sessions.show import Summary, details, summaries
 from brushloop.sessions.verify import verify_session
 from tests.command import brushloop
 from tests.journal_lines import read_lines
+from tests.sessions.conftest import no_space
 
 ID, OTHER = "2026-01-02-grid-01", "2026-01-03-grid-01"
 BOTH = ("H13-a05-r00", "H13-a05-r01")
@@ -64,12 +64,6 @@ def forget_from(folder, event, key):
 def chunks(path):
     with path.open("rb") as file:
         return make_reader(file).get_summary().chunk_indexes
-
-
-@pytest.fixture
-def other(make, tmp_path):
-    """A closed session of the same protocol, so that its steps have the same keys; it was stopped earlier."""
-    return make.session(tmp_path / OTHER, 1, closed=True, session_id=OTHER)
 
 
 @dataclass
@@ -191,7 +185,9 @@ def damaged(request, make, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("damaged", "case"), CASES.items(), ids=CASES, indirect=["damaged"])
-def test_damage_is_told_and_repaired(make, damaged, case, other, repair, resume):
+def test_damage_is_told_and_repaired(make, damaged, case, tmp_path, repair, resume):
+    # Of the same protocol, so that its steps have the same keys; it was stopped earlier.
+    other = make.session(tmp_path / OTHER, 1, closed=True, session_id=OTHER)
     case.damage(damaged, other)
     before = make.tree(damaged.parent)
     findings = verify_session(damaged).findings
@@ -312,11 +308,8 @@ def test_a_full_disk_leaves_the_damaged_file_with_its_name(opened, repair, monke
     cut_index(path)
     data = path.read_bytes()
 
-    def full(*_):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
     with monkeypatch.context() as disk:
-        disk.setattr("os.fsync", full)
+        disk.setattr("os.fsync", no_space)
         with pytest.raises(DiskFull, match="No space left"):
             repair(opened)
     assert path.read_bytes() == data

@@ -11,6 +11,7 @@ from brushloop.sessions.imports import ImportOptions
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Source
 from tests.command import brushloop
+from tests.sessions.conftest import no_space
 
 START = {"start_x_px": "1", "start_y_px": "1"}
 ROWS = [
@@ -165,8 +166,5 @@ def test_without_folder_or_table_and_where_a_session_is_nothing_is_imported(make
 def test_a_disk_without_room_is_refused(rows, photos, refusal, monkeypatch, call):
     (photos.parent / "sessions").mkdir()
 
-    def full(*_, **__):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, call, full)
+    monkeypatch.setattr(os, call, no_space)
     assert refusal() == "sessions/from-elsewhere: cannot write: No space left on device"

@@ -161,18 +161,14 @@ HELD_OUT = Stat(
 )
 
 
-@pytest.fixture(scope="module")
-def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return imported_presses(tmp_path_factory.mktemp("sessions"), PRESSED, (200, 320), (250, 100))
-
-
 class PowerCut(BaseException):
     pass
 
 
 def test_a_session_gets_a_twin_and_a_run_that_was_broken_off_goes_on(
-    session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    session = imported_presses(tmp_path, PRESSED, (200, 320), (250, 100))
     out, searched = tmp_path / "twin.toml", list[float]()
 
     def counted(_target: object, found: Solution, _workers: Executor, blur_mm: float) -> Solution:

@@ -10,16 +10,6 @@ import pytest
 
 from brushloop.drivers.sim.faults import FaultBoard, Phase, fault_of
 
-
-@pytest.fixture
-def world(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """As much of a world as the board looks at: its presses, its clock, and what the arm is doing."""
-    world = SimpleNamespace(at_s=0.0, doing=Phase.PARKED, presses=[])
-    world.clock = SimpleNamespace(real_s=lambda: world.at_s)
-    monkeypatch.setattr(FaultBoard, "phase", lambda _: world.doing)
-    return world
-
-
 ARM = "rob1.MotionControl."
 
 
@@ -54,8 +44,12 @@ ARM = "rob1.MotionControl."
     ],
 )
 def test_a_fault_strikes_the_requests_that_its_conditions_name(
-    world: Any, fault: dict[str, Any], moments: list[tuple[dict[str, Any], str, list[bool]]]
+    monkeypatch: pytest.MonkeyPatch, fault: dict[str, Any], moments: list[tuple[dict[str, Any], str, list[bool]]]
 ) -> None:
+    # As much of a world as the board looks at: its presses, its clock, and what the arm is doing.
+    world: Any = SimpleNamespace(at_s=0.0, doing=Phase.PARKED, presses=[])
+    world.clock = SimpleNamespace(real_s=lambda: world.at_s)
+    monkeypatch.setattr(FaultBoard, "phase", lambda _: world.doing)
     board, hung = FaultBoard(world), fault_of({"device": "robot", "kind": "mute"} | fault)
     board.hang(hung)
     for changes, ops, expected in moments:
