@@ -231,7 +231,7 @@ def fault(
 
 @groups["sim"].command()
 def hand(
-    control: Annotated[Path, typer.Argument(help="Control socket of a lab: `brushloop sim --unknown`.")],
+    control: Annotated[Path, typer.Argument(help="The lab's socket, as after `brushloop sim --control`.")],
     act: Annotated[str, typer.Argument(help="bring, measure or mend.")],
     to: Annotated[str | None, typer.Argument(help="What: pin, board-corner, well, park, hold-board, ...")] = None,
     index: Annotated[int, typer.Option(min=1, max=999, help="Which one, from 1, such as a direction at the pin.")] = 1,

@@ -237,7 +237,7 @@ def open_source(table: CameraTable) -> JpegStream | Capture:
             DEVICE,
             "lock",
             f"{', '.join(locked)} cannot be set through {table.source}",
-            remedy="Lock them in the camera's own set-up and leave them out of the configuration.",
+            remedy="Fix them in the camera's own set-up, and remove them from [camera.locked] in rig.toml.",
         )
     host = table.source.partition("://")[2].partition("/")[0]
     if table.source.startswith(("http://", "https://")) and "@" not in host:  # FFmpeg logs in
