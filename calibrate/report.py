@@ -250,7 +250,7 @@ class Sealed(Frozen):
             what = f"is not a report with a digest: write it with `{cls.MADE_BY}`"
             raise CalibrationError(str(path), what) from None
         if fields_format != cls.FORMAT:
-            raise CalibrationError(str(path), f"format is {str(fields_format)[:40]!r}, this version reads {cls.FORMAT!r}")
+            raise CalibrationError(str(path), f"format is {str(fields_format)[:40]!r}, not {cls.FORMAT!r}")
         if known != digest:
             raise CalibrationError(str(path), "was edited: its digest does not match its contents")
         try:

@@ -197,7 +197,8 @@ async def photograph(context: StepContext) -> Gray:
 
 async def _fresh_frame(context: StepContext) -> Frame:
     run, photographer = context.run, context.run.procedures.photographer
-    known = photographer.delay
+    if (known := photographer.delay) is None:
+        run.progress.log("measuring the camera's delay: the arm goes over the sheet and back, two to six times")
     frame = await photographer.photograph()
     if photographer.delay is not known:
         measured = f"camera delay: {photographer.delay}, limit {run.rig.config.camera.max_delay_ms:g} ms"

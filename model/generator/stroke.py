@@ -149,7 +149,7 @@ def read_generator(path: Path) -> GeneratorFile:
     """
     metadata, tensors = read_tensors(path, 4 * MAX_WEIGHTS + 2**26)
     if metadata.get("format") != FORMAT:
-        raise TrainError(path, f"format is {metadata.get('format', 'missing')[:60]!r}, this version reads {FORMAT!r}")
+        raise TrainError(path, f"format is {metadata.get('format', 'missing')[:60]!r}, not {FORMAT!r}")
     fields = _table(path, "config", metadata.get("config", ""))
     # What only steered the training of an earlier version says nothing about the images.
     config = checked(path, {name: value for name, value in fields.items() if name in TrainConfig.model_fields})
