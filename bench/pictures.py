@@ -65,7 +65,7 @@ PICTURES = {
     "middle of the well": "places",
     "l: length": "brush",
     "push the tip": "force",
-    "robot.limits.z_mm": "limits",
+    "in this box": "limits",
     "dry run": "proof",
 }
 """Words of a question, in small letters, and the picture that is taken of it."""

@@ -118,7 +118,7 @@ class InLab(Person):
             "Squares of the print": "{}x{}".format(*table.board_squares),
             "Side of a square": str(facts.printed_square_mm),
             "Side of a marker": str(facts.printed_marker_mm),
-            "Markers of the print": table.board_dictionary,
+            "Family of its markers": table.board_dictionary,
             "R:": str(brush.radius_mm),
             "L:": str(brush.length_mm),
             "Deepest press": str(facts.max_depth_mm),
