@@ -328,7 +328,7 @@ def _models(report: Report) -> Iterator[Point]:
     if _csim(report, CEILING) is None:
         words = "No condition was pressed twice: the repeatability of the brush is unknown, and there is no ceiling."
         yield Point(False, words)
-    if _csim(report, FITTED_HELD_OUT) is None and not report.source.imported:
+    if _csim(report, FITTED_HELD_OUT) is None:
         yield Point(None, "No model was calibrated to this brush: run “brushloop fit”, then validate again.")
 
 
