@@ -122,12 +122,8 @@ def import_(
     licence: Annotated[str, typer.Option(help="Licence of the photographs, kept in the recording.")] = "",
     origin: Annotated[str, typer.Option(help="Where they come from, kept in the recording.")] = "",
     brush: Annotated[str, typer.Option(help="Description of the brush.")] = "",
-    brush_radius_mm: Annotated[
-        float | None, typer.Option(min=0.5, max=50.0, help="R in mm; the paper's 6 if left out.")
-    ] = None,
-    brush_length_mm: Annotated[
-        float | None, typer.Option(min=5.0, max=500.0, help="L in mm; the paper's 48 if left out.")
-    ] = None,
+    brush_radius_mm: Annotated[float | None, typer.Option(min=0.5, max=50.0, help="R in mm; default: 6.")] = None,
+    brush_length_mm: Annotated[float | None, typer.Option(min=5.0, max=500.0, help="L in mm; default: 48.")] = None,
     simulated: Annotated[bool, typer.Option("--simulated", help="The ink was simulated; reports say so.")] = False,
 ) -> None:
     """Turn a folder of photographs with a parameter table into a session that every later command accepts."""

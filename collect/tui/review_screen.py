@@ -322,6 +322,6 @@ class ReviewScreen(Screen[None]):
 
 def _row_content(capture: ReviewCapture) -> Content:
     sign, style = ("✓", "") if capture.counts else ("!", "bold $text-warning")
-    noted, waited = " ✎" if capture.note else "", " dip?" if capture.unlike else ""
+    noted, waited = " ✎" if capture.note else "", " waited?" if capture.unlike else ""
     name = f" {one_line(capture.press.stroke_id)}{noted}"
     return Content.assemble((sign, style), name, (waited, "bold $text-warning"))
