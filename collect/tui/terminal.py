@@ -55,8 +55,8 @@ class PlainApp(App[None]):
 
     TITLE = "brushloop"
     ENABLE_COMMAND_PALETTE = False
-    # Below the title, where a notification covers neither the last line nor the keys.
-    CSS = "ToastRack { dock: top; align: right top; margin-top: 1; }"
+    # Where a notification covers neither tip and force of a run, nor the last lines.
+    CSS = "ToastRack { dock: top; align: right top; margin-top: 8; }"
     # From 110 columns on, a picture has room beside the text.
     HORIZONTAL_BREAKPOINTS = [(0, "-narrow"), (110, "-wide")]  # noqa: RUF012 - so textual declares it
     # A selection would be copied with ctrl+c, which is a stop key here.
