@@ -116,7 +116,8 @@ async def zero_touch(context: StepContext, step: ZeroTouchStep) -> ZeroTouchResu
     moved_mm = max((p.z_mm - before.touch_z_mm(p.x_mm, p.y_mm) for p in measured.points), key=abs)
     if measured.method != "taught":
         run.progress.log(
-            f"zero touch by {measured.method}: the paper lies {moved_mm:+.2f} mm from the height known before"
+            f"zero touch by {measured.method}: the paper leans by {measured.slope_deg:.2f} deg, and lies at most "
+            f"{moved_mm:+.2f} mm from the plane known before"
         )
     if step.between_strokes:
         await _accepted(context, moved_mm)

@@ -79,7 +79,7 @@ def test_a_loop_in_the_session_is_the_third_row_of_table_1(place: Path) -> None:
     [
         (("imported photographs", "real capture"), "was edited: its digest does not match its contents"),
         (('"digest"', '"digested"'), "is not a report with a digest: write it with `brushloop repress compare`"),
-        (("brushloop-loop-4", "brushloop-loop-9"), "format is 'brushloop-loop-9'"),
+        (("brushloop-loop-4", "brushloop-loop-9"), "format is 'brushloop-loop-9', not 'brushloop-loop-4'"),
     ],
 )
 def test_an_edited_loop_is_refused_by_name(place: Path, edit: tuple[str, str], words: str) -> None:
