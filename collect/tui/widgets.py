@@ -143,7 +143,7 @@ class AskScreen(ModalScreen[str]):
         border: heavy $warning; background: $surface; overflow-y: auto;
     }
     AskScreen #question { margin-bottom: 1; }
-    AskScreen #cause { height: 9; margin-bottom: 1; }
+    AskScreen #cause { height: 8; }
     AskScreen #live { height: auto; margin: 1 0; background: $boost; text-wrap: nowrap; }
     """
     BINDINGS: ClassVar[list[BindingType]] = [
