@@ -8,9 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from brushloop.__main__ import app
 from brushloop.calibrate.compare import Tone
 from brushloop.calibrate.loop import Pair, write_loop
 from brushloop.calibrate.report import chart_uri, picture_grid, printable, source_label, source_note
@@ -30,12 +28,8 @@ MADE = "simulated bristle bundle, paper (made to agree with the paper's Table 2:
 
 
 def run(*arguments: object) -> str:
-    """Run a command; returns the page that its last line names."""
-    ran = CliRunner().invoke(app, [*map(str, arguments)])
-    assert ran.exit_code == 0, ran.output
-    *_, last = ran.output.splitlines()
-    assert last.startswith("Page: "), last
-    return Path(last.removeprefix("Page: ")).read_text(encoding="utf-8")
+    """Run a command; returns the page that it names at the end."""
+    return Path(said(*arguments).rpartition("Page: ")[2]).read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")

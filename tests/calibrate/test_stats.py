@@ -76,14 +76,11 @@ def presses(rng: np.random.Generator, condition: int, count: int, stray_px: floa
     return ((X - 60.0 - 0.5 * (left + right)) / long) ** 2 + ((Y - 30.0) / wide) ** 2 < 1.0
 
 
-def scored(seen: np.ndarray, marks: np.ndarray) -> np.ndarray:
-    return 100.0 * binary_scores(np.broadcast_to(seen, marks.shape), marks)[:, 0]
-
-
 def perfect(condition: int) -> float:
     """What the best image of a condition scores on fresh presses of it."""
     best = presses(np.random.default_rng(0), condition, 1, stray_px=0.0)[0]
-    return float(scored(best, presses(np.random.default_rng(1), condition, 400)).mean())
+    marks = presses(np.random.default_rng(1), condition, 400)
+    return 100.0 * float(binary_scores(np.broadcast_to(best, marks.shape), marks)[:, 0].mean())
 
 
 def session(seed: int, count: int) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:

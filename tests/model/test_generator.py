@@ -62,7 +62,6 @@ def test_placements_are_those_of_the_validation() -> None:
         ({"depth_mm": (20, 11)}, r"depth_mm = \[20, 11\] must grow"),
         ({"tilt_deg": (-5, 10)}, "tilt_deg = -5 is outside"),
         ({"depth_mm": (11, 60)}, "depth_mm = 60 is outside"),
-        ({"lam": 30}, "less than or equal to 10"),
         ({"model": "spline"}, "unknown stroke model 'spline'"),
     ],
 )

@@ -204,21 +204,20 @@ def test_a_batch_is_its_presses_one_by_one_also_in_scalars() -> None:
 
 
 @pytest.mark.parametrize(
-    ("depth_mm", "tilt_deg", "name", "value", "says"),
+    ("name", "value", "says"),
     [
-        (15, -5, "tilt_deg", -5, "heading + 180"),
-        (15, 82.9, "tilt_deg", 82.9, "[0, 82.875) deg"),
-        (15, math.nan, "tilt_deg", math.nan, "[0, 82.875) deg"),
-        (0, 5, "depth_mm", 0, "(0, 47.8173] mm"),
-        (48, 5, "depth_mm", 48, "(0, 47.8173] mm"),
-        (math.nan, 5, "depth_mm", math.nan, "(0, 47.8173] mm"),
+        ("tilt_deg", -5.0, "heading + 180"),
+        ("tilt_deg", 82.9, "[0, 82.875) deg"),
+        ("tilt_deg", math.nan, "[0, 82.875) deg"),
+        ("depth_mm", 0.0, "(0, 47.8173] mm"),
+        ("depth_mm", 48.0, "(0, 47.8173] mm"),
+        ("depth_mm", math.nan, "(0, 47.8173] mm"),
     ],
 )
-def test_presses_outside_the_domain_are_refused(
-    depth_mm: float, tilt_deg: float, name: str, value: float, says: str
-) -> None:
+def test_presses_outside_the_domain_are_refused(name: str, value: float, says: str) -> None:
+    press = {"depth_mm": 15.0, "tilt_deg": 5.0} | {name: value}
     with pytest.raises(DomainError) as caught:
-        ccdbsm(BRUSH, np.array([15.0, depth_mm]), tilt_deg)
+        ccdbsm(BRUSH, np.array([15.0, press["depth_mm"]]), press["tilt_deg"])
     assert caught.value.name == name
     assert caught.value.value == pytest.approx(value, nan_ok=True)
     assert says in str(caught.value)

@@ -20,14 +20,6 @@ def wide(monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
 
 
-@pytest.fixture
-def store(make, tmp_path):
-    """An open session that knows what was planned."""
-    store = make.store(tmp_path / make.header.session_id, protocol=PROTOCOL, robot="aubo_i5", robot_firmware="24")
-    yield store
-    store.release()
-
-
 def press(make, store, stroke_id, depth_mm, patch):
     made = make.press(stroke_id, depth_mm, sheet=store.state.sheet, patch=patch)
     make.take(store, f"press {stroke_id}", [], PressResult(press=made), patch)
@@ -37,14 +29,16 @@ def press(make, store, stroke_id, depth_mm, patch):
 
 
 @pytest.fixture
-def collected(make, store):
-    """Two strokes of four, one press that was stopped, one that the process did not survive."""
+def collected(make, tmp_path):
+    """Two strokes of four that were planned, one press that was stopped, one that the process did not survive."""
+    store = make.store(tmp_path / make.header.session_id, protocol=PROTOCOL, robot="aubo_i5", robot_firmware="24")
     press(make, store, "H13-a5-r01", 13.0, 0)
     store.void(store.begin("v", StepKind.PRESS, patches=(1,), press=make.press("H15-a5-r01")), "stopped")
     press(make, store, "H15-a5-r01", 15.0, 2)
     store.fresh_sheet()
     store.begin("k", StepKind.PRESS, patches=(0,), press=make.press("H13-a5-r02")).writer.abandon()
-    return store
+    yield store
+    store.release()
 
 
 def test_an_open_session_shows_what_is_done_cut_and_next(collected):

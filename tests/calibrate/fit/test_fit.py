@@ -7,9 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from brushloop.__main__ import app
 from brushloop.calibrate.artefact import FITS, current
 from brushloop.calibrate.commands import FitRequest
 from brushloop.calibrate.errors import CalibrationError
@@ -33,6 +31,7 @@ from brushloop.model.fitted import (
 )
 from brushloop.model.presses import Grid, Presses
 from tests.calibrate.conftest import CONDITIONS
+from tests.command import said
 from tests.photographed import imported_presses
 
 PX_MM = 0.4
@@ -179,17 +178,18 @@ def test_the_ends_of_a_brush_move_by_its_residual() -> None:
     assert brush.edges_at(15.0, 5.0, end).max() < 0.0 < moved.edges_at(15.0, 5.0, end).max()
 
 
-def test_one_command_leads_from_photographs_to_a_fit_and_a_report(tmp_path: Path) -> None:
+def test_one_command_leads_from_photographs_to_a_fit_and_a_report(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "60")
     session = imported_presses(tmp_path, CONDITIONS)
-    ran = CliRunner(env={"COLUMNS": "60"}).invoke(app, ["analyse", str(session)])
-    assert ran.exit_code == 0, ran.output
-    said = " ".join(ran.output.split())
+    output = said("analyse", session)
     sizes = "heel", "width", "95 %", "left out of the fit in turn", BEZIER, UNCALIBRATED
     for words in (*sizes, "paper's", "CCD-BSMG"):
-        assert words in said
-    assert "…" not in said, "a size is cut in 60 columns"
-    assert not any(name in said for name in NAMES), "a parameter alone says nothing about another brush"
-    assert "".join(ran.output.split()).endswith(f"Report:{session / 'validation' / 'report.html'}")
+        assert words in output
+    assert "…" not in output, "a size is cut in 60 columns"
+    assert not any(name in output for name in NAMES), "a parameter alone says nothing about another brush"
+    assert output.replace(" ", "").endswith(f"Report:{session / 'validation' / 'report.html'}")
     path = current(session, FITS)
     assert path is not None
     fit = BrushFit.read(path)
