@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from brushloop.drivers import geometry as rotation
 from brushloop.drivers.devices import Pose
-from brushloop.drivers.errors import DeviceError, LimitExceeded
+from brushloop.drivers.errors import LimitExceeded
 from brushloop.drivers.geometry import (
     Quaternion,
     brush_pose,
@@ -124,10 +124,10 @@ def test_both_ends_of_a_range_are_inside_and_a_step_beyond_and_what_is_no_number
             check(**{field: value})
 
 
-@pytest.mark.parametrize("quaternion", [(math.nan,) * 4, (0.0,) * 4])
-def test_an_orientation_that_is_none_is_refused_like_a_tilt(quaternion: tuple[float, float, float, float]):
-    with pytest.raises(DeviceError, match="tilt"):
-        LIMITS.check("robot", Pose(400.0, 0.0, 200.0, *quaternion), speed_mm_s=100.0, acc_mm_s2=500.0)
+def test_an_orientation_that_is_none_is_refused_like_a_tilt():
+    for quaternion in ((math.nan,) * 4, (0.0,) * 4):
+        with pytest.raises(LimitExceeded, match="tilt"):
+            LIMITS.check("robot", Pose(400.0, 0.0, 200.0, *quaternion), speed_mm_s=100.0, acc_mm_s2=500.0)
 
 
 @given(st.floats(-180.0, 180.0))
