@@ -113,7 +113,7 @@ async def test_a_controller_that_holds_few_lines_is_fed_as_it_takes_them(
     monkeypatch.setattr(queueing, "MOST_QUEUED", 2 * MOST_MOVES)
     queued: list[int] = []
     cabinet.before_each("MotionControl.moveLine", lambda _: queued.append(cabinet.queued))
-    await arm.follow(LONG, **WAY)
+    await arm.follow(LONG, speed_mm_s=200.0, acc_mm_s2=800.0)
     assert max(queued) == MOST_MOVES
     assert distance(cabinet.tool, LONG[-1])[0] <= 0.05
 
