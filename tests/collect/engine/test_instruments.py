@@ -22,12 +22,11 @@ from brushloop.drivers.host import Clock
 from brushloop.drivers.ink.port import DoseLost
 from brushloop.drivers.sim import world
 from brushloop.drivers.sim.faults import Device, Fault
-from brushloop.drivers.sim.world import push_on
 from brushloop.sessions.events import DipResult, PressResult
 from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.records import Topic
 from tests.rigs import Lab
-from tests.runs import answer, ended_by, question, until, wait_for_end
+from tests.runs import SteppedEngine, answer, ended_by, question, until, wait_for_end
 
 
 def slowly(lab: Lab) -> None:
@@ -36,17 +35,12 @@ def slowly(lab: Lab) -> None:
     lab.write_protocol("[11.0]", "[0.0]", dwell_s=60.0)
 
 
-def in_mid_press(lab: Lab, monkeypatch: pytest.MonkeyPatch, fault: Fault) -> None:
-    """The sensor has this fault as soon as the brush is 4 mm deep, once."""
-    push_n = push_on(lab.rig.config.brush)
-    hung: list[int] = []
-
-    def pushed_n(depth_mm: float, tilt_deg: float) -> float:
-        if depth_mm > 4.0 and not hung:
-            hung.append(lab.rig.faults.hang(fault))
-        return push_n(depth_mm, tilt_deg)
-
-    monkeypatch.setattr(world, "push_on", lambda _brush: pushed_n)
+def in_mid_press(lab: Lab) -> SteppedEngine:
+    """A run that stands still with the brush 4 mm deep."""
+    slowly(lab)
+    engine = lab.started()
+    until(engine, lambda _: lab.rig.world.tool().z_mm < 116.0)
+    return engine
 
 
 @pytest.mark.xdist_group("collected")
@@ -75,13 +69,10 @@ def test_something_hard_under_the_brush_stops_the_arm_at_once_and_burns_the_patc
     assert (len(lab.state.cut), len(lab.state.used_patches)) == (1, 1)
 
 
-def test_a_sensor_that_goes_silent_in_mid_press_stops_the_arm_and_the_press_is_done_again_elsewhere(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    in_mid_press(lab, monkeypatch, Fault(device=Device.FORCE, kind="silence", for_s=20.0))
+def test_a_sensor_that_goes_silent_in_mid_press_stops_the_arm_and_the_press_is_done_again_elsewhere(lab: Lab) -> None:
     lab.edit_rig("stale_ms = 1000.0", "stale_ms = 600.0")
-    slowly(lab)
-    engine = lab.started()
+    engine = in_mid_press(lab)
+    lab.rig.faults.hang(Fault(device=Device.FORCE, kind="silence", for_s=20.0))
     until(engine, lambda now: now.voids > 0)
     lab.rig.faults.clear()
     wait_for_end(engine)
@@ -98,12 +89,11 @@ def test_a_sensor_that_goes_silent_in_mid_press_stops_the_arm_and_the_press_is_d
     ],
 )
 def test_a_sensor_that_fails_in_mid_press_ends_the_run_with_the_brush_lifted(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch, fault: Fault, error: type[Exception], says: str
+    lab: Lab, fault: Fault, error: type[Exception], says: str
 ) -> None:
-    in_mid_press(lab, monkeypatch, fault)
-    slowly(lab)
-    with pytest.raises(error, match=says):
-        lab.run()
+    engine = in_mid_press(lab)
+    lab.rig.faults.hang(fault)
+    ended_by(engine, error, says)
     assert (len(lab.state.cut), len(lab.state.used_patches)) == (1, 1)
     assert lab.at_rest
     assert lab.rig.world.tool().z_mm > 170.0, "a sensor is at fault, the arm is in order"

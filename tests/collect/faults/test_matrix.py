@@ -6,7 +6,6 @@ however a run ends, it says so if the brush may be down, and what to do; and say
 
 from __future__ import annotations
 
-import asyncio
 import errno
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from typing import Any
 import pytest
 
 from brushloop.collect.engine.control import State
-from brushloop.collect.engine.engine import Engine
+from brushloop.collect.engine.snapshot import Snapshot
 from brushloop.collect.errors import describe
 from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.devices import Pose
@@ -35,13 +34,11 @@ from brushloop.sessions.recording import Recording
 from brushloop.sessions.store import SessionStore
 from tests.journal_lines import read_lines
 from tests.rigs import BARE, Lab
-from tests.runs import until, wait_for_end
+from tests.runs import SteppedEngine, until, wait_for_end
 
 FAST, SLOW = BARE.rate, 0.5
 """Seconds of the arm for each second of the driver."""
-LINE, POLL = "rob1.MotionControl.moveLine", "getSafetyModeType"
-WAITING, LET_GO = f"rob1.RobotState.{POLL}", "rob1.MotionControl.startMove"
-"""All lines of a press are sent before the first begins: its phases show while the driver waits."""
+POLL = "getSafetyModeType"
 STRUCK = {"on": POLL, "nth": 3}
 """In a move: the third time that the driver asks while it waits, some hundredths of a second after the start."""
 
@@ -56,9 +53,8 @@ def lab(bare_lab: Lab) -> Lab:
 
 @dataclass(frozen=True)
 class Moment:
-    """When a phase begins: with a call of `method`, in a step, with the arm on its way as `phase` says."""
+    """When a phase begins: in a step, with the arm on its way as `phase` says."""
 
-    method: str
     step: str = ""
     phase: Phase | None = None
     deep: bool = False
@@ -67,34 +63,20 @@ class Moment:
     """The kind of the step that a fault of the robot cuts, whose attempt is void: a void press has burnt its patch."""
 
 
+STILL = {"connecting": "getRobotNames", "powering": "rob1.RobotManage.poweron"}
+"""Phases in which nothing moves, with the request that begins each: the fault strikes that."""
 PHASES: dict[str, Moment] = {
-    "connecting": Moment("getRobotNames"),
-    "powering": Moment("rob1.RobotManage.poweron"),
-    "retreat": Moment(LINE, "retreat"),
-    "zero touch": Moment(LINE, "zero touch", Phase.DESCENDING, cuts="zero_touch"),
-    "dip": Moment(LINE, "dip", Phase.DIPPING, cuts="dip"),
-    "travel": Moment(LINE, "press", Phase.TRAVELLING, cuts="press"),
-    "descent": Moment(WAITING, "press", Phase.DESCENDING, deep=True, cuts="press"),
-    "at depth": Moment(WAITING, "press", Phase.DESCENDING, deep=True, cuts="press"),
-    "lift": Moment(WAITING, "press", Phase.LIFTING, cuts="press"),
-    "parking": Moment(LINE, "capture", cuts="capture"),
+    **dict.fromkeys(STILL, Moment()),
+    "retreat": Moment("retreat"),
+    "zero touch": Moment("zero touch", Phase.DESCENDING, cuts="zero_touch"),
+    "dip": Moment("dip", Phase.DIPPING, cuts="dip"),
+    "travel": Moment("press", Phase.TRAVELLING, cuts="press"),
+    "descent": Moment("press", Phase.DESCENDING, deep=True, cuts="press"),
+    "at depth": Moment("press", Phase.DESCENDING, deep=True, cuts="press"),
+    "lift": Moment("press", Phase.LIFTING, cuts="press"),
+    "parking": Moment("capture", cuts="capture"),
 }
 STEPS = ["zero_touch", "board", "dip", "press", "capture"]
-STILL = ("connecting", "powering")
-"""Phases in which nothing moves: there the fault strikes the request that begins the phase."""
-
-FAULTS: dict[str, dict[str, Any]] = {
-    "mute": {"kind": "mute", "count": ALWAYS},
-    "late": {"kind": "late", "late_s": 2.5},
-    "split": {"kind": "split", "count": ALWAYS},
-    "duplicate": {"kind": "duplicate", "count": ALWAYS},
-    "wrong id": {"kind": "wrong-id"},
-    "malformed": {"kind": "malformed"},
-    "drop": {"kind": "drop", "for_s": 0.3},
-    "protective stop": {"kind": "protective-stop"},
-    "emergency stop": {"kind": "emergency-stop"},
-    "frozen camera": {"device": "camera", "kind": "frozen", "count": ALWAYS},
-}
 
 
 @dataclass(frozen=True)
@@ -118,20 +100,20 @@ def but_for_a_press(outcome: Outcome) -> list[Outcome]:
     return [outcome] * 6 + [DONE] * 3 + [outcome]
 
 
-ROWS: dict[str, list[Outcome]] = {
+FAULTS: dict[str, tuple[dict[str, Any], list[Outcome]]] = {
     # connecting and powering, then the eight phases in which the arm moves or has just moved
-    "mute": [TIMEOUT] * 2 + [SILENT] * 8,
-    "late": but_for_a_press(TIMEOUT),
-    "split": [DONE] * 10,
-    "duplicate": [DONE] * 10,
-    "wrong id": but_for_a_press(TIMEOUT),
-    "malformed": but_for_a_press(VIOLATION),
-    "drop": but_for_a_press(LOST),
-    "protective stop": [UNSAFE] * 10,
-    "emergency stop": [UNSAFE] * 10,
-    "frozen camera": [BLIND] * 10,
+    "mute": ({"kind": "mute", "count": ALWAYS}, [TIMEOUT] * 2 + [SILENT] * 8),
+    "late": ({"kind": "late", "late_s": 2.5}, but_for_a_press(TIMEOUT)),
+    "split": ({"kind": "split", "count": ALWAYS}, [DONE] * 10),
+    "duplicate": ({"kind": "duplicate", "count": ALWAYS}, [DONE] * 10),
+    "wrong id": ({"kind": "wrong-id"}, but_for_a_press(TIMEOUT)),
+    "malformed": ({"kind": "malformed"}, but_for_a_press(VIOLATION)),
+    "drop": ({"kind": "drop", "for_s": 0.3}, but_for_a_press(LOST)),
+    "protective stop": ({"kind": "protective-stop"}, [UNSAFE] * 10),
+    "emergency stop": ({"kind": "emergency-stop"}, [UNSAFE] * 10),
+    "frozen camera": ({"device": "camera", "kind": "frozen", "count": ALWAYS}, [BLIND] * 10),
 }
-TABLE = {name: dict(zip(PHASES, outcomes, strict=True)) for name, outcomes in ROWS.items()}
+TABLE = {name: dict(zip(PHASES, outcomes, strict=True)) for name, (_, outcomes) in FAULTS.items()}
 PRESSING = ("descent", "at depth", "lift")
 
 
@@ -151,7 +133,7 @@ def patches() -> list[Any]:
 
 
 def fault_at(name: str, phase: str) -> Fault:
-    fields: dict[str, Any] = {"device": "robot"} | FAULTS[name]
+    fields: dict[str, Any] = {"device": "robot"} | FAULTS[name][0]
     if phase not in STILL and fields["device"] == "robot":
         # What strikes once strikes a request of the driver's own wait, all else whoever asks.
         once = fields.keys().isdisjoint({"count", "for_s"})
@@ -164,57 +146,45 @@ def fault_at(name: str, phase: str) -> Fault:
     return Fault.model_validate(fields)
 
 
-def arm_the_fault(lab: Lab, engine: Engine, name: str, phase: str) -> list[Pose | None]:
-    """Hang the fault as the phase begins, and slow down where a move is to be struck.
+def start_with_fault(lab: Lab, engine: SteppedEngine, name: str, phase: str) -> Pose | None:
+    """Start the run and hang the fault as the phase begins, with a slow arm where a move is to be struck.
 
-    The list will hold where that move was to end.
+    Return where that move was to end.
     """
     moment, fault, rig = PHASES[phase], fault_at(name, phase), lab.rig
-    methods = rig.arcs._methods
-    original: Callable[[dict[str, Any]], Any] = methods[moment.method]
-    targets: list[Pose | None] = []
-    slow = SLOW / 2 if TABLE[name]["connecting"] is TIMEOUT else SLOW  # or the arm is there when the time is out
+    if phase in STILL:
+        methods, request = rig.arcs._methods, STILL[phase]
+        carry_out = methods[request]
 
-    def now() -> bool:
-        if not engine.snapshot().step.startswith(moment.step):
-            return False
-        to = rig.world.target()
-        if moment.method == LINE and to is None:
-            return False  # already there
-        if moment.deep and (to is None or to.z_mm > rig.config.table.paper_z_mm - 1.0):
-            return False
-        return moment.phase is None or rig.faults.phase() is moment.phase
-
-    def watched(params: dict[str, Any]) -> Any:
-        if targets:
-            return original(params)
-        if moment.method != WAITING:
-            lab.rig.clock.shift(slow)  # or a line would be over before anyone has looked at it
-        result = original(params)
-        if now():
-            targets.append(rig.world.target())
+        def struck(params: dict[str, Any]) -> Any:
+            methods[request] = carry_out
             rig.faults.hang(fault)
-        if moment.method == WAITING and not targets:
-            return result
-        if not targets or moment.method not in (LINE, WAITING) or name == "frozen camera":
-            lab.rig.clock.shift(FAST)
-        elif TABLE[name]["connecting"] is DONE or carried_out(name, phase):
-            wait_s = 1.6 / slow if phase == "at depth" else 1.0 if phase in PRESSING else 0.3
-            asyncio.get_running_loop().call_later(wait_s, lab.rig.clock.shift, FAST)
-        return result
+            return carry_out(params)
 
-    let_go: Callable[[dict[str, Any]], Any] = methods[LET_GO]
+        methods[request] = struck
+        engine.start()
+        return None
+    engine.start()
+    until(engine, lambda now: now.step.startswith(moment.step))
+    slow = SLOW / 2 if TABLE[name]["connecting"] is TIMEOUT else SLOW  # or the arm is there when the time is out
+    rig.clock.shift(slow)
 
-    def slowly(params: dict[str, Any]) -> Any:
-        if moment.method == WAITING and not targets and engine.snapshot().step.startswith(moment.step):
-            lab.rig.clock.shift(slow)
-        return let_go(params)
+    def begins(_now: Snapshot) -> bool:
+        to = rig.world.target()
+        deep_enough = to is not None and (not moment.deep or to.z_mm < rig.config.table.paper_z_mm - 1.0)
+        return deep_enough and moment.phase in (None, rig.faults.phase())
 
-    methods[moment.method], methods[LET_GO] = watched, slowly
-    return targets
+    until(engine, begins)
+    target = rig.world.target()
+    rig.faults.hang(fault)
+    if TABLE[name]["connecting"] is DONE or TABLE[name][phase] is BLIND or carried_out(name, phase):
+        over_s = rig.time.now_s + (1.6 / slow if phase == "at depth" else 1.0 if phase in PRESSING else 0.3)
+        until(engine, lambda _: rig.time.now_s > over_s)
+        rig.clock.shift(FAST)
+    return target
 
 
-def end_of(engine: Engine) -> BaseException | None:
+def end_of(engine: SteppedEngine) -> BaseException | None:
     """What ended the run, once it is over."""
     try:
         wait_for_end(engine)
@@ -227,8 +197,7 @@ def end_of(engine: Engine) -> BaseException | None:
 def test_a_fault_in_a_phase_ends_as_the_table_says(lab: Lab, name: str, phase: str) -> None:
     expected = TABLE[name][phase]
     engine = lab.engine()
-    targets = arm_the_fault(lab, engine, name, phase)
-    engine.start()
+    target = start_with_fault(lab, engine, name, phase)
     ended = end_of(engine)
 
     assert lab.rig.faults.strikes, "the fault has struck"
@@ -245,7 +214,6 @@ def test_a_fault_in_a_phase_ends_as_the_table_says(lab: Lab, name: str, phase: s
         assert lab.rig.arcs.cabinet.power.safety != SafetyMode.NORMAL, "nothing is ever cleared automatically"
 
     assert lab.at_rest
-    [target] = targets
     if expected in (DONE, BLIND):
         assert lab.rig.faults.phase() is Phase.PARKED
     elif carried_out(name, phase):
@@ -262,7 +230,7 @@ def assert_it_stays_at_rest(lab: Lab) -> None:
     lab.rig.faults.clear()
     lab.rig.arcs.cabinet.release()
     lab.rig.clock.shift(FAST)
-    for method in (LET_GO, "RuntimeMachine.resume"):
+    for method in ("rob1.MotionControl.startMove", "RuntimeMachine.resume"):
         lab.rig.arcs._methods[method]({})
     lab.rig.time.pass_s(0.1)  # half a minute of the arm's time
     assert lab.rig.world.tool() == before
@@ -296,8 +264,7 @@ def assert_the_session_is_whole(lab: Lab, name: str, phase: str) -> None:
 
 def test_once_the_cause_is_mended_the_same_command_goes_on(lab: Lab) -> None:
     engine = lab.engine()
-    arm_the_fault(lab, engine, "drop", "travel")
-    engine.start()
+    start_with_fault(lab, engine, "drop", "travel")
     assert end_of(engine) is not None
     lab.rig.faults.clear()
     lab.rig.clock.shift(FAST)
@@ -308,14 +275,14 @@ def test_once_the_cause_is_mended_the_same_command_goes_on(lab: Lab) -> None:
 
 DOWN = "The brush may be down"
 DEEP_RATE = 2.0
-ENDS: dict[str, Callable[[Lab, Engine], object]] = {
+ENDS: dict[str, Callable[[Lab, SteppedEngine], object]] = {
     "a stop": lambda _, engine: engine.stop(),
     "a safety stop": lambda lab, _: lab.rig.arcs.cabinet.safety_stop(),
     "another client's stop": lambda lab, _: lab.rig.arcs.cabinet.stop(2.0, 2.0),
 }
 
 
-def said_at_the_end(engine: Engine) -> str:
+def said_at_the_end(engine: SteppedEngine) -> str:
     """The last line of the run, as the command prints it and as the screen shows it."""
     ended = end_of(engine)
     assert isinstance(ended, Exception)
