@@ -26,7 +26,7 @@ from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import MotionFailed
 from brushloop.sessions.events import ZeroTouchResult
 from tests.collect.sent import not_checked, not_sent
-from tests.collect.touch.conftest import Bench, MakeBench
+from tests.collect.touch.bench import Bench
 
 CORNERS = [(0.0, 0.0), (110.0, 0.0), (0.0, 80.0), (110.0, 80.0)]
 THREE: dict[str, Any] = {"points_mm": [(6.0, 4.0), (104.0, 4.0), (50.0, 76.0)]}
@@ -51,10 +51,8 @@ def worst_corner_mm(bench: Bench, result: ZeroTouchResult) -> float:
 
 
 @pytest.mark.parametrize("slope_deg", [(0.0, 0.0), (1.0, 0.0), (0.0, -1.0), (-0.7, 0.7)])
-async def test_the_plane_of_a_leaning_sheet_is_found_by_force(
-    make_bench: MakeBench, slope_deg: tuple[float, float]
-) -> None:
-    bench = make_bench(slope_deg, paper_z_mm=119.6)
+async def test_the_plane_of_a_leaning_sheet_is_found_by_force(tmp_path: Path, slope_deg: tuple[float, float]) -> None:
+    bench = Bench(tmp_path, slope_deg, paper_z_mm=119.6)
     result = await measured(bench, method="force", **THREE)
     assert max(map(abs, errors_mm(bench, result))) < 0.1
     assert worst_corner_mm(bench, result) < 0.06
@@ -66,7 +64,7 @@ async def test_the_plane_of_a_leaning_sheet_is_found_by_force(
     "sheets", [1, pytest.param(18, marks=[pytest.mark.soak, pytest.mark.timeout(300)], id="more than 200 touches")]
 )
 async def test_touches_by_camera_lie_within_150_um_of_the_truth_at_3_sigma(
-    make_bench: MakeBench, monkeypatch: pytest.MonkeyPatch, sheets: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sheets: int
 ) -> None:
     rng, errors, touches = np.random.default_rng(0), list[float](), list[Touch]()
     monkeypatch.setattr(
@@ -76,7 +74,7 @@ async def test_touches_by_camera_lie_within_150_um_of_the_truth_at_3_sigma(
         towards = rng.uniform(0.0, 2.0 * math.pi)
         lean_deg = 1.0 if seed % 2 else rng.uniform(0.0, 1.0)
         slope_deg = (lean_deg * math.cos(towards), lean_deg * math.sin(towards))
-        bench = make_bench(slope_deg, paper_z_mm=120.0 + rng.uniform(-1.5, 1.5), seed=seed)
+        bench = Bench(tmp_path, slope_deg, paper_z_mm=120.0 + rng.uniform(-1.5, 1.5), seed=seed)
         places = [(2.0, 2.0), (76.0, 2.0), (39.0, 31.0)]
         touches.clear()
         await measured(bench, method="camera", touches=4, points_mm=places)
@@ -99,17 +97,17 @@ async def test_touches_by_camera_lie_within_150_um_of_the_truth_at_3_sigma(
     ],
 )
 async def test_what_cannot_be_touched_ends_with_the_brush_lifted(
-    make_bench: MakeBench, touch: dict[str, Any], paper_z_mm: float, said: str
+    tmp_path: Path, touch: dict[str, Any], paper_z_mm: float, said: str
 ) -> None:
-    bench = make_bench(paper_z_mm=paper_z_mm)
+    bench = Bench(tmp_path, paper_z_mm=paper_z_mm)
     with pytest.raises(StepError, match=said):
         await measured(bench, **(PATCHES | touch))
     assert bench.lifted
     assert not bench.world.presses
 
 
-async def test_a_bump_under_the_sheet_is_refused(make_bench: MakeBench) -> None:
-    bench = make_bench()
+async def test_a_bump_under_the_sheet_is_refused(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
     four = [*THREE["points_mm"], (104.0, 76.0)]
 
     def lower_over_the_bump(pose: Pose) -> Pose:
@@ -126,9 +124,9 @@ async def test_a_bump_under_the_sheet_is_refused(make_bench: MakeBench) -> None:
     "error", [asyncio.CancelledError(), MotionFailed("robot", "moveLine", "rests 0.40 mm and 0.00 deg from the target")]
 )
 async def test_an_arm_that_was_stopped_or_failed_is_left_where_it_is(
-    make_bench: MakeBench, monkeypatch: pytest.MonkeyPatch, error: BaseException
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
 ) -> None:
-    bench = make_bench()
+    bench = Bench(tmp_path)
     move = bench.move
 
     async def held_up(target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
@@ -160,8 +158,8 @@ class Operator(Asker):
         return next((key for key, step in (("1", 1.0), ("2", 0.1), ("3", 0.02)) if gap_mm > step), "t")
 
 
-async def test_the_operator_jogs_until_it_touches(make_bench: MakeBench) -> None:
-    bench = make_bench((0.5, 0.5), paper_z_mm=120.4)
+async def test_the_operator_jogs_until_it_touches(tmp_path: Path) -> None:
+    bench = Bench(tmp_path, (0.5, 0.5), paper_z_mm=120.4)
     operator = Operator(bench)
     result = await measured(bench, operator, method="jog", **THREE)
     assert max(map(abs, errors_mm(bench, result))) < 0.021
@@ -169,8 +167,8 @@ async def test_the_operator_jogs_until_it_touches(make_bench: MakeBench) -> None
     assert bench.lifted
 
 
-async def test_a_jog_ends_at_the_travel_limit_and_says_so(make_bench: MakeBench) -> None:
-    bench = make_bench(paper_z_mm=110.0)
+async def test_a_jog_ends_at_the_travel_limit_and_says_so(tmp_path: Path) -> None:
+    bench = Bench(tmp_path, paper_z_mm=110.0)
     operator = Operator(bench, "x")
     with pytest.raises(NeedsOperator, match="touch 1 of 3"):
         await measured(bench, operator, method="jog")
@@ -219,10 +217,10 @@ FEW, MANY = [(4.0, 4.0), (70.0, 4.0), (36.0, 36.0)], [*((x, 4.0) for x in (4.0, 
     ("method", "points_mm"), [*((method, FEW) for method in ("taught", "force", "jog", "camera")), ("jog", MANY)]
 )
 async def test_no_touch_leaves_what_was_checked(
-    make_bench: MakeBench, method: str, points_mm: list[tuple[float, float]]
+    tmp_path: Path, method: str, points_mm: list[tuple[float, float]]
 ) -> None:
     """An operator jogs to the end of the travel at each point: touches that each find the paper lower do not add up."""
-    bench = make_bench((0.5, -0.5), paper_z_mm=119.4)
+    bench = Bench(tmp_path, (0.5, -0.5), paper_z_mm=119.4)
     touch: dict[str, Any] = {"method": method, "residual_mm": 9.0, "touches": 1, "points_mm": points_mm}
     config = bench.rig.config.model_copy(update={"touch": TouchConfig.model_validate(touch)})
     await measured(bench, Operator(bench, "t"), **touch)
@@ -236,8 +234,8 @@ async def test_no_touch_leaves_what_was_checked(
     assert min(pose.z_mm for pose in bench.sent) > 120.0 - config.touch.travel_mm - lean_mm
 
 
-async def test_the_self_check_presses_as_deep_as_was_checked(make_bench: MakeBench) -> None:
-    bench = make_bench(whole=True)
+async def test_the_self_check_presses_as_deep_as_was_checked(tmp_path: Path) -> None:
+    bench = Bench(tmp_path, whole=True)
     config, plane, sent = bench.rig.config, PaperPlane(120.0), bench.sent
     sheet = Sheet(config.paper)
     patches = (sheet.patch(0), *partners(sheet, sheet.patch(0), set()))
@@ -248,9 +246,9 @@ async def test_the_self_check_presses_as_deep_as_was_checked(make_bench: MakeBen
     assert min(pose.z_mm for pose in sent) == 120.0 - config.self_check.depth_mm
 
 
-def test_a_touch_that_the_operator_asks_for_by_key_is_checked_before_it(make_bench: MakeBench) -> None:
+def test_a_touch_that_the_operator_asks_for_by_key_is_checked_before_it(tmp_path: Path) -> None:
     """The rig visits a taught height near the arm; by jog it would touch where the arm may not go."""
-    config = make_bench().rig.config
+    config = Bench(tmp_path).rig.config
     limits = config.robot.limits.model_copy(update={"y_mm": (config.robot.limits.y_mm[0], -20.0)})
     there = config.model_copy(
         update={

@@ -7,6 +7,7 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from unittest.mock import AsyncMock
 
 import cv2
@@ -22,7 +23,7 @@ from brushloop.collect.rig.paper import Sheet, to_base
 from brushloop.collect.touch.selfcheck import LEGS_MM, Triangle, judge, partners, self_check, triangle_on
 from brushloop.drivers.devices import Pose
 from brushloop.sessions.events import SelfCheckResult
-from tests.collect.touch.conftest import Bench, MakeBench
+from tests.collect.touch.bench import Bench
 
 PLACES: Triangle = ((12.0, 8.0), (100.0, 8.0), (12.0, 68.0))
 COMMANDED = np.array(PLACES)
@@ -117,7 +118,7 @@ def test_a_wide_triangle_is_always_uneven_wide_and_on_free_patches(width: float,
             judge(places, mirrored, CONFIG)
 
 
-Fault = Callable[["Bench"], None]
+Fault = Callable[[Bench], None]
 
 
 def goes_to(change: Callable[[float, float], tuple[float, float]]) -> Fault:
@@ -181,10 +182,10 @@ CORNERS, ONE_PATCH = (0, 5, 36), (36,)
     ],
 )
 async def test_what_is_wrong_at_the_rig_is_described_with_the_brush_lifted(
-    make_bench: MakeBench, fault: Fault, patches: tuple[int, ...], why: str | None
+    tmp_path: Path, fault: Fault, patches: tuple[int, ...], why: str | None
 ) -> None:
     """Within one patch, a camera that is 2 % wrong is not seen."""
-    bench = make_bench(whole=True)
+    bench = Bench(tmp_path, whole=True)
     sheet = Sheet(bench.rig.config.paper)
     fault(bench)
     with contextlib.nullcontext() if why is None else pytest.raises(StepError, match=why):

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from brushloop.collect.motion import Procedures, photograph_moves
@@ -32,20 +31,30 @@ WHOLE_VIEW = View(width_px=1024, height_px=768, px_per_mm=3.125)
 @dataclass
 class Bench:
     """Arm, camera and force sensor over one world, the rig that they are, and its procedures beside a person who keeps
-    the well full. Time passes only when the arm moves."""
+    the well full. Time passes only when the arm moves. The operator taught 120 mm, whatever the paper's height is."""
 
-    sim: SimConfig
     folder: Path
+    """Where its `rig.toml` is written."""
+    slope_deg: tuple[float, float] = (0.0, 0.0)
+    """How a small sheet leans."""
+    paper_z_mm: float = 120.0
+    seed: int = 1
+    whole: bool = False
+    """Whether the sheet is of the usual size, at the height that was taught."""
     bent: Callable[[Pose], Pose] = lambda pose: pose
     """What the arm makes of a target: for arms that are mounted wrong."""
     sent: list[Pose] = field(default_factory=list[Pose])
     """Every target that the arm was sent."""
 
     def __post_init__(self) -> None:
+        table = replace(SMALL_TABLE, slope_deg=self.slope_deg, paper_z_mm=self.paper_z_mm)
+        self.sim = SimConfig(seed=self.seed, table=table, view=SMALL_VIEW)
+        if self.whole:
+            self.sim = SimConfig(seed=self.seed, view=WHOLE_VIEW)
         self.time = SimulatedTime()
         self.world = World(self.sim, SimClock(real_s=self.time.seconds))
         self.scene = Scene(self.world)
-        self.rng = np.random.default_rng(self.sim.seed)
+        self.rng = np.random.default_rng(self.seed)
         self.weight_n = self.world.wrench()[2]
         self.target = brush_pose(*self.sim.home_mm)
         text = re.sub(r"touch_z_mm = .*", "touch_z_mm = 120.0", rig_toml(self.sim))
@@ -107,25 +116,3 @@ class Bench:
         """Without wires no picture is late: there is no delay to measure."""
         await self.effector.go(*photograph_moves(self.rig.config))
         return await self.fresh(Stamp(self.time.now_ns()))
-
-
-MakeBench = Callable[..., Bench]
-
-
-@pytest.fixture
-def make_bench(tmp_path: Path) -> MakeBench:
-    """A small sheet that leans so, at that height; the operator taught 120 mm whatever it is. Or a `whole` one."""
-
-    def make(
-        slope_deg: tuple[float, float] = (0.0, 0.0),
-        *,
-        paper_z_mm: float = 120.0,
-        seed: int = 1,
-        whole: bool = False,
-    ) -> Bench:
-        if whole:
-            return Bench(SimConfig(seed=seed, view=WHOLE_VIEW), tmp_path)
-        table = replace(SMALL_TABLE, slope_deg=slope_deg, paper_z_mm=paper_z_mm)
-        return Bench(SimConfig(seed=seed, table=table, view=SMALL_VIEW), tmp_path)
-
-    return make
