@@ -329,18 +329,15 @@ def test_a_line_that_cannot_be_the_value_is_refused_where_it_is_typed(asked: Pro
         asked.read(line)
 
 
-async def test_a_step_that_is_taught_again_by_mistake_is_as_it_was_after_back(tmp_path: Path) -> None:
-    await led(Answering("6", "48", "20", "", "n", ""), tmp_path)
-    again = Answering(BACK)
-    visit = again.visit(tmp_path / "rig.toml")
-    before = visit.notebook
-    await Wizard(visit, (BrushStep(), ForceStep())).again("brush")
-    assert again.asked == [R]
-    assert visit.notebook == before
-
-
-async def test_a_step_is_taught_again_only_where_all_before_it_are_done(tmp_path: Path) -> None:
-    person = Person()
+async def test_a_step_is_taught_again_only_where_all_before_it_are_done_and_is_as_it_was_after_back(
+    tmp_path: Path,
+) -> None:
+    person, steps = Answering(BACK), (BrushStep(), ForceStep())
     with pytest.raises(CollectAborted, match="`force` depends on brush, which is not taught yet"):
-        await Wizard(person.visit(tmp_path / "rig.toml"), (BrushStep(), ForceStep())).again("force")
-    assert not person.asked
+        await Wizard(person.visit(tmp_path / "rig.toml"), steps).again("force")
+    await led(Answering("6", "48", "20", "", "n", ""), tmp_path)
+    visit = person.visit(tmp_path / "rig.toml")
+    before = visit.notebook
+    await Wizard(visit, steps).again("brush")
+    assert person.asked == [R]
+    assert visit.notebook == before, "it was taught again by mistake"

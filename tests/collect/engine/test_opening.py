@@ -67,10 +67,12 @@ def refused() -> list[str]:
     return str(caught.value).splitlines()
 
 
-def test_what_did_not_change_is_gone_on_with(lab: Path) -> None:
+def test_what_did_not_change_is_gone_on_with_unless_its_old_values_cannot_be_read(lab: Path) -> None:
     edit("rig.toml", "port = 30004", "port = 31004")  # where a device is may change
     edit("rig.toml", "[paper]", "# measured again\n[paper]")
     assert find_resumable(opening()) == Path("sessions/grid-01")
+    Path("sessions/grid-01/rig.effective.json").write_text("{")
+    assert refused()[1] == "rig.toml: its earlier content is missing or damaged"
 
 
 @pytest.mark.parametrize("trouble", ["damaged", "linked"])
@@ -122,11 +124,6 @@ def test_a_changed_row_of_a_side_file_is_named_by_its_number(lab: Path) -> None:
     assert refused()[1:] == ["protocol.toml: presses.1.depth_mm: 12.0 -> 13.0", WAY_OUT]
     Path("p.csv").write_text("depth_mm\n11\n")
     assert refused()[1] == "protocol.toml: presses.1.depth_mm: 12.0 -> left out"
-
-
-def test_a_session_whose_old_values_cannot_be_read_is_not_gone_on_with(lab: Path) -> None:
-    Path("sessions/grid-01/rig.effective.json").write_text("{")
-    assert refused()[1] == "rig.toml: its earlier content is missing or damaged"
 
 
 def test_where_hardware_may_move_the_rig_is_checked_first_unless_it_is_switched_off(lab: Path) -> None:

@@ -285,17 +285,14 @@ def test_a_session_is_collected_straight_and_holds_its_lens(bent_lab: Lab) -> No
     assert len(state.used_patches) == 4 + 3 * len(state.cut)
 
 
-def test_without_the_lens_file_the_run_ends_before_ink_and_names_the_remedy(bent_lab: Lab) -> None:
+def test_without_its_lens_file_the_run_ends_before_ink_and_names_the_remedy(bent_lab: Lab) -> None:
     with pytest.raises(StepError, match=r"the lens bends straight lines: .*camera\.lens_file"):
         bent_lab.run()
     assert not bent_lab.state.used_patches
-
-
-def test_what_is_no_lens_file_is_refused_in_one_line(bent_lab: Lab) -> None:
     lens = with_lens_file(bent_lab)
     lens.write_text(lens.read_text().replace("a board", "another"))
     with pytest.raises(ConfigError, match=r"rig.toml: camera.lens_file: .*was edited"):
-        load_rig(bent_lab.folder / "rig.toml")
+        bent_lab.run()
 
 
 def test_a_board_that_moved_is_searched_again_and_one_that_is_hidden_lies_where_it_was_seen_last() -> None:

@@ -246,7 +246,9 @@ def test_rows_become_part_of_the_protocol_and_an_empty_cell_is_left_out(tmp_path
     assert load(tmp_path, LIST, "depth_mm\n13\n").model_dump_json() != listed.model_dump_json()
 
 
-def test_rows_and_bytes_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_and_bytes_are_bounded_and_what_is_no_file_is_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(ConfigError, match=r"p.csv: line 10002: more than 10000 rows"):
         load(tmp_path, LIST, "depth_mm\n" + "11\n" * 10_001)
     monkeypatch.setattr(protocol_config, "MAX_TABLE_BYTES", 1000)
@@ -255,6 +257,12 @@ def test_rows_and_bytes_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(protocol_config, "MAX_PROTOCOL_BYTES", 100)
     with pytest.raises(ConfigError, match=r"protocol.toml: is larger than 100 bytes"):
         load(tmp_path, LIST + "#" * 200, "depth_mm\n11\n")
+    (tmp_path / "p.csv").unlink()
+    os.mkfifo(tmp_path / "p.csv")
+    with pytest.raises(ConfigError, match=r"p.csv: is not a file"):
+        load(tmp_path, LIST)
+    with pytest.raises(ConfigError, match=r"is not a file"):
+        load_protocol(tmp_path)
 
 
 def test_strokes_and_points_are_bounded_over_the_whole_protocol(tmp_path: Path) -> None:
@@ -264,14 +272,6 @@ def test_strokes_and_points_are_bounded_over_the_whole_protocol(tmp_path: Path) 
     figures = "".join(f'[[figures]]\nname = "f{k}"\n[[figures.strokes]]\nfile = "p.csv"\n' for k in range(12))
     with pytest.raises(ConfigError, match=r"10800 points in all, at most 10000"):
         load(tmp_path, f'kind = "write"\ncell_mm = [60.0, 60.0]\n{figures}', "x_mm,y_mm,depth_mm\n" + rows)
-
-
-def test_what_is_no_file_is_not_read(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "p.csv")
-    with pytest.raises(ConfigError, match=r"p.csv: is not a file"):
-        load(tmp_path, LIST)
-    with pytest.raises(ConfigError, match=r"is not a file"):
-        load_protocol(tmp_path)
 
 
 @given(st.binary(max_size=200) | st.text(max_size=200).map(str.encode))

@@ -101,12 +101,18 @@ def rig(tmp_path: Path) -> Path:
     return rig_file(tmp_path)
 
 
-def test_the_loopback_rig_contradicts_nothing_and_what_is_missing_is_said(rig: Path) -> None:
+def test_the_loopback_rig_contradicts_nothing_a_contradiction_ends_with_code_5_and_an_unusable_file_with_code_2(
+    rig: Path,
+) -> None:
     ran = brushloop("rig", "check", rig)
     assert ran.returncode == 0
     assert "plausible     tool length" in ran.stdout
     assert re.search(r"not measured  lens +not calibrated", ran.stdout)
     assert ran.stdout.rstrip().endswith("10 values are plausible, 0 contradict others, 7 were not measured")
+    assert brushloop("rig", "check", rig_file(rig.parent, "max_depth_mm = 22.0", "max_depth_mm = 47.0")).returncode == 5
+    ran = brushloop("rig", "check", rig_file(rig.parent, "safe_z_mm = 180.0", "safe_z_mm = 18.0"))
+    assert (ran.returncode, ran.stderr.count("\n")) == (2, 1)
+    assert "motion.safe_z_mm = 18 is below" in ran.stderr
 
 
 @pytest.mark.parametrize(
@@ -129,15 +135,6 @@ def test_a_value_that_cannot_be_true_is_named_with_its_remedy(
     assert checks[name].verdict == "contradicts"
     assert checks[name].allowed
     assert remedy in checks[name].remedy
-
-
-def test_values_that_contradict_each_other_end_with_code_5_and_a_file_that_cannot_be_used_with_code_2(
-    rig: Path,
-) -> None:
-    assert brushloop("rig", "check", rig_file(rig.parent, "max_depth_mm = 22.0", "max_depth_mm = 47.0")).returncode == 5
-    ran = brushloop("rig", "check", rig_file(rig.parent, "safe_z_mm = 180.0", "safe_z_mm = 18.0"))
-    assert (ran.returncode, ran.stderr.count("\n")) == (2, 1)
-    assert "motion.safe_z_mm = 18 is below" in ran.stderr
 
 
 def test_what_is_shown_is_where_the_tip_goes(rig: Path) -> None:
