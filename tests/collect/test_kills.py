@@ -96,11 +96,10 @@ def session(lab: Lab, toll: Toll, kills: int) -> None:
     before = len(lab.presses)
     finished: dict[str, str] = {}
     while True:
-        known = events(lab)
         life_s = START_S + STROKE_S * strokes_left(lab)
         process, began = lab.process(), time.monotonic()
         if kills > 0:
-            wait_for_a_moment(lab, process, toll.rng, toll.pace * life_s, len(known))
+            wait_for_a_moment(lab, process, toll.rng, toll.pace * life_s)
             if process.poll() is None:
                 process.kill()
             in_paper = check_the_brush_lifts(lab)
@@ -115,19 +114,19 @@ def session(lab: Lab, toll: Toll, kills: int) -> None:
         check_nothing_was_taken_back(lab, finished)
         if process.returncode != -signal.SIGKILL:
             assert process.returncode == 0, stderr
-        if "closed" in events(lab):
+        if state(lab).closed is not None:
             break
     check(lab, before)
     toll.sessions += 1
 
 
-def wait_for_a_moment(lab: Lab, process: subprocess.Popen[str], rng: random.Random, life_s: float, known: int) -> None:
+def wait_for_a_moment(lab: Lab, process: subprocess.Popen[str], rng: random.Random, life_s: float) -> None:
     """Wait until some random moment of the process's life, or its end.
 
     Some moments are drawn evenly from its whole life, the others are aimed at what takes little of it.
     """
     aim = rng.choice(["life", "life", "press", "press", "opening", "step", "close"])
-    press_s = BELOW_S / lab.rig.config.rate
+    known, press_s = written(lab), BELOW_S / lab.rig.config.rate
     after_s = rng.uniform(0.0, {"life": life_s, "press": press_s}.get(aim, 0.3))
     deadline = time.monotonic() + LONGEST_LIFE_S
 
@@ -138,10 +137,10 @@ def wait_for_a_moment(lab: Lab, process: subprocess.Popen[str], rng: random.Rand
 
     match aim:
         case "opening":
-            until(lambda: len(events(lab)) > known)
+            until(lambda: written(lab) > known)
         case "step":
-            begun = rng.randint(1, 12)
-            until(lambda: events(lab)[known:].count("begin") >= begun)
+            begun = state(lab).begun + rng.randint(1, 12)
+            until(lambda: state(lab).begun >= begun)
         case "press":
             until(lambda: above_mm(lab) < 7.5)
         case "close":
@@ -159,9 +158,10 @@ def journal(lab: Lab) -> Path | None:
     return found[0] if found else None
 
 
-def events(lab: Lab) -> list[str]:
+def written(lab: Lab) -> int:
+    """Bytes of the journal."""
     path = journal(lab)
-    return [] if path is None else [str(line["event"]) for line in read_lines(path)]
+    return 0 if path is None else path.stat().st_size
 
 
 def state(lab: Lab) -> RunState:

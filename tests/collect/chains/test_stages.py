@@ -224,11 +224,6 @@ CELL = 'kind = "write"\ncell_mm = [48.0, 48.0]\nrepeats = {repeats}\n[[figures]]
 POINTS = "points = [[10.0, 24.0, 3.0, 0.0, 0.0], [20.0, 24.0, 3.0, 0.0, 0.0]]\n"
 
 
-def plan_of(settled: bool) -> Plan:
-    figure = Figure(name="子", source="", settled=settled)
-    return Plan(model="", planned_by=PlannedBy(), cell_mm=48.0, software="", figures=(figure,))
-
-
 class Commands:
     """Stands in for brushloop's commands: writes what each would leave."""
 
@@ -262,8 +257,9 @@ class Commands:
         self.ran.append(name)
         folder.mkdir(parents=True)
         (folder / PROTOCOL).write_text(CELL.format(repeats=repeats) + POINTS, encoding="utf-8")
-        settled = self._rounds >= self._settled_after
-        (folder / PLAN).write_text(plan_of(settled).model_dump_json(), encoding="utf-8")
+        figure = Figure(name="子", source="", settled=self._rounds >= self._settled_after)
+        plan = Plan(model="", planned_by=PlannedBy(), cell_mm=48.0, software="", figures=(figure,))
+        (folder / PLAN).write_text(plan.model_dump_json(), encoding="utf-8")
         return Written(folder / PROTOCOL, ())
 
 

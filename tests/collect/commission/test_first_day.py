@@ -62,22 +62,6 @@ def quick_camera(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(camera, "LATE_MS", 800.0)
 
 
-@pytest.fixture
-def soaking(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Limits on time that the host's clock measures: the machine may be busy, and simulated time runs fast.
-
-    Pictures are drawn by the processor that also takes them, and six simulated seconds pass in one of the host's.
-    """
-    monkeypatch.setattr(camera, "LATE_MS", 2500.0)
-    for name, value in {
-        "MOTION__LEAST_DWELL_S": 0.05 * SOAK_RATE,
-        "FORCE__STALE_MS": 2000,
-        "CAMERA__MAX_JITTER_MS": 2000,
-        "CAMERA__MAX_DELAY_MS": 3000,
-    }.items():
-        monkeypatch.setenv(f"BRUSHLOOP_{name}", str(value))
-
-
 def hurried(person: InLab) -> InLab:
     """A person who leaves the lens out."""
     bring = person.bring
@@ -183,9 +167,18 @@ def _words_on(person: InLab, trap: Trap) -> str:
 
 @pytest.mark.soak
 @pytest.mark.timeout(1800)
-@pytest.mark.usefixtures("soaking")
 @pytest.mark.parametrize("seed", range(30))
-async def test_thirty_labs(seed: int, tmp_path: Path) -> None:
+async def test_thirty_labs(seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Limits on time that the host's clock measures: the machine may be busy, and simulated time runs fast. Pictures are
+    # drawn by the processor that also takes them, and six simulated seconds pass in one of the host's.
+    monkeypatch.setattr(camera, "LATE_MS", 2500.0)
+    for name, value in {
+        "MOTION__LEAST_DWELL_S": 0.05 * SOAK_RATE,
+        "FORCE__STALE_MS": 2000,
+        "CAMERA__MAX_JITTER_MS": 2000,
+        "CAMERA__MAX_DELAY_MS": 3000,
+    }.items():
+        monkeypatch.setenv(f"BRUSHLOOP_{name}", str(value))
     trap, began_s = TRAPPED.get(seed), time.monotonic()
     with in_lab(seed, trap, rate=SOAK_RATE) as person:
         person.mends = trap is not None

@@ -22,7 +22,6 @@ from brushloop.collect.rig.config import PaperConfig, SelfCheckConfig
 from brushloop.collect.rig.paper import Sheet, to_base
 from brushloop.collect.touch.selfcheck import LEGS_MM, Triangle, judge, partners, self_check, triangle_on
 from brushloop.drivers.devices import Pose
-from brushloop.sessions.events import SelfCheckResult
 from tests.collect.touch.bench import Bench
 
 PLACES: Triangle = ((12.0, 8.0), (100.0, 8.0), (12.0, 68.0))
@@ -80,11 +79,6 @@ def test_no_turn_passes_for_a_mirror_nor_a_mirror_for_a_turn(noise: int, turn_de
     elif 2.0 < turn_deg < 358.0:
         with pytest.raises(StepError, match="the marks are turned by"):
             judge(COMMANDED, found, CONFIG)
-
-
-async def checked(bench: Bench, places: Triangle = PLACES) -> SelfCheckResult:
-    bench.effector.rig = bench.rig  # with the board that the test gave it
-    return await self_check(bench.effector, places, bench.effector.dip)
 
 
 def paper(size_x_mm: float, size_y_mm: float) -> PaperConfig:
@@ -188,6 +182,7 @@ async def test_what_is_wrong_at_the_rig_is_described_with_the_brush_lifted(
     bench = Bench(tmp_path, whole=True)
     sheet = Sheet(bench.rig.config.paper)
     fault(bench)
+    bench.effector.rig, places = bench.rig, triangle_on([sheet.patch(index) for index in patches])
     with contextlib.nullcontext() if why is None else pytest.raises(StepError, match=why):
-        await checked(bench, triangle_on([sheet.patch(index) for index in patches]))
+        await self_check(bench.effector, places, bench.effector.dip)
     assert bench.lifted

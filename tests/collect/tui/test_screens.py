@@ -37,7 +37,6 @@ from tests.collect.tui.fake import (
     FakeBrowser,
     FakeEngine,
     Watched,
-    a_review,
     app_of,
     full_picture,
     picture,
@@ -294,18 +293,6 @@ async def test_other_files_can_be_typed_and_letters_of_stop_keys_too() -> None:
         assert "2  examples/protocol-list.toml" in await settled(pilot)
         await pilot.press("2", "enter")
         assert "rig s2.toml   protocol examples/protocol-list.toml" in await settled(pilot)
-
-
-async def test_no_note_is_typed_while_a_run_is_in_progress(tmp_path: Path) -> None:
-    async with watched(picture(state=State.PAUSED), (120, 40)) as run:
-        run.app.push_screen(review := a_review(tmp_path, run.app))
-        text = await settled(run.pilot)
-        for words in ("red button", "s STOP"):
-            assert words in text
-        assert "o Note" not in text
-        await run.press("o", "s")
-        assert run.engine.calls == ["stop"]
-        assert run.app.screen is review
 
 
 async def test_a_session_is_analysed_and_the_rig_asked_in_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -148,10 +148,15 @@ async def test_a_day_at_the_rig(lab: Lab) -> None:
         await operator.press("space")
         await operator.until(lambda now: now.step.startswith(("dip", "press")))
 
-        # stop; nothing is left of it on the start screen but an open session
-        await operator.press("s")
+        # stop, over a review in which no note is typed meanwhile; nothing is left but an open session
+        await operator.press("v")
+        await operator.sees(ReviewScreen, "red button", "s STOP")
+        assert "o Note" not in shown(app)
+        await operator.press("o", "s")
         stopped = operator.engine
         await asyncio.to_thread(runs.ended_by, stopped, CollectAborted)
+        await operator.sees(ReviewScreen)
+        await operator.press("escape")
         await operator.sees(RunScreen, "STOPPED", "Over: q leaves")
         now = stopped.snapshot()
         assert 1 <= now.strokes_done < STROKES
