@@ -48,14 +48,11 @@ ERROR = (
 )
 
 
-def grid_of(done: int) -> list[ConditionCount]:
-    conditions = [Condition(h, a) for h in HEIGHTS_MM for a in TILTS_DEG]
-    return [ConditionCount(asked, min(max(done - 2 * n, 0), 2), 2) for n, asked in enumerate(conditions)]
-
-
 def marked_grid() -> tuple[ConditionCount, ...]:
-    """Every sign once: a bad take, one left out, one now, one next; the more important of two."""
-    cells = grid_of(13)
+    """Thirteen strokes of thirty, and every sign once: a bad take, one left out, one now, one next; the more important
+    of two."""
+    conditions = [Condition(h, a) for h in HEIGHTS_MM for a in TILTS_DEG]
+    cells = [ConditionCount(asked, min(max(13 - 2 * n, 0), 2), 2) for n, asked in enumerate(conditions)]
     cells[1] = replace(cells[1], bad=2)
     cells[3] = replace(cells[3], done=1, left_out=1, bad=3)
     cells[6] = replace(cells[6], now=True, bad=1)
@@ -63,11 +60,11 @@ def marked_grid() -> tuple[ConditionCount, ...]:
     return tuple(cells)
 
 
-def sheet_of(used: int) -> SheetMap:
-    marks: list[Mark | None] = [Mark.KEPT] * used
-    marks[2], marks[5], marks[0] = Mark.BAD, Mark.VOID, Mark.CHECK
-    marks[-1] = Mark.NOW
-    return SheetMap(1, 6, (*marks, *([None] * (42 - used))))
+def marked_sheet() -> SheetMap:
+    """Seventeen used patches of 42, with every sign."""
+    marks: list[Mark | None] = [Mark.KEPT] * 17
+    marks[2], marks[5], marks[0], marks[-1] = Mark.BAD, Mark.VOID, Mark.CHECK, Mark.NOW
+    return SheetMap(1, 6, (*marks, *([None] * 25)))
 
 
 def blot(size: int = 128) -> np.ndarray[Any, np.dtype[np.bool_]]:
@@ -76,24 +73,22 @@ def blot(size: int = 128) -> np.ndarray[Any, np.dtype[np.bool_]]:
     return ((x - 0.5) / 0.35) ** 2 + ((y - 0.5) / (0.04 + 0.12 * x)) ** 2 < 1.0
 
 
-def checks(*, split: bool = False) -> Verdict:
-    score, reason = (0.42, "The tip is split.") if split else (0.02, "")
-    return Verdict(
+def capture(*, kept: bool = True) -> LastCapture:
+    """The last one, whose tip is split if it is not kept."""
+    score, reason = (0.02, "") if kept else (0.42, "The tip is split.")
+    verdict = Verdict(
         (
             Check(name="exposure", score=201.0, unit="of 255", threshold=250.0, passed=True),
             Check(name="blurred", score=0.11, unit="mm", threshold=0.25, passed=True),
             Check(name="dry", score=0.06, threshold=0.125, passed=True),
-            Check(name="split", score=score, unit="mm", threshold=0.3, passed=not split, reason=reason),
+            Check(name="split", score=score, unit="mm", threshold=0.3, passed=kept, reason=reason),
         )
     )
-
-
-def capture(*, kept: bool = True) -> LastCapture:
     binary = blot()
     photo = np.where(binary, 45, 205).astype(np.uint8).repeat(4, axis=0).repeat(4, axis=1)
     model = mark_of(FittedPress(6.0, 48.0), Condition(15.0, 5.0))
     press = Press(stroke_id="H15-a5-r01", condition=Condition(15.0, 5.0))
-    return LastCapture(press, 41, kept, checks(split=not kept), photo, binary, model)
+    return LastCapture(press, 41, kept, verdict, photo, binary, model)
 
 
 def camera_picture() -> Picture:
@@ -112,7 +107,7 @@ def picture(**changes: Any) -> Snapshot:
         step="press H15-a5-r02",
         strokes_done=13,
         strokes_planned=30,
-        grid=tuple(grid_of(13)),
+        grid=marked_grid(),
         voids=1,
         elapsed_s=185.0,
         eta_s=242.0,
@@ -126,14 +121,13 @@ def picture(**changes: Any) -> Snapshot:
 def full_picture(**changes: Any) -> Snapshot:
     """The same with everything that a screen can show."""
     values: dict[str, Any] = {
-        "grid": marked_grid(),
         "target_mm": (123.4, -45.25, 7.0),
         "force_n": 0.041,
         "force_ceiling_n": 5.0,
         "ink_level": 0.63,
         "given_up": 1,
         "trace_n": tuple(0.03 * max(0.0, math.sin(n / 9)) for n in range(70, 120)),
-        "sheet": sheet_of(17),
+        "sheet": marked_sheet(),
         "last": capture(),
         "picture": camera_picture(),
         "folder": "",
