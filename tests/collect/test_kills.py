@@ -36,10 +36,10 @@ from tests.waiting import PATIENCE_S, wait_until
 LONGEST_LIFE_S = 120.0
 START_S, STROKE_S = 3.2, 0.9
 """How long a process takes before its first step, and for each stroke; corrected by what lives really take."""
-BELOW_S = 20.0
-"""Of the rig's time, from the beginning of a slow descent to the brush above the paper again."""
+BELOW_S = 10.0
+"""Of the rig's time, that the brush is in the paper in a slow press."""
 WITHIN_S = 120.0
-"""The same from a kill on, whatever it cut: a dwell of a minute included."""
+"""The same from a kill to the end of whatever it cut: a dwell of a minute included."""
 SAME_SPOT_MM = 10.0
 """Patches are at least 24 mm apart."""
 
@@ -142,7 +142,7 @@ def wait_for_a_moment(lab: Lab, process: subprocess.Popen[str], rng: random.Rand
             begun = state(lab).begun + rng.randint(1, 12)
             until(lambda: state(lab).begun >= begun)
         case "press":
-            until(lambda: above_mm(lab) < 7.5)
+            until(lambda: above_mm(lab) < -TOUCH_DEPTH_MM)
         case "close":
             until(lambda: strokes_left(lab) == 0)
         case _:
