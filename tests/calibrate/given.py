@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import functools
 import itertools
 import json
@@ -34,6 +35,13 @@ from brushloop.sessions.messages import encode_png, image_message
 from brushloop.sessions.recording import Capture
 from brushloop.sessions.records import Header, Source, Stroke, Topic
 from brushloop.sessions.store import SessionStore
+
+
+def rows_of(table: Path) -> list[dict[str, str]]:
+    """The rows of a CSV file, by their columns."""
+    with table.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
 
 T0_NS, MINUTE_NS = 1_700_000_000_000_000_000, 60_000_000_000
 
@@ -131,15 +139,10 @@ def blank_press(stroke_id: str, depth_mm: float, tilt_deg: float, session: str =
     return Press(session, "", stroke, images, coverage, (0.0, 0.0), Measured(1.0, 1.0, 1.0, 1.0, 1.0), False)
 
 
-def kept_lens(
-    folder: Path,
-    size_px: tuple[int, int],
-    k1: float,
-    focal_px: float = 1024.0,
-    centre_off_px: tuple[float, float] = (0, 0),
-) -> Path:
-    """A lens file as `camera intrinsics` would write it."""
-    centre = ((side - 1) / 2 + off for side, off in zip(size_px, centre_off_px, strict=True))
+def kept_lens(folder: Path, size_px: tuple[int, int], k1: float, off_px: float = 0.0) -> Path:
+    """A lens file as `camera intrinsics` would write it: of a rig's camera, off in focus and centre by so much."""
+    focal_px = size_px[0] + 2.0 * off_px
+    centre = (0.5 * (size_px[0] - 1) + off_px, 0.5 * (size_px[1] - 1) - off_px)
     lens = Lens(size_px=size_px, matrix=(focal_px, focal_px, *centre), distortion=(k1, 0.0, 0.0, 0.0, 0.0))
     return LensFile(
         software="brushloop test",

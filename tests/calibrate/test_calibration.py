@@ -203,7 +203,7 @@ WORST_ANCHOR_MM = 0.1
 
 def rig_lens(folder: Path, k1: float, size_px: tuple[int, int] = (2048, 1536)) -> Path:
     """A lens file for a rig's camera, a little off in focus and centre."""
-    return kept_lens(folder, size_px, k1 + 0.002, size_px[0] + 1.0, (0.5, -0.5))
+    return kept_lens(folder, size_px, k1 + 0.002, off_px=0.5)
 
 
 @pytest.fixture(scope="module")

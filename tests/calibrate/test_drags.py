@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 from pathlib import Path
@@ -35,6 +34,7 @@ from brushloop.calibrate.stroke.preprocess import Measured, measure
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
 from brushloop.model.drag import DragModel, Drawings, ink, lagging
 from brushloop.sessions.records import Header, Source, Stroke
+from tests.calibrate.given import rows_of
 from tests.command import brushloop, refused, said
 from tests.photographed import imported, photograph
 
@@ -184,8 +184,7 @@ def test_defects_are_listed_and_the_source_is_told_everywhere(tmp_path: Path) ->
         assert f"not fitted: {words}" in lines
     assert html.count("imported simulation") >= 3
     assert "imported photographs" not in html
-    with (tmp_path / "measured.csv").open() as file:
-        rows = {row["stroke_id"]: row for row in csv.DictReader(file)}
+    rows = {row["stroke_id"]: row for row in rows_of(tmp_path / "measured.csv")}
     assert [name for name, row in rows.items() if row["cut"] == "1"] == ["cut"]
     assert rows["whole"]["source"] == "imported simulation"
 
@@ -220,8 +219,7 @@ def test_real_dragged_strokes_are_all_found_and_follow_their_commands(
     assert imported.returncode == 0, imported.stderr
     ran = brushloop("validate", tmp_path / "sessions" / name, cwd=tmp_path)
     assert ran.returncode == 0, ran.stderr
-    with (tmp_path / "sessions" / name / "validation" / "measured.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(tmp_path / "sessions" / name / "validation" / "measured.csv")
     assert len(rows) == strokes
     for command, correlation in least.items():
         size = {"length_mm": "measured_length_mm"}.get(command, "measured_mid_width_mm")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import sys
 from pathlib import Path
@@ -25,6 +24,7 @@ from brushloop.sessions.imports import ImportOptions
 from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Check, Quality, Topic, Wrench
+from tests.calibrate.given import rows_of
 from tests.calibrate.simulated_rigs import collected, sheet, true_mask
 from tests.command import refused, said
 from tests.sessions.conftest import no_space
@@ -33,11 +33,6 @@ from tests.sessions.conftest import no_space
 @pytest.fixture
 def to(tmp_path):
     return tmp_path / "exported"
-
-
-def rows_of(table):
-    with table.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
 
 
 def test_the_photographs_are_those_of_the_recording_byte_for_byte(make, closed, to):

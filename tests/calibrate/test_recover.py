@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -31,6 +30,7 @@ from brushloop.collect.protocols.kinds import ListConfig
 from brushloop.model.ccdbsm import Brush, ccdbsm
 from brushloop.model.raster import coverage
 from brushloop.sessions.records import Condition
+from tests.calibrate.given import rows_of
 from tests.command import said
 from tests.photographed import imported
 
@@ -71,8 +71,7 @@ def test_a_session_is_inverted_and_can_be_replayed(tmp_path: Path) -> None:
     assert isinstance(protocol, ListConfig)
     assert protocol.of == "shots"
     assert [press.stroke_id for press in protocol.presses] == ["p0", "p1", "p2"]
-    with out.open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(out)
     assert rows[0]["commanded_depth_mm"] == "12"
     assert rows[0]["source"] == "imported photographs"
     for row, press, (height, tilt) in zip(rows, protocol.presses, PRESSES, strict=True):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import pytest
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.stroke.difference import new_stroke
 from brushloop.calibrate.stroke.preprocess import PX_PER_MM, measure, prepare, rectify, rescale
+from tests.calibrate.given import rows_of
 
 PAGE = (800, 800)
 
@@ -161,8 +161,7 @@ def test_a_page_on_which_nothing_came_is_refused() -> None:
 @pytest.mark.soak  # half a minute
 @pytest.mark.skipif(not DATA.is_dir(), reason="the real page sequence is not here")
 def test_on_a_real_page_every_stroke_is_found_where_it_should_begin() -> None:
-    with (DATA / "strokes.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(DATA / "strokes.csv")
     assert len(rows) == 40
     for row in rows:
         before, after = (cv2.imread(str(DATA / row[name]), 0) for name in ("before", "after"))

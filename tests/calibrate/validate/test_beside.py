@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import shutil
 from pathlib import Path
@@ -16,7 +15,7 @@ from brushloop.calibrate.compare import TABLE_1
 from brushloop.calibrate.validate.tables import NORMAL, STRICT, Report, table_1, table_3
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Source
-from tests.calibrate.given import loop_record, table_of, written_record
+from tests.calibrate.given import loop_record, rows_of, table_of, written_record
 from tests.command import refused, said
 
 FAST = ("--model", "line", "--no-held-out")
@@ -66,8 +65,8 @@ def test_a_loop_in_the_session_is_the_third_row_of_table_1(place: Path) -> None:
     assert row.scores.csim.range_and_avg == pytest.approx((94.5, 94.0, 94.25))
     assert row.scores.ssim.range_and_avg == pytest.approx((84.5, 84.0, 84.25))
     assert row.paper == TABLE_1["robot writing"]
-    with (place / "validation" / "summary.csv").open() as file:
-        rows = [r for r in csv.DictReader(file) if r["model"] == f"robot writing ({place.name}-replay)"]
+    summary = rows_of(place / "validation" / "summary.csv")
+    rows = [row for row in summary if row["model"] == f"robot writing ({place.name}-replay)"]
     assert len(rows) == 2 * 2 * 2
     assert {(r["source"], r["below_ceiling"]) for r in rows} == {("imported photographs", "")}
     assert f"{place.name} pressed again as {place.name}-replay" in page

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
 import re
 import shutil
@@ -30,6 +29,7 @@ from brushloop.sessions.recording import Recording, add_remark
 from brushloop.sessions.records import Header, Source, Stroke
 from brushloop.sessions.store import SessionStore
 from tests.calibrate.conftest import CONDITIONS
+from tests.calibrate.given import rows_of
 from tests.command import refused, said
 from tests.photographed import imported_presses
 
@@ -100,8 +100,7 @@ def test_the_page_has_the_papers_numbers_its_source_and_what_was_refused(report:
 
 
 def test_csv_and_parquet_hold_the_same_scores(folder: Path) -> None:
-    with (folder / "scores.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(folder / "scores.csv")
     table = pyarrow.parquet.read_table(folder / "scores.parquet").to_pylist()
     assert len(rows) == len(table) > 10 * 4 * 7
     for text, binary in zip(rows, table, strict=True):
@@ -174,8 +173,7 @@ def test_commanded_and_reached_depth_stand_side_by_side_and_a_large_difference_i
 
     monkeypatch.setattr(Recording, "stroke_records", reached)
     output = brushloop.validate(session, models=("ccd-bsm",), held_out=False, out=tmp_path / "validation")
-    with (tmp_path / "validation" / "scores.csv").open(encoding="utf-8") as file:
-        rows = {row["stroke_id"]: row for row in csv.DictReader(file)}
+    rows = {row["stroke_id"]: row for row in rows_of(tmp_path / "validation" / "scores.csv")}
     assert rows["0"]["reached_mm"] == ""
     assert float(rows["3"]["depth_mm"]) - float(rows["3"]["reached_mm"]) == pytest.approx(off_mm)
     assert any(" 3: " in point.text and "was reached" in point.text for point in trust(output.report)) == named
