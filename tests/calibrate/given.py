@@ -43,6 +43,11 @@ def rows_of(table: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+def iou(mask: np.ndarray, truth: np.ndarray) -> float:
+    """How much of two masks they have in common, 0 to 1."""
+    return float((mask & truth).sum() / (mask | truth).sum())
+
+
 T0_NS, MINUTE_NS = 1_700_000_000_000_000_000, 60_000_000_000
 
 

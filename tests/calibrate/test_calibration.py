@@ -27,7 +27,7 @@ from brushloop.collect.tui.review_screen import Review
 from brushloop.sessions.errors import InputError
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Stroke
-from tests.calibrate.given import CALIBRATION, kept_lens, photographed
+from tests.calibrate.given import CALIBRATION, iou, kept_lens, photographed
 from tests.calibrate.simulated_rigs import CAMERAS, Shot, boards, collected, sheet, true_mask, true_scale
 from tests.command import brushloop, refused, said
 from tests.photographed import imported_presses
@@ -255,7 +255,7 @@ def test_a_bent_session_is_refused_without_a_lens_file_which_makes_scale_anchors
         mask = prepare_press(capture, made).mask
         truth = true_mask(shot, field_around(capture.stroke.anchor_mm), PX_PER_MM)
         # The cell of the model's field may end in the middle of the stroke's neighbour; here there is none.
-        assert (mask & truth).sum() / (mask | truth).sum() >= 0.95
+        assert iou(mask, truth) >= 0.95
     small = made.model_copy(update={"lens": made.lens.model_copy(update={"size_px": (1024, 768)})})
     with pytest.raises(CaptureRefused, match="is 2048 x 1536 px, the lens was calibrated at 1024 x 768 px"):
         prepare_press(capture, small)
@@ -289,7 +289,7 @@ def test_the_review_looks_through_the_recorded_lens_or_is_refused(tmp_path: Path
         assert looked.photo.shape == (768, 768), "the field, not the whole photograph"
         anchor = shot.anchors_mm[review.captures.index(seen)]
         truth = true_mask(shot, field_around(anchor), 1.0 / MM_PER_PX)
-        assert (looked.binary & truth).sum() / (looked.binary | truth).sum() >= 0.9
+        assert iou(looked.binary, truth) >= 0.9
     (session / "rig.effective.json").write_text('{"board": 7}')
     with pytest.raises(InputError, match=r"rig\.effective\.json: board: Input should be"):
         Review(session)

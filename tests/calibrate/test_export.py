@@ -24,7 +24,7 @@ from brushloop.sessions.imports import ImportOptions
 from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Check, Quality, Topic, Wrench
-from tests.calibrate.given import rows_of
+from tests.calibrate.given import iou, rows_of
 from tests.calibrate.simulated_rigs import collected, sheet, true_mask
 from tests.command import refused, said
 from tests.sessions.conftest import no_space
@@ -148,7 +148,7 @@ def test_crops_and_masks_lie_over_the_true_marks(tmp_path: Path, to: Path) -> No
         left, top = (20.0 * v for v in ANCHOR_MM)
         assert (float(row["anchor_x_px"]), float(row["anchor_y_px"])) == pytest.approx((left, top))
         truth = true_mask(shot, field_around(anchor), 20.0)
-        assert ((mask > 0) & truth).sum() / ((mask > 0) | truth).sum() >= 0.9
+        assert iou(mask > 0, truth) >= 0.9
         assert crop[mask > 0].mean() < 0.5 * crop[mask == 0].mean()
 
 

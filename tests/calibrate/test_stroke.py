@@ -12,7 +12,7 @@ import pytest
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.stroke.difference import new_stroke
 from brushloop.calibrate.stroke.preprocess import PX_PER_MM, measure, prepare, rectify, rescale
-from tests.calibrate.given import rows_of
+from tests.calibrate.given import iou, rows_of
 
 PAGE = (800, 800)
 
@@ -28,10 +28,6 @@ def page(mask: np.ndarray, *, shade: float = 0.0, ink: float = 0.1, noise: float
     light = 230.0 * (1.0 - shade * np.linspace(0, 1, PAGE[1])[None, :] * np.ones((PAGE[0], 1)))
     image = light * np.where(mask, ink, 1.0) + np.random.default_rng(0).normal(0, noise, PAGE)
     return np.clip(cv2.GaussianBlur(image, (0, 0), 1.0), 0, 255).astype(np.uint8)
-
-
-def iou(a: np.ndarray, b: np.ndarray) -> float:
-    return float((a & b).sum() / (a | b).sum())
 
 
 @pytest.mark.parametrize(("shade", "length_mm", "width_mm"), [(0.0, 20.0, 8.0), (0.6, 20.0, 8.0), (0.0, 34.0, 20.0)])
@@ -139,7 +135,7 @@ def test_the_new_stroke_is_found_and_nothing_else(light: float, shift: tuple[flo
     truth = np.zeros((400, 600), np.uint8)
     cv2.ellipse(truth, NEW[:2], NEW[2:], 0, 0, 360, 1, -1)
     found = new_stroke(photographed(*OLD), photographed(*OLD, NEW, light=light, shift=shift), 4.0, "page")
-    assert (found.mask & (truth > 0)).sum() / (found.mask | (truth > 0)).sum() > 0.995
+    assert iou(found.mask, truth > 0) > 0.995
     assert not any(flag.startswith(("crosses", "cut")) for flag in found.flags)
     said_px = [float(flag.split()[4]) for flag in found.flags if flag.startswith("moved: the page lay")]
     moved_px = math.hypot(*shift)

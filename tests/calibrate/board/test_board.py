@@ -32,6 +32,7 @@ from brushloop.calibrate.compare import field_around
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.stroke.preprocess import PX_PER_MM as RASTER_PX_PER_MM
 from brushloop.calibrate.stroke.preprocess import prepare, rectify_by
+from tests.calibrate.given import iou
 from tests.calibrate.simulated_rigs import CAMERAS, Shot, boards, sheet, true_mask, true_scale
 from tests.command import refused
 
@@ -266,7 +267,7 @@ def test_scale_strokes_and_anchors_are_right_whatever_the_camera_does(rig: int) 
     raster = rectify_by(shot.image, plane, window, "rig")
     at = ((anchor[0] - window[0]) * RASTER_PX_PER_MM, (window[1] + window[3] - anchor[1]) * RASTER_PX_PER_MM)
     mask, truth = prepare(raster, at, "rig").mask, true_mask(shot, window, RASTER_PX_PER_MM)
-    assert (mask & truth).sum() / (mask | truth).sum() >= 0.95
+    assert iou(mask, truth) >= 0.95
 
 
 def test_a_misnamed_corner_is_dropped_and_corners_on_no_plane_are_refused() -> None:
