@@ -10,7 +10,7 @@ from brushloop.collect.errors import StepError
 from brushloop.collect.motion import TOUCH_TOLERANCE_MM
 from brushloop.collect.operator import Choice, Prompt
 from brushloop.collect.protocols.steps import PressStep, ZeroTouchStep
-from brushloop.collect.touch.force import ForceTap
+from brushloop.collect.touch.force import average
 from brushloop.collect.touch.heights import plane_of
 from brushloop.collect.touch.measure import measure_plane
 from brushloop.collect.touch.selfcheck import self_check, triangle_on
@@ -99,14 +99,13 @@ async def zero_touch(context: StepContext, step: ZeroTouchStep) -> ZeroTouchResu
         await rig.force.bias(rig.config.force.bias_s)
     if step.method is not None:
         await within_limits("", rig.config, step_poses(rig.config, run.procedures.plane, step))
-    touch, tap = touch_of(rig.config, step), ForceTap()
-    context.guard.listeners.append(tap.take)
+    touch = touch_of(rig.config, step)
 
     def tell(doing: str) -> None:
         run.progress.doing(f"zero touch by {touch.method}: {doing}")
 
-    dip = partial(fill_brush, context)
-    measuring = measure_plane(run.procedures, touch, dip=dip, tap=tap, asker=run.asker, tell=tell)
+    dip, push = partial(fill_brush, context), partial(average, context.guard.listeners)
+    measuring = measure_plane(run.procedures, touch, dip=dip, average=push, asker=run.asker, tell=tell)
     measured = await context.guard.guarded(measuring)
     plane = plane_of(measured)
     poses = all_poses(rig.config, run.opening.protocol, plane)

@@ -248,38 +248,34 @@ SILENT_S = 5.0
 while the arm moves, `force.stale_ms` is the limit."""
 
 
-class ForceTap:
-    """Averages force samples on request. Hand every sample to `take`, in the event loop."""
-
-    def __init__(self) -> None:
-        self._wanted: asyncio.Queue[ForceSample] | None = None
-
-    def take(self, sample: ForceSample) -> None:
-        """Accept one sample of the sensor."""
-        if self._wanted is not None:
-            self._wanted.put_nowait(sample)
-
-    async def average(self, samples: int, push_axis: tuple[float, float, float], after_ns: int) -> tuple[float, float]:
-        """(mean push in N, standard deviation of one sample) of the next ones received after `after_ns`.
-
-        Raises `StepError` if the sensor falls silent.
-        """
-        self._wanted, pushes_n = asyncio.Queue(), list[float]()
-        try:
-            while len(pushes_n) < samples:
-                async with asyncio.timeout(SILENT_S):
-                    sample = await self._wanted.get()
-                if sample.stamp.host_ns > after_ns:
-                    along = zip(sample.force_n, push_axis, strict=True)
-                    pushes_n.append(sum(f * a for f, a in along) / math.hypot(*push_axis))
-        except TimeoutError:
-            raise StepError(f"the force sensor fell silent after {len(pushes_n)} of {samples} samples") from None
-        finally:
-            self._wanted = None
-        return statistics.fmean(pushes_n), statistics.stdev(pushes_n)
+Average = Callable[[int, tuple[float, float, float], int], Awaitable[tuple[float, float]]]
+"""What `average` is of one sensor."""
 
 
-def resting(procedures: Procedures, tap: ForceTap, at_mm: tuple[float, float], config: TouchConfig) -> Rest:
+async def average(
+    listeners: list[Callable[[ForceSample], None]], samples: int, push_axis: tuple[float, float, float], after_ns: int
+) -> tuple[float, float]:
+    """(mean push in N, standard deviation of one sample) of the next samples received after `after_ns`.
+
+    `listeners` are given every sample of the sensor, in the event loop. Raises `StepError` if the sensor falls silent.
+    """
+    arrived, pushes_n = asyncio.Queue[ForceSample](), list[float]()
+    listeners.append(arrived.put_nowait)
+    try:
+        while len(pushes_n) < samples:
+            async with asyncio.timeout(SILENT_S):
+                sample = await arrived.get()
+            if sample.stamp.host_ns > after_ns:
+                along = zip(sample.force_n, push_axis, strict=True)
+                pushes_n.append(sum(f * a for f, a in along) / math.hypot(*push_axis))
+    except TimeoutError:
+        raise StepError(f"the force sensor fell silent after {len(pushes_n)} of {samples} samples") from None
+    finally:
+        listeners.remove(arrived.put_nowait)
+    return statistics.fmean(pushes_n), statistics.stdev(pushes_n)
+
+
+def resting(procedures: Procedures, average: Average, at_mm: tuple[float, float], config: TouchConfig) -> Rest:
     """Rests over one point of the sheet, on a rig's arm and force sensor; each is reached from above."""
     last_z_mm = -math.inf
 
@@ -290,7 +286,7 @@ def resting(procedures: Procedures, tap: ForceTap, at_mm: tuple[float, float], c
         rests_z_mm = await procedures.lower(*at_mm, z_mm, config.speed_mm_s)
         last_z_mm = z_mm
         after_ns = procedures.rig.clock.now_ns() + round(config.force.settle_s * 1e9)
-        force_n, sd_n = await tap.average(samples, config.force.push_axis, after_ns)
+        force_n, sd_n = await average(samples, config.force.push_axis, after_ns)
         return Reading(rests_z_mm, force_n, samples, sd_n)
 
     return rest

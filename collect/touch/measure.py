@@ -11,7 +11,7 @@ from brushloop.collect.operator import Asker, Choice, Prompt
 from brushloop.collect.rig.config import PaperConfig, TouchConfig
 from brushloop.collect.rig.paper import Sheet
 from brushloop.collect.touch.camera import COLUMNS, EXTENT_MM, PITCH_MM, FirstInkTouch, most_spots
-from brushloop.collect.touch.force import ForceTap, Spring, resting, touch_by_force
+from brushloop.collect.touch.force import Average, Spring, resting, touch_by_force
 from brushloop.collect.touch.heights import KnownHeights, Reach, Touch, at_one_point, through
 from brushloop.sessions.events import TouchedPoint, ZeroTouchResult
 
@@ -23,16 +23,16 @@ async def measure_plane(
     config: TouchConfig,
     *,
     dip: Dip,
-    tap: ForceTap,
+    average: Average,
     asker: Asker,
     tell: Callable[[str], None],
 ) -> ZeroTouchResult:
     """Touch as configured and fit the plane. The arm begins and ends at travel height.
 
-    `dip` fills the brush. `tap` receives every sample of the force sensor, which must have been set to zero with
-    nothing touching. `asker` asks the operator for each jog, `tell` reports progress. Raises `StepError`, with the
-    figures, if nothing is touched, touches do not repeat, or the points do not lie in a plane, and `NeedsOperator` if
-    nobody can jog or the operator gives up; the brush is lifted then, too.
+    `dip` fills the brush. `average` is of the force sensor, which must have been set to zero with nothing touching.
+    `asker` asks the operator for each jog, `tell` reports progress. Raises `StepError`, with the figures, if nothing is
+    touched, touches do not repeat, or the points do not lie in a plane, and `NeedsOperator` if nobody can jog or the
+    operator gives up; the brush is lifted then, too.
     """
     paper = procedures.rig.config.paper
     if config.method == "taught":
@@ -46,7 +46,7 @@ async def measure_plane(
         if config.method == "camera":
             points = await FirstInkTouch(procedures, config, dip).measure(points_mm)
         else:
-            points = await _by_force_or_jog(procedures, config, points_mm, tap, asker, tell)
+            points = await _by_force_or_jog(procedures, config, points_mm, average, asker, tell)
     return through(points, config)
 
 
@@ -54,7 +54,7 @@ async def _by_force_or_jog(
     procedures: Procedures,
     config: TouchConfig,
     points_mm: list[Point],
-    tap: ForceTap,
+    average: Average,
     asker: Asker,
     tell: Callable[[str], None],
 ) -> list[TouchedPoint]:
@@ -63,7 +63,7 @@ async def _by_force_or_jog(
     spring: Spring | None = None
     for point in points_mm:
         reach, touches = known.reach(*point), list[Touch]()
-        rest = resting(procedures, tap, point, config)
+        rest = resting(procedures, average, point, config)
         await procedures.go(over(rig, *point), slowly(rig, *point, reach.start_z_mm))
         for count in range(len(points) * config.touches + 1, (len(points) + 1) * config.touches + 1):
             name = f"touch {count} of {len(points_mm) * config.touches}"

@@ -100,7 +100,7 @@ class Bench:
     def photograph(self) -> NDArray[np.uint8]:
         return self.scene.render(tool=self.world.tool())
 
-    # Force, as a `ForceTap`
+    # Force
     async def average(self, samples: int, push_axis: tuple[float, float, float], after_ns: int) -> tuple[float, float]:
         """Of the world's own force with the rig's noise, drawn at once."""
         push_n = self.weight_n - self.world.wrench()[2]

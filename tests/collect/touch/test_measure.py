@@ -46,8 +46,8 @@ NOBODY = Asker(watched=False)
 
 async def measured(bench: Bench, asker: Asker = NOBODY, **touch: Any) -> ZeroTouchResult:
     config = TouchConfig.model_validate(touch)
-    tap: Any = bench
-    return await measure_plane(bench.effector, config, dip=bench.dip, tap=tap, asker=asker, tell=lambda _: None)
+    average, dip = bench.average, bench.dip
+    return await measure_plane(bench.effector, config, dip=dip, average=average, asker=asker, tell=lambda _: None)
 
 
 def errors_mm(bench: Bench, result: ZeroTouchResult) -> list[float]:
