@@ -7,7 +7,7 @@ measured mark, in `Photograph.check_press` if it judges the photograph or the in
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -53,11 +53,6 @@ class Verdict:
     """All checks of one capture that could be measured, in the order of `Failure`."""
 
     checks: tuple[Check, ...]
-
-    @classmethod
-    def of(cls, checks: Iterable[Check]) -> Verdict:
-        """The verdict of checks in any order."""
-        return cls(tuple(sorted(checks, key=lambda check: list(Failure).index(Failure(check.name)))))
 
     @property
     def passed(self) -> bool:
@@ -117,7 +112,7 @@ class Photograph:
         ink = self._ink(patch, MARGIN_MM, anchor)
         checks = [*frame.checks, cut(ink, self.plane, self.image.shape, anchor, limits), self._glare(patch)]
         if not all(check.passed for check in checks):
-            return Verdict.of(checks)
+            return Verdict(tuple(checks))
         checks.append(neighbour(ink, limits))
         enough = blank(ink.own_mm2, depth_mm, limits)
         mark = measure_mark(ink, anchor)
@@ -125,12 +120,8 @@ class Photograph:
             away = (
                 None if self.previous is None else far_off(self._ink(patch, FAR_MM, anchor), anchor, depth_mm, limits)
             )
-            return Verdict.of([*checks, away or enough])
-        checks += [enough, dry(mark, limits)]
-        if checks[-1].passed:
-            # The head, tip and tone of a dry brush's mark mean nothing.
-            checks += judge_mark(mark, depth_mm, limits)
-        return Verdict.of(checks)
+            return Verdict((*checks, away or enough))
+        return Verdict((*checks, enough, *judge_mark(mark, depth_mm, limits)))
 
     def check_drawing(self, patch: Patch, depth_mm: float) -> Verdict:
         """Judge a figure that was drawn down to `depth_mm`.
@@ -195,10 +186,6 @@ def _check(name: Failure, score: float, unit: str, limit: float, reason: str, *,
     return Check(name=name, score=score, threshold=limit, unit=unit, passed=passed, reason="" if passed else reason)
 
 
-def _at_least(name: Failure, score: float, unit: str, limit: float, reason: str) -> Check:
-    return _check(name, score, unit, limit, reason, passed=score >= limit)
-
-
 def judge_frame(image: Gray, plane: Plane, limits: QualityConfig) -> Iterator[Check]:
     """The checks of a photograph, whatever it shows."""
     # The paper is neither dark nor saturated.
@@ -222,7 +209,7 @@ def cut(ink: Ink, plane: Plane, shape: tuple[int, ...], anchor_mm: Point, limits
     points = ink.window.points_mm(ink.own) if ink.own.any() else np.array([anchor_mm])
     gap_mm = measure.edge_mm(points, plane, shape)
     reason = f"The stroke ends {max(gap_mm, 0.0):.1f} mm from the edge of the picture. Move the camera or the sheet."
-    return _at_least(Failure.CUT, gap_mm, "mm", limits.edge_mm, reason)
+    return _check(Failure.CUT, gap_mm, "mm", limits.edge_mm, reason, passed=gap_mm >= limits.edge_mm)
 
 
 def neighbour(ink: Ink, limits: QualityConfig) -> Check:
@@ -241,7 +228,7 @@ def blank(own_mm2: float, depth_mm: float, limits: QualityConfig) -> Check:
     """The press left ink."""
     least_mm2 = limits.blank_mm2_per_mm * depth_mm
     reason = f"No stroke: {own_mm2:.1f} mm^2 of ink. Dip again; if the well is full, teach the touch height again."
-    return _at_least(Failure.BLANK, own_mm2, "mm^2", least_mm2, reason)
+    return _check(Failure.BLANK, own_mm2, "mm^2", least_mm2, reason, passed=own_mm2 >= least_mm2)
 
 
 def far_off(ink: Ink, anchor_mm: Point, depth_mm: float, limits: QualityConfig) -> Check | None:
@@ -253,14 +240,14 @@ def far_off(ink: Ink, anchor_mm: Point, depth_mm: float, limits: QualityConfig) 
     return _check(Failure.MISPLACED, away_mm, "mm", limits.misplaced_mm, reason, passed=False)
 
 
-def dry(mark: Mark, limits: QualityConfig) -> Check:
-    """Ink without streaks of bare paper."""
-    reason = f"The brush was dry: the ink is streaky ({mark.uneven:.2f}). Dip again, deeper or longer."
-    return _check(Failure.DRY, mark.uneven, "of the mean", limits.uneven, reason)
-
-
 def judge_mark(mark: Mark, depth_mm: float, limits: QualityConfig) -> Iterator[Check]:
-    """The checks of a mark that is not dry."""
+    """The checks of a mark. The head, tip and tone of a dry brush's mark mean nothing."""
+    # It is ink without streaks of bare paper.
+    reason = f"The brush was dry: the ink is streaky ({mark.uneven:.2f}). Dip again, deeper or longer."
+    dry = _check(Failure.DRY, mark.uneven, "of the mean", limits.uneven, reason)
+    yield dry
+    if not dry.passed:
+        return
     # It is no larger than a press of its depth makes it: a brush that moves sideways leaves more.
     excess_mm = max(mark.length_mm - LONGEST * depth_mm, mark.width_mm - WIDEST * depth_mm, 0.0)
     reason = (
@@ -275,7 +262,7 @@ def judge_mark(mark: Mark, depth_mm: float, limits: QualityConfig) -> Iterator[C
     yield _check(Failure.MISPLACED, off_mm, "mm", limits.misplaced_mm, reason)
     # Its ink is dark.
     reason = f"The ink is faint: darkness {mark.tone:.2f}. Stir or renew the ink, and dip again."
-    yield _at_least(Failure.FAINT, mark.tone, "of 1", limits.faint_tone, reason)
+    yield _check(Failure.FAINT, mark.tone, "of 1", limits.faint_tone, reason, passed=mark.tone >= limits.faint_tone)
     # One group of hairs made it, not two.
     reason = f"The bristles are split: a gap of {mark.gap_mm:.1f} mm. Comb the brush together on the rim and dip again."
     yield _check(Failure.SPLIT, mark.gap_mm, "mm", limits.split_mm, reason)
