@@ -209,12 +209,6 @@ def put_in_sheet(store: SessionStore, sheet: int | None) -> None:
     store.fresh_sheet()
 
 
-def _next_session_id(root: Path, label: str) -> str:
-    """Return `2026-11-21-grid-01` with the first number that is free under `root`."""
-    ids = (f"{dt.date.today().isoformat()}-{label}-{number:02d}" for number in itertools.count(1))
-    return next(session_id for session_id in ids if not (root / session_id).exists())
-
-
 def open_sessions(root: Path) -> list[Path]:
     """Folders under `root` whose journal was opened and has no `closed` event, oldest first.
 
@@ -233,12 +227,13 @@ def open_sessions(root: Path) -> list[Path]:
 
 def open_store(opening: Opening, resume: Path | None, rig: Rig, clock: Clock) -> SessionStore:
     """Make or resume the session. Raises `ConfigError` if it was begun on another robot."""
-    root = opening.request.out
-    session_id = _next_session_id(root, opening.protocol.kind) if resume is None else resume.name
-    header = _header(opening, rig, session_id)
     if resume is None:
-        return SessionStore.create(root / session_id, header, opening.snapshots, clock.now_ns)
-    store = SessionStore(resume, clock.now_ns)
+        # `2026-11-21-grid-01`, with the first number that is free.
+        name = f"{dt.date.today().isoformat()}-{opening.protocol.kind}"
+        folders = (opening.request.out / f"{name}-{number:02d}" for number in itertools.count(1))
+        folder = next(folder for folder in folders if not folder.exists())
+        return SessionStore.create(folder, _header(opening, rig, folder.name), opening.snapshots, clock.now_ns)
+    header, store = _header(opening, rig, resume.name), SessionStore(resume, clock.now_ns)
     try:
         # Before anything moves: damage to a step would otherwise show only when everything is collected.
         store.verify()
