@@ -273,7 +273,9 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
             self._sheet.show(sheet_content(now.sheet))
             self._sheet.border_title = f"Sheet {now.sheet.number}: {now.sheet.marks.count(None)} free"
         if now.messages != before.messages:
-            self._log.show(Content("\n").join(_message_content(line) for line in now.messages[-LOG_LINES:]))
+            lines = [plain(line) for line in now.messages[-LOG_LINES:]]
+            styles = ["bold $text-warning" if line.startswith(WARNING) else "" for line in lines]
+            self._log.show(Content("\n").join(map(Content.styled, lines, styles)))
         if (last := now.last) is not None and last is not before.last:
             self._words.show(_capture_words(last))
             pictures = (last.photo, binary_picture(last.binary), binary_picture(last.model))
@@ -398,11 +400,6 @@ def _capture_words(last: LastCapture) -> Content:
     if last.likeness is not None:
         lines.append(Content.styled(f"CCD-BSM as published (right): CSIM {100.0 * last.likeness:.1f} %", "dim"))
     return Content("\n").join(lines)
-
-
-def _message_content(line: str) -> Content:
-    text = plain(line)
-    return Content.styled(text, "bold $text-warning") if text.startswith(WARNING) else Content(text)
 
 
 def _note_content(now: Snapshot) -> Content:
