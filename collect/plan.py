@@ -89,11 +89,9 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
     """Walk the protocol and add up strokes, sheets, ink and time. `check_protocol` must have passed."""
     sheet = sheet_of(config, protocol)
     placed: list[Press] = []
-    changes: list[str] = []
     kinds: Counter[str] = Counter()
     seconds: dict[str, float] = {}
     dips = 0
-    sheets = 1
     plane, here = PaperPlane(config.paper.touch_z_mm), park_move(config).target
     for walked in walk(config, protocol):
         step = walked.step
@@ -103,17 +101,14 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
         seconds[kind] = seconds.get(kind, 0.0) + took_s
         dips += moves.dips
         if isinstance(step, PressStep):
-            if placed and walked.sheet != sheets:
-                changes.append(step.press.stroke_id)
-            sheets = walked.sheet
-            placed.append(step.press.model_copy(update={"sheet": sheets - 1, "patch": walked.patches[0].index}))
+            placed.append(step.press.model_copy(update={"sheet": walked.sheet - 1, "patch": walked.patches[0].index}))
     return Plan(
         kind=protocol.kind,
         steps=dict(kinds),
         placed=tuple(placed),
         patches_per_sheet=sheet.capacity,
-        sheets=sheets,
-        sheet_changes=tuple(changes),
+        sheets=1 + max(press.sheet or 0 for press in placed),
+        sheet_changes=tuple(b.stroke_id for a, b in itertools.pairwise(placed) if a.sheet != b.sheet),
         dips=dips,
         ink_ml=None if config.ink.device is None else config.ink.device.doses_ml(dips),
         seconds=sum(seconds.values()),

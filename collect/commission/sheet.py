@@ -93,7 +93,10 @@ class SheetStep(Step):
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """Everything that follows from the touched corners and the tip."""
         fit = fitted(notebook)
-        plane, sigma_mm, point = fit.plane, fit.origin_sigma_mm, touch_point(fit)
+        plane, sigma_mm = fit.plane, fit.origin_sigma_mm
+        # Inside the lowest corner of the sheet: the floor of every press is counted from there.
+        corners = inside_corners(fit.size_mm, INSET_MM).tolist()
+        point = [round(at, 3) for at in min(corners, key=lambda at: plane.touch_z_mm(at[0], at[1]))]
         touches = len(notebook.touched(BOARD)) + len(notebook.touched(SHEET))
         how = f"{touches} corners of board and sheet touched by hand"
         known = f"residuals up to {fit.worst_mm:.2f} mm"
@@ -103,18 +106,11 @@ class SheetStep(Step):
             "paper.origin_mm": Taught(list(fit.origin_mm), how, sigma_mm, known),
             "paper.yaw_deg": Taught(fit.yaw_deg, how, fit.yaw_sigma_deg, known),
             "paper.size_mm": Taught(list(fit.size_mm), how, sigma_mm, known),
-            "paper.touch_point_mm": Taught(list(point), "beside every patch"),
+            "paper.touch_point_mm": Taught(point, "beside every patch"),
             "paper.touch_z_mm": Taught(plane.touch_z_mm(*point), how, fit.depth_sigma_mm, leaning),
             "board.origin_mm": Taught(list(fit.board_origin_mm), how, sigma_mm, known),
             "aside.plane": Taught(slopes, how, fit.depth_sigma_mm, known),
         }
-
-
-def touch_point(fit: SheetFit) -> tuple[float, float]:
-    """Inside the lowest corner of the sheet: the floor of every press is counted from there."""
-    points = inside_corners(fit.size_mm, INSET_MM)
-    x, y = min(points.tolist(), key=lambda at: fit.plane.touch_z_mm(at[0], at[1]))
-    return round(x, 3), round(y, 3)
 
 
 def all_corners(notebook: Notebook, kind: str) -> Corners:

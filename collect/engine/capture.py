@@ -55,15 +55,11 @@ async def decide(
         run.progress.log(f"{stroke_id}: left out", warning=True)
         return False, False
     text = f"{stroke_id}, take {press.take}: {verdict.reason}"
-    await run.procedures.go(park_move(run.rig.config))  # a person may reach under the arm
-    answer = await run.asker.ask(Prompt(text, (KEEP, AGAIN, SKIP), SKIP.key, image=_around(run, image, patch)))
-    return answer == KEEP.key, answer == AGAIN.key
-
-
-def _around(run: RunContext, image: Gray, patch: Patch) -> Gray:
-    """The patch and a margin around it, seen from above."""
     window_mm = around(patch.rect_mm, PICTURE_MARGIN_MM, None)
-    return rectify(image, run.board.plane.homography, window_mm, PICTURE_PX_PER_MM)
+    picture = rectify(image, run.board.plane.homography, window_mm, PICTURE_PX_PER_MM)
+    await run.procedures.go(park_move(run.rig.config))  # a person may reach under the arm
+    answer = await run.asker.ask(Prompt(text, (KEEP, AGAIN, SKIP), SKIP.key, image=picture))
+    return answer == KEEP.key, answer == AGAIN.key
 
 
 def marked_bad(run: RunContext) -> list[str]:

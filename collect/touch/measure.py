@@ -8,14 +8,13 @@ from collections.abc import Callable
 from brushloop.collect.errors import NeedsOperator, StepError
 from brushloop.collect.motion import Dip, Procedures, over, slowly
 from brushloop.collect.operator import Asker, Choice, Prompt
+from brushloop.collect.photograph.measure import Point, Rect
 from brushloop.collect.rig.config import PaperConfig, TouchConfig
 from brushloop.collect.rig.paper import Sheet
 from brushloop.collect.touch.camera import COLUMNS, EXTENT_MM, PITCH_MM, FirstInkTouch, most_spots
 from brushloop.collect.touch.force import Average, Spring, resting, touch_by_force
 from brushloop.collect.touch.heights import KnownHeights, Reach, Touch, at_one_point, through
 from brushloop.sessions.events import TouchedPoint, ZeroTouchResult
-
-Point = tuple[float, float]
 
 
 async def measure_plane(
@@ -123,8 +122,6 @@ async def _jogged(
 
 MARK_MM = 3.0
 """Half the side of the paper that one mark may cover; a shallow touch leaves less."""
-Rect = tuple[float, float, float, float]
-"""x, y, width, height in the paper frame."""
 
 
 def touched_regions(paper: PaperConfig, config: TouchConfig) -> list[tuple[Rect, float]]:
