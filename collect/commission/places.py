@@ -209,7 +209,7 @@ class LimitsStep(Step):
         """Have each limit and the box confirmed, and ask the controller whether the arm reaches every corner."""
         for field, prompt in SPEEDS.items():
             await visit.value(field, prompt)
-        box = _box(visit.notebook)
+        box = self.derived(visit.notebook)
         rig = rig_of(visit.notebook.with_values(box), visit.rig_path)
         picture = visit.rig_path.with_name(f"{visit.rig_path.stem}.limits.png")
         visit.working("drawing box and places")
@@ -237,26 +237,21 @@ class LimitsStep(Step):
         visit.say(f"The controller finds joints for all {count} poses at and over the places of the tip.")
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
-        """The box around what was taught."""
-        return _box(notebook)
-
-
-def _box(notebook: Notebook) -> dict[str, Taught]:
-    """The smallest box around everything that the tip must reach, in the base frame."""
-    places, corners = tips(notebook), sheet_corners(notebook)
-    x, y, lowest_mm = min(corners, key=lambda corner: corner[2])
-    heights_mm = (
-        notebook.get("motion.safe_z_mm"),
-        lowest_mm - notebook.get("brush.max_depth_mm") - BELOW_MM,
-        notebook.get("ink.dip_z_mm") - BELOW_MM,
-    )
-    park_x, park_y, park_z = notebook.get("motion.park_mm")
-    reached = [point for name, point in places.items() if name.split(" ")[0] in INK]
-    points = [*reached, (park_x, park_y, park_z), *corners, *((x, y, z) for z in heights_mm)]
-    beside = f"the smallest around sheet, well, wipe, pot and park position, and {MARGIN_MM:g} mm beside and above"
-    floor = f"{BELOW_MM:g} mm below the deepest press and the dip; {MARGIN_MM:g} mm above travel and park"
-    ranges = zip(BOX, hull(points, MARGIN_MM), (beside, beside, floor), strict=True)
-    return {field: Taught(range_mm, how) for field, range_mm, how in ranges}
+        """The smallest box around everything that the tip must reach, in the base frame."""
+        places, corners = tips(notebook), sheet_corners(notebook)
+        x, y, lowest_mm = min(corners, key=lambda corner: corner[2])
+        heights_mm = (
+            notebook.get("motion.safe_z_mm"),
+            lowest_mm - notebook.get("brush.max_depth_mm") - BELOW_MM,
+            notebook.get("ink.dip_z_mm") - BELOW_MM,
+        )
+        park_x, park_y, park_z = notebook.get("motion.park_mm")
+        reached = [point for name, point in places.items() if name.split(" ")[0] in INK]
+        points = [*reached, (park_x, park_y, park_z), *corners, *((x, y, z) for z in heights_mm)]
+        beside = f"the smallest around sheet, well, wipe, pot and park position, and {MARGIN_MM:g} mm beside and above"
+        floor = f"{BELOW_MM:g} mm below the deepest press and the dip; {MARGIN_MM:g} mm above travel and park"
+        ranges = zip(BOX, hull(points, MARGIN_MM), (beside, beside, floor), strict=True)
+        return {field: Taught(range_mm, how) for field, range_mm, how in ranges}
 
 
 def hull(points: Sequence[Point], margin_mm: float) -> list[list[float]]:
