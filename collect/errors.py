@@ -102,10 +102,6 @@ class CollectAborted(Exception):
     exit_code: ClassVar[int] = 4
 
 
-class Parked(CollectAborted):
-    """The run ended between two steps on request, with the arm lifted and parked."""
-
-
 def arm_at_fault(error: BaseException) -> bool:
     """Whether the arm failed, or the brush met something hard: then the arm must not move before a person has looked.
 

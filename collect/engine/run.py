@@ -14,7 +14,7 @@ from brushloop.collect.engine import brush, capture
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.policy import GO_ON, METHODS, STOP, TITLES, Action, accept_question, decide, question
 from brushloop.collect.engine.recorder import ForceGuard, Recorder, RunContext, StepContext, uninterrupted
-from brushloop.collect.errors import NeedsOperator, Parked, SheetFull, StepError, arm_at_fault, describe
+from brushloop.collect.errors import CollectAborted, NeedsOperator, SheetFull, StepError, arm_at_fault, describe
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
 from brushloop.collect.protocols import steps
 from brushloop.collect.protocols.steps import MARKING, Protocol, Step, press_of, takes
@@ -131,7 +131,7 @@ class Run(RunContext):
 
     async def _park(self) -> None:
         await self._retreat()
-        raise Parked("parked on request; the same command resumes from here")
+        raise CollectAborted("parked on request; the same command resumes from here")
 
     async def _new_sheet(self) -> None:
         sheet = self.store.state.sheet
@@ -163,7 +163,7 @@ class Run(RunContext):
         self.progress.log(f"{asked.question} -> {meant}")
         if answer == STOP.key:
             if parked:
-                raise Parked(f"stopped at a question, parked: {describe(error)}") from error
+                raise CollectAborted(f"stopped at a question, parked: {describe(error)}") from error
             raise error
         self.procedures.photographer.forget()  # a person may have changed what the camera sees
         if isinstance(error, MotionError | LimitExceeded):

@@ -13,7 +13,7 @@ from brushloop.collect.engine.control import FINAL, TRANSITIONS, RunControl, Sta
 from brushloop.collect.engine.policy import MAX_FAILURES, Action, decide
 from brushloop.collect.engine.run import Run
 from brushloop.collect.engine.snapshot import Mark
-from brushloop.collect.errors import ForceTooHigh, NeedsOperator, Parked, SheetFull, StepVoid, arm_at_fault
+from brushloop.collect.errors import CollectAborted, ForceTooHigh, NeedsOperator, SheetFull, StepVoid, arm_at_fault
 from brushloop.collect.operator import Asker, Choice, OperatorRequest, Prompt
 from brushloop.collect.protocols.steps import CaptureStep, PressStep, Step, ZeroTouchStep
 from brushloop.drivers.errors import DeviceError, DeviceTimeout, LimitExceeded, MotionFailed, RobotNotSafe, Stuck
@@ -147,7 +147,7 @@ def test_what_is_left_out_stays_so_and_what_is_marked_bad_is_pressed_again_at_th
     assert [mark_bad_or_good(folder, last.still, last.press.stroke_id, n) for n in range(3)] == [True, False, True]
     until(first, lambda now: any(cell.now and cell.bad for cell in now.grid))
     first.park()
-    ended_by(first, Parked)
+    ended_by(first, CollectAborted, "parked")
     again = lab.run()
 
     now = again.snapshot()

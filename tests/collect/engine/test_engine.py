@@ -9,7 +9,7 @@ import pytest
 
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.engine import UNCHECKED
-from brushloop.collect.errors import CollectAborted, ConfigError, NeedsOperator, Parked, SheetFull
+from brushloop.collect.errors import CollectAborted, ConfigError, NeedsOperator, SheetFull
 from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.devices import Identity
 from brushloop.drivers.errors import DeviceError
@@ -117,7 +117,7 @@ def begun(lab: Lab) -> Path:
     engine = lab.started()
     until(engine, lambda now: now.strokes_done == 1)
     engine.park()
-    ended_by(engine, Parked)
+    ended_by(engine, CollectAborted, "parked")
     return lab.session
 
 

@@ -22,7 +22,7 @@ from brushloop.collect.engine.capture import mark_of
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.recorder import RunContext, meanwhile
 from brushloop.collect.engine.snapshot import LastCapture
-from brushloop.collect.errors import BadPicture, CollectAborted, ConfigError, NeedsOperator, Parked, StepError
+from brushloop.collect.errors import BadPicture, CollectAborted, ConfigError, NeedsOperator, StepError
 from brushloop.collect.motion import Procedures, dip_moves, wash_moves
 from brushloop.collect.photograph.photographer import Photographer
 from brushloop.collect.rig.config import RigConfig, load_rig
@@ -202,7 +202,7 @@ def test_a_question_that_nobody_answered_is_asked_again_on_resume(sharp_lab: Lab
     left = sharp_lab.started(on_screen=True)
     assert until(left, lambda now: now.prompt is not None).state is State.ASKING
     left.park()  # as `q` does, and a lost connection
-    ended_by(left, Parked)
+    ended_by(left, CollectAborted, "parked")
     assert (left.snapshot().given_up, left.snapshot().prompt) == (0, None)
 
     resumed = sharp_lab.engine(on_screen=True)
