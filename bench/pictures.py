@@ -213,7 +213,7 @@ async def _tour(app: OperatorApp, rig: LoopbackRig) -> None:
         await tour.until(lambda: tour.asked("Self-check: "))
         await tour.take("set-up-self-check")
         begun = len(rig.world.presses)
-        rig.world.flaws.update(dict.fromkeys(range(begun + 2, begun + 5), (Flaw.SPLIT, 1.0)))
+        rig.world.splits.update(dict.fromkeys(range(begun + 2, begun + 5), 1.0))
         await pilot.press("g")
         await tour.until(lambda: tour.asked(Flaw.SPLIT))
         await tour.take("ask")

@@ -31,7 +31,6 @@ from brushloop.drivers.devices import Frame, Identity, Stamp
 from brushloop.drivers.errors import DeviceTimeout
 from brushloop.drivers.force.sri_m8123 import SriM8123
 from brushloop.drivers.host import Clock
-from brushloop.drivers.sim.brush.footprint import Flaw
 from brushloop.drivers.sim.config import SimConfig, Table, View
 from brushloop.drivers.sim.faults import Device
 from brushloop.drivers.sim.rig import PORTS, LoopbackRig, rig_toml
@@ -195,7 +194,7 @@ def sharp(lab: Lab, latency_ms: int = 100) -> Lab:
     text = lab.rig.toml().replace("latency_ms = 250.0", f"latency_ms = {latency_ms}")
     (lab.folder / "rig.toml").write_text(text.replace("[force]", "[force]\nbias_s = 0.25"), encoding="utf-8")
     lab.write_protocol("[13.0]", "[0.0]")
-    lab.rig.world.flaws.update(dict.fromkeys(range(20), (Flaw.SPLIT, 0.0)))
+    lab.rig.world.splits.update(dict.fromkeys(range(20), 0.0))
     return lab
 
 

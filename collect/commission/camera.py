@@ -21,7 +21,8 @@ from brushloop.collect.errors import NotAccepted
 from brushloop.collect.operator import Prompt
 from brushloop.collect.photograph.frames import Gray, each_frame
 from brushloop.collect.rig.devices import identified
-from brushloop.drivers.camera import CameraTable, Locked, OpenCvCamera, found_settings
+from brushloop.drivers.camera import OpenCvCamera
+from brushloop.drivers.camera.source import CameraTable, Locked, found_settings
 from brushloop.drivers.devices import Frame, Stamp
 from brushloop.drivers.host import Clock
 

@@ -123,13 +123,9 @@ async def make_ready(controller: Controller, table: ArcsTable) -> Settings:
     """
     wanted = await read_back(controller)
     if wanted.operational_mode not in ("Automatic", "Disabled"):
-        raise MotionError(
-            DEVICE,
-            "power on",
-            f"operational mode is {wanted.operational_mode}",
-            condition="Nothing was set or powered.",
-            remedy="Turn it to Automatic on the pendant; no software here does that.",
-        )
+        what, condition = f"operational mode is {wanted.operational_mode}", "Nothing was set or powered."
+        remedy = "Turn it to Automatic on the pendant; no software here does that."
+        raise MotionError(DEVICE, "power on", what, condition=condition, remedy=remedy)
     offset = [*(mm / 1e3 for mm in table.tcp_offset_mm), *map(math.radians, table.tcp_rotation_deg)]
     commands: dict[str, dict[str, object]] = {"setTcpOffset": {"offset": offset}}
     wanted = replace(wanted, tool=from_wire(offset))
@@ -167,10 +163,7 @@ async def _until_mode(controller: Controller, *wanted: RobotMode) -> None:
     while (mode := await controller.mode()) not in wanted:
         await controller.require_safe("power on")
         if loop.time() > until_s:
-            raise DeviceTimeout(
-                DEVICE,
-                "power on",
-                f"mode {mode} did not become {' or '.join(sorted(wanted))}",
-                remedy="Look at the pendant: a confirmation may be waiting there.",
-            )
+            what = f"mode {mode} did not become {' or '.join(sorted(wanted))}"
+            remedy = "Look at the pendant: a confirmation may be waiting there."
+            raise DeviceTimeout(DEVICE, "power on", what, remedy=remedy)
         await asyncio.sleep(POLL_S)

@@ -26,9 +26,7 @@ from brushloop.drivers.camera.source import (
     CameraTable,
     Capture,
     JpegStream,
-    Locked,
     Picture,
-    found_settings,
     is_patched,
     is_repeated,
     open_source,
@@ -40,8 +38,6 @@ from brushloop.drivers.host import Clock
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
-
-__all__ = ["CameraTable", "Locked", "OpenCvCamera", "found_settings"]
 
 SAMPLE_STEP = 7
 """Pixels are sampled at this step in both directions; a prime, so that no pattern hides between them."""
@@ -170,13 +166,10 @@ class OpenCvCamera:
             elif self._ended is not None:
                 raise self._ended
             if time.monotonic() >= until_s:
-                raise DeviceTimeout(
-                    DEVICE,
-                    "fresh",
-                    f"no valid new frame from {self._table.source} in {self._table.timeout_s:g} s"
-                    + self._why_none(self._skipped.copy() - skipped_before),
-                    remedy="Check cable, light and stream; the arm does not move meanwhile.",
-                )
+                what = f"no valid new frame from {self._table.source} in {self._table.timeout_s:g} s"
+                what += self._why_none(self._skipped.copy() - skipped_before)
+                remedy = "Check cable, light and stream; the arm does not move meanwhile."
+                raise DeviceTimeout(DEVICE, "fresh", what, remedy=remedy)
             await asyncio.sleep(POLL_S)
 
     async def close(self) -> None:

@@ -199,12 +199,9 @@ class Capture:
         settings = {name: float(self._capture.get(getattr(cv2, PROPERTIES[name][0]))) for name in wanted}
         for name, value in wanted.items():
             if abs(settings[name] - value) > SETTING_TOLERANCE * max(abs(value), 1.0):
-                raise DeviceError(
-                    DEVICE,
-                    "lock",
-                    f"{name} = {value:g} was asked for, but {settings[name]:g} is read back",
-                    remedy="Choose a value that the camera has; `v4l2-ctl --list-ctrls` lists them.",
-                )
+                what = f"{name} = {value:g} was asked for, but {settings[name]:g} is read back"
+                remedy = "Choose a value that the camera has; `v4l2-ctl --list-ctrls` lists them."
+                raise DeviceError(DEVICE, "lock", what, remedy=remedy)
         return settings
 
 
@@ -233,12 +230,9 @@ def open_source(table: CameraTable) -> JpegStream | Capture:
     """
     locked = table.locked.model_dump(exclude_none=True)
     if locked and not table.source.isdecimal():
-        raise DeviceError(
-            DEVICE,
-            "lock",
-            f"{', '.join(locked)} cannot be set through {table.source}",
-            remedy="Fix them in the camera's own set-up, and remove them from [camera.locked] in rig.toml.",
-        )
+        what = f"{', '.join(locked)} cannot be set through {table.source}"
+        remedy = "Fix them in the camera's own set-up, and remove them from [camera.locked] in rig.toml."
+        raise DeviceError(DEVICE, "lock", what, remedy=remedy)
     host = table.source.partition("://")[2].partition("/")[0]
     if table.source.startswith(("http://", "https://")) and "@" not in host:  # FFmpeg logs in
         try:

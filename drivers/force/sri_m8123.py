@@ -222,13 +222,10 @@ class SriM8123:
         for name, values in zip(AXES, axes, strict=True):
             limit, unit = (STILL_N, "N") if name.startswith("F") else (STILL_NM, "Nm")
             if (deviation := statistics.stdev(values)) > limit:
-                raise DeviceError(
-                    DEVICE,
-                    "bias",
-                    f"{name} varied by {deviation:.4f} {unit} (standard deviation), limit {limit:g} {unit}",
-                    condition="The previous bias remains.",
-                    remedy="Let nothing touch the brush, wait until the arm is still, and try again.",
-                )
+                what = f"{name} varied by {deviation:.4f} {unit} (standard deviation), limit {limit:g} {unit}"
+                condition = "The previous bias remains."
+                remedy = "Let nothing touch the brush, wait until the arm is still, and try again."
+                raise DeviceError(DEVICE, "bias", what, condition=condition, remedy=remedy)
         self.bias_wrench = tuple(statistics.fmean(values) for values in axes)
 
     async def close(self) -> None:

@@ -152,13 +152,9 @@ class ModbusPump(InkDevice):
             await finished(self._halt())
             if ran_s > planned_s + MAX_OVERRUN_S:
                 excess_ml = (ran_s - planned_s) * self._ml_per_s
-                raise DeviceError(
-                    DEVICE,
-                    "dose",
-                    f"ran {ran_s:.2f} s instead of {planned_s:.2f} s",
-                    condition=f"About {excess_ml:.2f} ml too much is in the well; the pump is stopped.",
-                    remedy="Something held the host up.",
-                )
+                what, remedy = f"ran {ran_s:.2f} s instead of {planned_s:.2f} s", "Something held the host up."
+                condition = f"About {excess_ml:.2f} ml too much is in the well; the pump is stopped."
+                raise DeviceError(DEVICE, "dose", what, condition=condition, remedy=remedy)
 
     async def replenish(self) -> None:
         """Dose before every `every_dips`-th dip since `connect`. Raises as `dose` does, and does not count that dip."""
@@ -212,9 +208,6 @@ class ModbusPump(InkDevice):
             )
         except (DeviceTimeout, ProtocolViolation):
             return
-        raise ProtocolViolation(
-            DEVICE,
-            "connect",
-            "the line echoes, so a confirmation would mean nothing",
-            remedy="Switch off local echo on the RS-485 adapter.",
-        )
+        what = "the line echoes, so a confirmation would mean nothing"
+        remedy = "Switch off local echo on the RS-485 adapter."
+        raise ProtocolViolation(DEVICE, "connect", what, remedy=remedy)

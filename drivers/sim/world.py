@@ -209,8 +209,8 @@ class World:
         self.presses: list[Press] = []
         self.drags = 0
         """Number of contacts that travelled along the paper."""
-        self.flaws: dict[int, tuple[Flaw, float]] = {}
-        """Scripted flaw and severity by the index of the press; severity 0 rules out a spontaneous split."""
+        self.splits: dict[int, float] = {}
+        """Scripted severity of a split by the index of the press; 0 rules out a spontaneous one."""
         self.ink_load = 0.0
         table = config.table
         self.well = Well(math.pi * table.well_radius_mm**2 / 1e3, table.ink_level_mm, table.well_depth_mm)
@@ -279,12 +279,9 @@ class World:
             return
         tilt_deg, heading_deg = self._lean(deepest)
         index = len(self.presses)
-        if index in self.flaws:
-            flaw, severity = self.flaws[index]
-        else:
-            rng = np.random.default_rng([self.config.seed, index, 3])
-            flaw, severity = Flaw.SPLIT, natural_split(self.ink_load, depth_mm, rng)
-        flaw = flaw if severity > 0.0 else None
+        rng = np.random.default_rng([self.config.seed, index, 3])
+        severity = self.splits.get(index, natural_split(self.ink_load, depth_mm, rng))
+        flaw = Flaw.SPLIT if severity > 0.0 else None
         make = functools.partial(
             self.brush.press,
             min(depth_mm, self.brush.deepest_mm(tilt_deg)),  # at most until the ferrule stands on the paper

@@ -18,8 +18,8 @@ import pytest
 from numpy.typing import NDArray
 
 from brushloop.drivers import camera as camera_module
-from brushloop.drivers.camera import CameraTable, Locked, OpenCvCamera, found_settings, is_late, looked_at
-from brushloop.drivers.camera.source import Capture, JpegStream, open_source
+from brushloop.drivers.camera import OpenCvCamera, is_late, looked_at
+from brushloop.drivers.camera.source import CameraTable, Capture, JpegStream, Locked, found_settings, open_source
 from brushloop.drivers.devices import Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout
 from brushloop.drivers.host import Clock

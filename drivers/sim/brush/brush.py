@@ -36,8 +36,6 @@ from brushloop.drivers.sim.brush.mechanics import (
 )
 from brushloop.drivers.sim.brush.spec import BrushSpec, within
 
-__all__ = ["Brush", "BrushSpec", "Flaw", "Footprint", "Waypoint"]
-
 LINKS = 48
 LEAST_DEPTH_MM = 1e-6
 """A drag no deeper than this leaves no mark."""

@@ -27,7 +27,6 @@ from brushloop.collect.motion import Procedures, dip_moves, wash_moves
 from brushloop.collect.photograph.photographer import Photographer
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.tui.review_screen import Review
-from brushloop.drivers.sim.brush.footprint import Flaw
 from brushloop.model.fitted import FittedPress
 from brushloop.model.strokes import stroke_model
 from brushloop.sessions.events import Press, PressResult, SelfCheckResult
@@ -183,7 +182,7 @@ def test_a_split_stroke_is_pressed_again_elsewhere_until_it_is_sound_or_given_up
     sharp_lab: Lab,
 ) -> None:
     """The first stroke of two is split every time, the other one at first."""
-    sharp_lab.rig.world.flaws.update(dict.fromkeys(range(4), (Flaw.SPLIT, 1.0)))
+    sharp_lab.rig.world.splits.update(dict.fromkeys(range(4), 1.0))
     sharp_lab.write_protocol("[13.0]", "[0.0]", repeats=2)
     engine = sharp_lab.run()
 
@@ -198,7 +197,7 @@ def test_a_split_stroke_is_pressed_again_elsewhere_until_it_is_sound_or_given_up
 
 
 def test_a_question_that_nobody_answered_is_asked_again_on_resume(sharp_lab: Lab) -> None:
-    sharp_lab.rig.world.flaws.update(dict.fromkeys(range(20), (Flaw.SPLIT, 1.0)))
+    sharp_lab.rig.world.splits.update(dict.fromkeys(range(20), 1.0))
     left = sharp_lab.started(on_screen=True)
     assert until(left, lambda now: now.prompt is not None).state is State.ASKING
     left.park()  # as `q` does, and a lost connection

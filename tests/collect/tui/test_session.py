@@ -21,7 +21,6 @@ from brushloop.collect.tui.run_screen import RunScreen
 from brushloop.collect.tui.start_screen import SessionBrowser, StartScreen
 from brushloop.collect.tui.widgets import AskScreen
 from brushloop.drivers.arcs.controller import SafetyMode
-from brushloop.drivers.sim.brush.footprint import Flaw
 from brushloop.sessions.recording import Recording, remarks_of
 from brushloop.sessions.verify import verify_session
 from tests import rigs, runs
@@ -122,7 +121,7 @@ async def test_a_day_at_the_rig(lab: Lab) -> None:
         await operator.accepts("Camera, board, scale")
         await operator.accepts("Zero touch and plane")
         await operator.is_asked("Self-check: all within limits")
-        rig.world.flaws[len(rig.world.presses)] = (Flaw.SPLIT, 1.0)
+        rig.world.splits[len(rig.world.presses)] = 1.0
         await operator.accepts("Self-check")
 
         # a stroke comes out badly: the question has its picture, and the answer presses it again
