@@ -21,8 +21,6 @@ DeviceError
 On a computer that is too busy, frames, forces and replies come late and no device is at fault: `too_busy` says so.
 """
 
-from __future__ import annotations
-
 import os
 from typing import ClassVar
 

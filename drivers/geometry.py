@@ -7,8 +7,6 @@ for arrays of rotations.
 Formulas: J. Diebel, Representing Attitude (2006).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -5,8 +5,6 @@ process in any case, and is visible to every user of the machine, but not in a c
 other systems it is a lock on a file that every user may open, in a folder shared by all users.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import errno

@@ -4,8 +4,6 @@ A simulator needs an interpreter of its own: it keeps real time while the proces
 the simulated sheet, and the rig of a demo outlives the demo, so it is started as the command that serves it.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import ipaddress

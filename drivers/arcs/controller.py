@@ -3,8 +3,6 @@
 `survey` is a transcript of untyped ones, which change nothing: what a cabinet answered, for a report of a defect.
 """
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections.abc import AsyncGenerator, Awaitable, Callable

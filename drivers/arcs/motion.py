@@ -9,8 +9,6 @@ before the descent begins. The controller holds its path meanwhile (`stopMove`) 
 any client, so its queue must hold ours and no other; see `OwnPath`.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import itertools

@@ -4,8 +4,6 @@ Any client of the controller may use the arm and change its settings, so place a
 motion: an arm that is not where it was left, or is not set up as it was, is not sent anywhere.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import itertools

@@ -4,8 +4,6 @@ Two connections have no common order, so a stop on its own connection may overta
 That is why a stop is sent a second time behind that line, and why the arm is polled until it is seen at rest.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable

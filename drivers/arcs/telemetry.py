@@ -14,8 +14,6 @@ asks the controller where it is: the lag is the time by which the path of the po
 it agrees with the poses that were asked for.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json

@@ -13,8 +13,6 @@ The end of a bare document is found by its brackets: parsing again and again unt
 on a reply that comes in small pieces, and could not tell a reply that is cut off from one that is wrong.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json

@@ -9,8 +9,6 @@
 | | `< frame ID SECONDS HEX >`, `< error ID SECONDS >` |
 """
 
-from __future__ import annotations
-
 import asyncio
 import math
 import random

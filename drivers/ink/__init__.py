@@ -4,8 +4,6 @@ The engine, the plan and the first day use what `InkTable` and `InkDevice` say o
 file here and its table in `AnyInkTable`. `simulator` is used by the loopback rig and tests alone.
 """
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from pydantic import Field

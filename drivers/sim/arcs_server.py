@@ -4,8 +4,6 @@ One port takes SOF frames and bare JSON, named and positional params, ids of any
 its framing. The RTDE port greets, and pushes samples to subscribers at the frequency they ask for.
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 from collections.abc import Callable

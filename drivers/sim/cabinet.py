@@ -4,8 +4,6 @@ It simulates what a driver can get wrong: refusals by return code, poses that ar
 path that a protective stop keeps. It simulates neither accuracy nor safety functions, nor the arm's highest speeds.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Configuration of the loopback rig: the true values, which the software under test may learn only by measuring."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import Literal

@@ -4,8 +4,6 @@ The loopback controller answers FK and IK with it. A real arm is calibrated and 
 driver always asks the controller.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence

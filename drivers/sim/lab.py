@@ -3,8 +3,6 @@
 The person does what `brushloop sim hand` asks for, which docs/first-day.md and docs/loopback-controller.md explain.
 """
 
-from __future__ import annotations
-
 import asyncio
 import math
 import os

@@ -3,8 +3,6 @@
 Each is a loopback rig in a process of its own, which ends with the test. Nothing that it presses is a result on paper.
 """
 
-from __future__ import annotations
-
 from collections.abc import Generator
 from pathlib import Path
 

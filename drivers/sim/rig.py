@@ -1,7 +1,5 @@
 """The loopback rig: one world, the devices around it on 127.0.0.1 and on ptys, its `rig.toml`, and its process."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import functools

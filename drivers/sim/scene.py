@@ -3,8 +3,6 @@
 A stream is MJPEG over HTTP, one new image per period to every client that keeps up.
 """
 
-from __future__ import annotations
-
 import asyncio
 import functools
 import itertools

@@ -1,7 +1,5 @@
 """The simulated world: where the tool is, its contacts with paper and ink, the force on it, and its sheet of marks."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math

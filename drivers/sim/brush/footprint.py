@@ -5,8 +5,6 @@ plane of bending; both are fractions of the free radius, so a bristle is one poi
 the mechanics of a flawless press: forces and the shape of the spine do not change.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

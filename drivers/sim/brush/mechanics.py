@@ -7,8 +7,6 @@ bending plus squash plus the lagged smoothed-Coulomb potential of incremental po
 ACM TOG 39(4), 2020), by damped Newton.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 

@@ -3,8 +3,6 @@
 docs/loopback-brush.md shows such a file; a field of `BrushSpec` that it leaves out has its default.
 """
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import dataclass, field, fields
 from pathlib import Path
