@@ -5,8 +5,7 @@ the time and keeps only the newest frame; `fresh` then waits for one that was ex
 at it. A source that ends is opened again, with a notice. Frames that are black, saturated, torn, frozen or late
 are named and skipped.
 
-JPEGs that are pushed over HTTP are kept as they come. Every other source is read through OpenCV, which decodes each
-frame.
+The JPEGs of a stream are kept as they come; OpenCV decodes each frame of any other source.
 """
 
 from __future__ import annotations
@@ -21,16 +20,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from brushloop.drivers.camera.source import (
-    DEVICE,
-    CameraTable,
-    Capture,
-    JpegStream,
-    Picture,
-    is_patched,
-    is_repeated,
-    open_source,
-)
+from brushloop.drivers.camera.source import DEVICE, CameraTable, Capture, Picture, is_repeated
 from brushloop.drivers.devices import Frame, Identity, Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout
 from brushloop.drivers.host import Clock
@@ -195,7 +185,7 @@ class OpenCvCamera:
             while not self._closing.is_set():
                 opening_ns = self._clock.now_ns()
                 try:
-                    source = open_source(self._table)
+                    source = Capture(self._table)
                 except ConnectionLost:
                     if self._lost_ns is None:
                         raise
@@ -217,8 +207,8 @@ class OpenCvCamera:
             self._ended = DeviceError(DEVICE, "read", f"the grabber failed: {error!r}")
             raise
 
-    def _read_all(self, source: JpegStream | Capture, opening_ns: int) -> None:
-        """Read until the source ends; late, repeated and patched frames are skipped."""
+    def _read_all(self, source: Capture, opening_ns: int) -> None:
+        """Read until the source ends; late and repeated frames are skipped."""
         self._settings, self._simulated = source.settings, source.simulated
         latency_ns = round(self._table.latency_ms * 1e6)
         before, gaps_ns, last_ns = None, deque[int](maxlen=PERIODS_KEPT), opening_ns
@@ -233,12 +223,9 @@ class OpenCvCamera:
                 gaps_ns.append(arrival_ns - last_ns)
             last_ns = arrival_ns
             late, repeated = bool(gaps_ns) and is_late(gaps_ns, latency_ns), is_repeated(picture, before)
-            torn = source.patches and not repeated and is_patched(picture, before)
             before = picture
             if late or repeated:
                 self._skipped["late" if late else "frozen"] += 1
-            elif torn:
-                self._skipped["torn"] += 1
             else:
                 seq = self._newest.stamp.seq + 1 if self._newest is not None else 0
                 self._newest = _Arrival(Stamp(arrival_ns, None, seq), exposed_ns, picture)

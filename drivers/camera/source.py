@@ -72,94 +72,33 @@ PROPERTIES = {
 """OpenCV's name of each setting in `Locked`, what sets it by itself, and the value that switches that off."""
 SETTING_TOLERANCE = 0.01
 """Relative difference up to which a setting that is read back counts as applied."""
-MAX_JPEG_BYTES = 64 * 1024 * 1024
-MAX_GAP_BYTES = 1024 * 1024
-"""Most bytes between two pictures: where no part begins in them, this is another kind of stream."""
-
-
-class JpegStream:
-    """JPEGs pushed over HTTP (`multipart/x-mixed-replace`), each handed over as it came.
-
-    `simulated` is True for the loopback camera, which identifies itself.
-    """
-
-    patches = False
-
-    def __init__(self, table: CameraTable) -> None:
-        """Raises `OSError` where nothing answers, and ValueError for an answer of another kind."""
-        self.settings: dict[str, float] = {}
-        self._timeout_s = table.timeout_s
-        opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-        try:
-            self._response = opener.open(table.source, timeout=table.timeout_s)
-        except urllib.error.HTTPError as refusal:
-            refusal.close()
-            raise
-        self.simulated = self._response.headers["Server"] == LOOPBACK_SERVER
-        try:
-            if self._response.headers.get_content_maintype() != "multipart":
-                raise ValueError("not a stream of pictures")
-            self._first: bytes | None = self._part()
-        except BaseException:
-            self.close()
-            raise
-
-    def read(self) -> bytes | None:
-        """The next JPEG; None where the stream has ended, or is silent for longer than its timeout."""
-        jpeg, self._first = self._first, None
-        try:
-            return jpeg or self._part()
-        except (OSError, ValueError, http.client.HTTPException):
-            return None
-
-    def close(self) -> None:
-        """Close the connection."""
-        self._response.close()
-
-    def _part(self) -> bytes:
-        """The body of the next part. Raises `OSError` at the end, and ValueError for none with a length."""
-        left = MAX_GAP_BYTES
-        while not (line := self._response.readline(MAX_GAP_BYTES)).startswith(b"--"):
-            left -= len(line)
-            if not line:
-                raise ConnectionError("the stream ended")
-            if left < 0:
-                raise ValueError("no part of a multipart stream")
-        length = int(http.client.parse_headers(self._response)["Content-Length"] or 0)
-        if not 0 < length <= MAX_JPEG_BYTES:
-            raise ValueError(f"a part of {length} bytes")
-        jpeg, until_s = bytearray(), time.monotonic() + self._timeout_s
-        while len(jpeg) < length:
-            piece = self._response.read1(length - len(jpeg))
-            if not piece:
-                raise ConnectionError("the stream ended")
-            if time.monotonic() > until_s:
-                raise TimeoutError("a picture takes longer than the timeout")
-            jpeg += piece
-        return bytes(jpeg)
 
 
 class Capture:
     """A `cv2.VideoCapture` on a device or a stream, its settings locked and read back.
 
-    `settings` are those read back, by name; `patches` is True where what is missing of a JPEG is filled from the
-    picture before.
+    `settings` are those read back, by name; `simulated` is True for the loopback camera, which identifies itself.
     """
 
-    simulated = False
-
     def __init__(self, table: CameraTable) -> None:
-        """Raises `ConnectionLost`, and `DeviceError` for a setting that the camera does not keep."""
-        # Set before the first capture: otherwise the libraries would write their own lines across the screen.
+        """Raises `ConnectionLost` where it does not open, and `DeviceError` for a setting that it does not keep."""
+        # Set before the first capture: otherwise the libraries would write their own lines across the screen, and look
+        # for a camera in the same room behind a proxy.
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+        os.environ["no_proxy"] = "*"
         import cv2
 
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-        source = table.source
-        is_device = source.isdecimal()
+        source, is_device = table.source, table.source.isdecimal()
+        locked = table.locked.model_dump(exclude_none=True)
+        if locked and not is_device:
+            what = f"{', '.join(locked)} cannot be set through {source}"
+            remedy = "Fix them in the camera's own set-up, and remove them from [camera.locked] in rig.toml."
+            raise DeviceError(DEVICE, "lock", what, remedy=remedy)
         if not is_device and ("://" not in source or source.startswith("file:")):
             what = f"{source} is neither the number of a device nor the address of a stream"
             raise ConnectionLost(DEVICE, "open", what)  # a recording would pass for the sheet
+        self.simulated = _is_loopback(table)
         timeout_ms = round(table.timeout_s * 1e3)
         # One decoder thread: frame-parallel decoding would hold every frame back by one or more periods.
         stream = [
@@ -171,26 +110,29 @@ class Capture:
         try:
             if not self._capture.isOpened():
                 raise ConnectionLost(DEVICE, "open", f"cannot open {source}")
-            fourcc = int(self._capture.get(cv2.CAP_PROP_FOURCC))
-            self.patches = not is_device and fourcc == cv2.VideoWriter.fourcc(*"MJPG")
-            self.settings = self._lock(table.locked) if is_device else {}
+            is_jpeg = int(self._capture.get(cv2.CAP_PROP_FOURCC)) == cv2.VideoWriter.fourcc(*"MJPG")
+            # JPEGs are not decoded here: FFmpeg would fill a cut one from the picture before.
+            self._as_came = not is_device and is_jpeg and self._capture.set(cv2.CAP_PROP_FORMAT, -1)
+            self.settings = self._lock(locked)
         except BaseException:
             self.close()
             raise
 
-    def read(self) -> NDArray[np.uint8] | None:
-        """The next frame; blocks up to the stream's own timeout."""
+    def read(self) -> Picture | None:
+        """The next picture, a JPEG of a stream as it came; None where the stream has ended or is silent for longer than
+        its timeout, for which it blocks."""
         ok, raw = self._capture.read()
-        return cast("NDArray[np.uint8]", raw) if ok else None
+        if not ok:
+            return None
+        return raw.tobytes() if self._as_came else cast("NDArray[np.uint8]", raw)
 
     def close(self) -> None:
         """Close the capture."""
         self._capture.release()
 
-    def _lock(self, locked: Locked) -> dict[str, float]:
+    def _lock(self, wanted: dict[str, float]) -> dict[str, float]:
         import cv2
 
-        wanted: dict[str, float] = locked.model_dump(exclude_none=True)
         for name, value in wanted.items():
             number, automatic, off = PROPERTIES[name]
             if automatic:
@@ -223,46 +165,29 @@ def found_settings(device: int, settle_s: float) -> dict[str, float]:
     return {name: value for name, value in settings.items() if value > 0.0 or (name == "exposure" and value < -0.5)}
 
 
-def open_source(table: CameraTable) -> JpegStream | Capture:
-    """The source that the table names; one thread owns it from here to its release.
-
-    Raises `ConnectionLost` where it does not open, and `DeviceError` for a setting that it does not keep.
-    """
-    locked = table.locked.model_dump(exclude_none=True)
-    if locked and not table.source.isdecimal():
-        what = f"{', '.join(locked)} cannot be set through {table.source}"
-        remedy = "Fix them in the camera's own set-up, and remove them from [camera.locked] in rig.toml."
-        raise DeviceError(DEVICE, "lock", what, remedy=remedy)
+def _is_loopback(table: CameraTable) -> bool:
+    """Whether a stream says that it is the loopback camera's. Raises `ConnectionLost` where none answers."""
     host = table.source.partition("://")[2].partition("/")[0]
-    if table.source.startswith(("http://", "https://")) and "@" not in host:  # FFmpeg logs in
-        try:
-            return JpegStream(table)
-        except OSError as error:
-            raise ConnectionLost(DEVICE, "open", f"cannot open {table.source}: {error}") from None
-        except (ValueError, http.client.HTTPException):
-            pass  # not pushed JPEGs: FFmpeg knows more kinds of streams
-    return Capture(table)
+    if not table.source.startswith(("http://", "https://")) or "@" in host:  # FFmpeg logs in
+        return False
+    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+    try:
+        with opener.open(table.source, timeout=table.timeout_s) as response:
+            return response.headers["Server"] == LOOPBACK_SERVER
+    except OSError as error:
+        if isinstance(error, urllib.error.HTTPError):
+            error.close()
+        raise ConnectionLost(DEVICE, "open", f"cannot open {table.source}: {error}") from None
+    except (ValueError, http.client.HTTPException):
+        return False  # FFmpeg knows more kinds of streams
 
 
 # ---------------------------------------------------------------- pictures
 
 Picture: TypeAlias = "bytes | NDArray[np.uint8]"
 """A JPEG, or an (h, w) or (h, w, 3) BGR image."""
-PATCH_PX, WHITE = 16, 254
-"""Rows at the end of a picture that are compared, and the level from which all of them count as glare."""
 SCAN = b"\xff\xda"
 """Begins the picture in a JPEG, after the headers."""
-
-
-def is_patched(picture: Picture, before: Picture | None) -> bool:
-    """Whether a decoded picture ends, to the bit, as the one before it does: FFmpeg fills a cut JPEG so.
-
-    A white end is not compared: glare has no noise.
-    """
-    if isinstance(picture, bytes) or before is None or isinstance(before, bytes) or picture.shape != before.shape:
-        return False
-    end = picture[-PATCH_PX:]
-    return int(end.min()) < WHITE and is_repeated(end, before[-PATCH_PX:])
 
 
 def is_repeated(picture: Picture, before: Picture | None) -> bool:

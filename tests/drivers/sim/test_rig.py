@@ -25,7 +25,7 @@ import numpy as np
 import pytest
 
 from brushloop.drivers.camera import CameraTable
-from brushloop.drivers.camera.source import JpegStream
+from brushloop.drivers.camera.source import Capture
 from brushloop.drivers.force.simulator import FRAME_S, ForceBoard, SocketcandServer
 from brushloop.drivers.force.sri_m8123 import COMMAND_ID, LOOPBACK_CHANNEL, START
 from brushloop.drivers.loopback import LoopbackServer, RigRefused
@@ -92,10 +92,10 @@ async def test_a_rig_with_a_client_is_not_idle(rig: LoopbackRig):
     await idle
 
 
-async def pictures_of(rig: LoopbackRig) -> JpegStream:
+async def pictures_of(rig: LoopbackRig) -> Capture:
     """Its camera's stream, which has sent a picture."""
     source = tomllib.loads(rig.toml())["camera"]["source"]
-    return await asyncio.to_thread(JpegStream, CameraTable(kind="opencv", source=source))
+    return await asyncio.to_thread(Capture, CameraTable(kind="opencv", source=source))
 
 
 async def test_the_motion_queue_belongs_to_the_event_loops_thread(rig: LoopbackRig, monkeypatch: pytest.MonkeyPatch):
