@@ -60,7 +60,7 @@ MOVED_MM = 0.3
 MISSED_MM = 0.1
 """Difference between the commanded and the reached depth above which a report says so."""
 MAX_NAMED = 6
-ANSWERS = {True: "Yes", False: "No", None: "Not certain"}
+ANSWERS = {True: "Yes", False: "No, not closely enough", None: "Not certain"}
 """Whether the model predicts the brush: whether all, none or a part of its interval is within the goal."""
 SHORT = {HELD_OUT: ", held out", "fitted, in sample": ", in sample"}
 """What a model knows of the strokes, shortened for the terminal."""
@@ -357,7 +357,7 @@ def terminal_lines(report: Report) -> Iterator[object]:
         for name in record.characters:
             rows = [table_3(record, name, alignment) for alignment in (NORMAL[0], STRICT[0])]
             yield _terminal_table(f"Table 3: {name}, averages, binary, percent ({report.label})", *rows)
-    yield verdict(report)
+    yield f"Does CCD-BSM predict this brush? {verdict(report)}"
     for point in trust(report):
         yield f"{'•' if point.good is None else '✓' if point.good else '✗'} {point.text}"
     for press in report.refused[:MAX_REFUSED_IN_TERMINAL]:

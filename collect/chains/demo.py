@@ -133,7 +133,7 @@ class Demo:
                 "Size and place count here. The paper compares only shapes, scaled to one size: so compared, CCD-BSM "
                 f"as published scores {shapes.csim.avg:.1f} %, and {TABLE_2['ccd-bsm'].csim[2]:.1f} % in the paper."
             )
-        say(verdict(report))
+        say(f"Does CCD-BSM predict this brush? {verdict(report)}")
 
     def _started(self) -> LoopbackRig:
         """The rig of this demo; started, with a blank sheet, where it is first needed. Raises `RigRefused`."""
