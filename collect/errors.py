@@ -134,4 +134,5 @@ def brush_may_be_down(above_mm: float) -> str:
 
 def describe(error: BaseException) -> str:
     """The message of an error with its notes: one of them may say that the arm still moves."""
-    return " ".join([str(error) or type(error).__name__, *getattr(error, "__notes__", [])])
+    message, notes = str(error) or type(error).__name__, getattr(error, "__notes__", [])
+    return " ".join([f"{message.removesuffix('.')}.", *notes]) if notes else message

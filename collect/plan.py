@@ -121,7 +121,7 @@ def plan_table(plan: Plan) -> Table:
     totals = Table(title=f"plan of {plan.kind}", show_header=False)
     changes = f", a fresh one before {', '.join(plan.sheet_changes)}" if plan.sheet_changes else ""
     totals.add_row("strokes", str(len(plan.placed)))
-    totals.add_row("sheets", f"{plan.sheets} of {plan.patches_per_sheet} patches{changes}")
+    totals.add_row("sheets", f"{plan.sheets}, with {plan.patches_per_sheet} patches each{changes}")
     totals.add_row("dips", str(plan.dips))
     if plan.ink_ml is not None:
         totals.add_row("ink", f"{plan.ink_ml:.1f} ml, dosed by the ink device")

@@ -214,6 +214,7 @@ class OperatorApp(PlainApp):
             busy = self.screen is not self._main or self._leave_when_over
             if self._now.state in FINAL:
                 self.bell()
+                self.clear_notifications()  # that a stop was sent would cover why the run ended
             if self._now.state is State.DONE and self._now.folder and not busy:
                 self._offer_analysis(Path(self._now.folder))
         if self._leave_when_over and self._now.state in FINAL:
