@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -58,7 +59,7 @@ class ProofStep(Step):
         folder = tempfile.mkdtemp(prefix=f"{visit.rig_path.stem}.proof-", dir=visit.rig_path.parent)
         session = await self._run(visit, Path(folder), protocol, dry=False)
         visit.say(f"Recorded in {session}.")
-        self._keep(visit, *read_proof(session))
+        self._keep(visit, rig, *read_proof(session))
 
     async def _doctor(self, visit: Visit, rig: RigConfig) -> None:
         visit.working("asking every device")
@@ -107,7 +108,12 @@ class ProofStep(Step):
             await asyncio.sleep(POLL_S)
 
     def _keep(
-        self, visit: Visit, touch: ZeroTouchResult, check: SelfCheckResult, captures: list[CaptureResult]
+        self,
+        visit: Visit,
+        rig: RigConfig,
+        touch: ZeroTouchResult,
+        check: SelfCheckResult,
+        captures: list[CaptureResult],
     ) -> None:
         plane = plane_of(touch)
         by_hand_mm = visit.notebook.get(HEIGHT)
@@ -117,7 +123,8 @@ class ProofStep(Step):
         sigma_mm = max([*sigmas_mm, LEAST_SIGMA_MM])
         delay_ms, jitter_ms = captures[-1].camera_delay_ms or 0.0, captures[-1].camera_jitter_ms or 0.0
         how = f"touched by {touch.method}, leaning by {plane.slope_deg:.2f} deg"
-        known = f"residuals up to {worst_mm:.3f} mm; by hand it was {by_hand_mm:.2f} mm"
+        residuals = f"residuals up to {worst_mm:.3f} mm (limit: {rig.touch.residual_mm:g} mm)"
+        known = f"{z_mm - by_hand_mm:+.2f} mm from the touch by hand; {residuals}"
         again = sum(capture.retake for capture in captures)
         later = "the arm was seen to leave the picture later than it did"
         visit.keep(
@@ -128,15 +135,20 @@ class ProofStep(Step):
             }
         )
         visit.say(
-            f"touch height {z_mm:.3f} mm ({z_mm - by_hand_mm:+.2f} mm from the touch by hand), {known}",
-            f"marks off by {check.offset_mm[0]:+.1f}, {check.offset_mm[1]:+.1f} mm, turned {check.turn_deg:+.2f} deg",
+            f"touch height {z_mm:.3f} mm, {known}",
+            f"marks off by {math.hypot(*check.offset_mm):.1f} mm (limit: {rig.self_check.offset_mm:g} mm), turned "
+            f"{check.turn_deg:+.2f} deg (limit: {rig.self_check.turn_deg:g} deg)",
             f"{PRESSES} presses passed the quality checks, {again} were repeated",
             f"camera delay {delay_ms:.0f} ms: up to {SLOW_CAMERA_MS:g} ms are good",
         )
         if delay_ms > SLOW_CAMERA_MS:
             slow = f"The camera is slow: {delay_ms / 1e3:.1f} s. Each photograph waits for it."
             visit.say(slow, FASTER, tone="warning")
-        visit.say("Lay a fresh sheet before the first session: this one has the marks of the proof.", "READY")
+        visit.say(
+            "Lay a fresh sheet before the first session: this one has the marks of the proof.",
+            "Then: brushloop collect --protocol FILE --arm",
+            "READY",
+        )
 
 
 def slowly(rig: RigConfig) -> RigConfig:
