@@ -23,6 +23,7 @@ from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.presses import prepare_press
 from brushloop.calibrate.session import Calibration, open_session
 from brushloop.calibrate.stroke.preprocess import PX_PER_MM
+from brushloop.collect.photograph.measure import blur_px, busiest_tile
 from brushloop.collect.tui.review_screen import Review
 from brushloop.sessions.errors import InputError
 from brushloop.sessions.recording import Recording
@@ -276,8 +277,12 @@ def test_a_session_that_was_collected_with_a_lens_needs_no_other(tmp_path: Path,
 def test_the_quick_look_at_a_board_needs_a_picture_without_distortion(shot: Shot, lens: Path) -> None:
     with pytest.raises(CalibrationError, match="the lens bends straight lines: calibrate it with `brushloop camera"):
         see_board(shot.image, shot.board)
-    plane = see_board(read_lens(lens).undistort(shot.image), shot.board).plane
+    flat = read_lens(lens).undistort(shot.image)
+    plane = see_board(flat, shot.board).plane
     assert plane.mm_per_px == pytest.approx(true_scale(shot, plane.middle_px), rel=5e-4)
+    sharp_px, flat_px = (blur_px(busiest_tile(image)) or 0.0 for image in (shot.image, flat))
+    assert sharp_px > 0.5
+    assert flat_px < sharp_px + 0.1, "it stays as sharp, as sharpness is judged in it"
 
 
 def test_the_review_looks_through_the_recorded_lens_or_is_refused(tmp_path: Path, shot: Shot, lens: Path) -> None:
