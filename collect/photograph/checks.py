@@ -117,10 +117,12 @@ class Photograph:
         enough = blank(ink.own_mm2, depth_mm, limits)
         mark = measure_mark(ink, anchor)
         if not enough.passed or mark is None:
-            away = (
-                None if self.previous is None else far_off(self._ink(patch, FAR_MM, anchor), anchor, depth_mm, limits)
-            )
-            return Verdict((*checks, away or enough))
+            far = None if self.previous is None else self._ink(patch, FAR_MM, anchor)
+            if far is not None and blank(far.own_mm2, depth_mm, limits).passed:
+                away_mm = float(np.hypot(*(far.window.points_mm(far.own) - np.array(anchor)).T).min())
+                reason = f"The stroke lies {away_mm:.0f} mm away from its patch. {_WHERE}"
+                enough = _check(Failure.MISPLACED, away_mm, "mm", limits.misplaced_mm, reason, passed=False)
+            return Verdict((*checks, enough))
         return Verdict((*checks, enough, *judge_mark(mark, depth_mm, limits)))
 
     def check_drawing(self, patch: Patch, depth_mm: float) -> Verdict:
@@ -229,15 +231,6 @@ def blank(own_mm2: float, depth_mm: float, limits: QualityConfig) -> Check:
     least_mm2 = limits.blank_mm2_per_mm * depth_mm
     reason = f"No stroke: {own_mm2:.1f} mm^2 of ink. Dip again; if the well is full, teach the touch height again."
     return _check(Failure.BLANK, own_mm2, "mm^2", least_mm2, reason, passed=own_mm2 >= least_mm2)
-
-
-def far_off(ink: Ink, anchor_mm: Point, depth_mm: float, limits: QualityConfig) -> Check | None:
-    """A press whose ink lies outside its patch; None if there is less of it in the wide window than a press leaves."""
-    if ink.own_mm2 < limits.blank_mm2_per_mm * depth_mm:
-        return None
-    away_mm = float(np.hypot(*(ink.window.points_mm(ink.own) - np.array(anchor_mm)).T).min())
-    reason = f"The stroke lies {away_mm:.0f} mm away from its patch. {_WHERE}"
-    return _check(Failure.MISPLACED, away_mm, "mm", limits.misplaced_mm, reason, passed=False)
 
 
 def judge_mark(mark: Mark, depth_mm: float, limits: QualityConfig) -> Iterator[Check]:
