@@ -47,13 +47,10 @@ class Sheet:
         width, height = paper.size_mm
         cell_w, cell_h = self.cell_mm
         self.columns, self.rows = int(width // cell_w), int(height // cell_h)
+        self.capacity = self.columns * self.rows
+        """Patches on the sheet."""
         self._left = 0.5 * (width - self.columns * cell_w)
         self._bottom = 0.5 * (height - self.rows * cell_h)
-
-    @property
-    def capacity(self) -> int:
-        """Patches on the sheet."""
-        return self.columns * self.rows
 
     def patch(self, index: int) -> Patch:
         """The patch with this number."""

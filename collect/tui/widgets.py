@@ -158,12 +158,9 @@ class AskScreen(ModalScreen[str]):
         super().__init__()
         self.prompt = prompt
         self._answer = answer
-        self._live = Line("live")
-
-    @property
-    def own(self) -> bool:
+        self.own = answer is None
         """Whether the screen itself asks, not the engine."""
-        return self._answer is None
+        self._live = Line("live")
 
     def compose(self) -> ComposeResult:
         """Lay out the question, its picture, and a line for each answer or for the one that is typed."""
