@@ -129,9 +129,6 @@ class _LostWrites(io.StringIO):
     def fileno(self) -> int:
         return self._terminal.fileno()
 
-    def isatty(self) -> bool:
-        return self._terminal.isatty()
-
     def write(self, text: str) -> int:
         with contextlib.suppress(OSError):
             self._terminal.write(text)
