@@ -184,7 +184,7 @@ def test_the_paper_is_found_again_by_jog_and_a_jog_that_is_given_up_or_not_taken
     wait_for_end(engine)
     now = engine.snapshot()
     assert now.strokes_done == 3
-    assert any("the paper lies +1." in line for line in now.messages)
+    assert any("lies at most +1." in line for line in now.messages)
     assert [result.method for result in lab.state.results(ZeroTouchResult)] == ["jog", "jog"]
     voids = [why for _, why in lab.state.cut]
     assert voids[-2:] == ["the new height was not accepted.", "the operator gave up at touch 1 of 1"]
