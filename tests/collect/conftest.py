@@ -53,16 +53,3 @@ def wired_lab(tmp_path: Path) -> Iterator[Lab]:
     """As `lab`, on sockets and in real time: for processes."""
     with rigs.wired_lab(tmp_path) as lab:
         yield lab
-
-
-@pytest.fixture(scope="session")
-def collected(tmp_path_factory: pytest.TempPathFactory) -> Lab:
-    """What a session of four strokes left, from its beginning to its end, armed and without a self-check.
-
-    The rig has ended, but the world remembers what was pressed. Nobody writes into it.
-    """
-    with rigs.wireless_lab(tmp_path_factory.mktemp("collected"), COARSE) as lab:
-        rigs.coarse(lab).write_protocol(tilts="[0.0, 10.0]")
-        lab.edit_rig("", "\n[self_check]\nenabled = false\n")
-        lab.run(armed=True)
-        return lab

@@ -170,14 +170,11 @@ def test_corners_that_were_swapped_are_named(pair: tuple[str, str]) -> None:
     assert "mirror" in said or "opposite" in said or (one in said and other in said)
 
 
-def test_a_print_of_another_size_is_named_with_its_squares() -> None:
+def test_a_print_of_another_size_is_named_with_its_squares_and_a_sheet_that_lies_askew_is_refused() -> None:
     board, _ = laid(30.0, (400.0, -100.0), noise_mm=0.3)
     claimed = BOARD.model_copy(update={"square_mm": 12.4, "marker_mm": 9.3})
     with pytest.raises(NotAccepted, match=r"its squares measure 12\.0\d mm, not 12\.4 mm"):
         check_board(board, claimed)
-
-
-def test_a_sheet_that_lies_askew_is_refused() -> None:
     board, _ = laid(30.0, (400.0, -100.0))
     _, askew = laid(32.0, (405.0, -104.0))
     with pytest.raises(NotAccepted, match=r"turned by \+2\.0 deg on its board"):

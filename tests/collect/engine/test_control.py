@@ -52,19 +52,16 @@ class SlippedIn:
         self._lock.release()
 
 
-def test_a_pause_that_comes_as_the_run_goes_on_is_not_lost() -> None:
+async def test_what_comes_as_the_run_goes_on_or_the_screen_goes_away_is_not_lost() -> None:
     control = RunControl()
     control.move_to(State.RECOVERING)
     control._lock = SlippedIn(control.pause)  # type: ignore[assignment]
     control.move_to(State.RUNNING)
     assert control.state is State.PAUSING
-
-
-async def test_a_question_that_is_asked_as_the_screen_goes_away_does_not_wait_for_an_answer() -> None:
     asker = Asker(watched=True)
     asker._lock = SlippedIn(asker.abandon)  # type: ignore[assignment]
     async with asyncio.timeout(PATIENCE_S):
-        with pytest.raises(NeedsOperator):
+        with pytest.raises(NeedsOperator):  # instead of waiting for an answer
             await asker.ask(Prompt("Is the sheet in?", (Choice("g", "yes"),), "g"))
 
 

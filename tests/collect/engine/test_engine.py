@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
 
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.engine import UNCHECKED
@@ -14,9 +16,10 @@ from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.devices import Identity
 from brushloop.drivers.errors import DeviceError
 from brushloop.drivers.sim.scene import Scene
-from brushloop.sessions.events import CaptureResult
+from brushloop.sessions.events import CaptureResult, PressResult
 from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.recording import Recording
+from brushloop.sessions.records import Topic
 from brushloop.sessions.store import SessionStore
 from tests.rigs import SMALL_VIEW, Lab
 from tests.runs import answer, answered_alike, ended_by, question, until, wait_for_end
@@ -24,24 +27,35 @@ from tests.runs import answer, answered_alike, ended_by, question, until, wait_f
 ELSEWHERE = replace(SMALL_VIEW, centre_mm=(SMALL_VIEW.centre_mm[0] + 3.0, SMALL_VIEW.centre_mm[1]))
 
 
-@pytest.mark.xdist_group("collected")
-def test_a_whole_session_is_collected_as_the_protocol_says_and_merged(collected: Lab) -> None:
-    now, recording = collected.engines[-1].snapshot(), Recording(collected.session)
+def test_a_whole_session_is_collected_as_the_protocol_says_and_merged(lab: Lab) -> None:
+    lab.write_protocol(tilts="[0.0, 10.0]")
+    lab.edit_rig("", "\n[self_check]\nenabled = false\n")
+    now = lab.run(armed=True).snapshot()
+    recording = Recording(lab.session)
     assert (now.state, now.strokes_done, now.strokes_planned) == (State.DONE, 4, 4)
     assert now.source == recording.header.source == "loopback rig"
     captures = sorted(recording.captures(), key=lambda capture: capture.stroke.still)
     assert all(capture.image().shape == (384, 512) for capture in captures)
     assert {(c.stroke.depth_mm, c.stroke.tilt_deg) for c in captures} == {(11, 0), (11, 10), (15, 0), (15, 10)}
     # World's own answer sheet; the operator taught the touch height .03 mm too high. The first contact is zero touch.
-    for press, stroke in zip(collected.presses, (capture.stroke for capture in captures), strict=True):
+    for press, stroke in zip(lab.presses, (capture.stroke for capture in captures), strict=True):
         assert stroke.depth_mm == pytest.approx(press.depth_mm + 0.03, abs=0.01)
         assert (stroke.tilt_deg, 0.0) == pytest.approx((press.tilt_deg, press.heading_deg), abs=0.01)
         assert stroke.anchor_mm == pytest.approx((press.x_mm, press.y_mm), abs=0.05)
         assert press.ink_load == 1.0
     assert any(UNCHECKED in line for line in now.messages), "it was armed, and its self-check is switched off"
-    assert "self_check" not in {step.kind for step in collected.state.files.values()}
+    assert "self_check" not in {step.kind for step in lab.state.files.values()}
     with pytest.raises(ConfigError, match="Put a fresh sheet in, then confirm it with --sheet 1"):
-        collected.engine()
+        lab.engine()
+
+    # Force and ink are recorded beside the poses.
+    with recording.path.open("rb") as file:
+        seen = Counter(channel.topic for _, channel, _ in make_reader(file, validate_crcs=True).iter_messages())
+    assert min(seen[topic] for topic in (Topic.TCP, Topic.JOINTS, Topic.WRENCH)) > 10
+    assert seen[Topic.INK] == 4
+    peaks_n = [press.peak_force_n or 0.0 for press in lab.state.results(PressResult)]
+    assert len(peaks_n) == 4
+    assert all(0.02 < peak_n < 0.5 for peak_n in peaks_n)
 
 
 def test_stop_in_mid_press_voids_the_patch_and_the_same_command_goes_on(lab: Lab) -> None:

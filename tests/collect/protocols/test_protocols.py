@@ -108,13 +108,21 @@ def test_a_dump_changes_no_key(config: ProtocolConfig) -> None:
     assert [step.key for step in run(again)] == [step.key for step in run(config)]
 
 
-def test_keys_and_order_are_the_same_in_every_process() -> None:
+def test_keys_tell_steps_apart_and_are_the_same_in_every_process_as_is_the_order() -> None:
     """Where these change, a session that is open is not gone on with by the next version."""
     config = GridConfig(kind="grid", depths_mm=[11.0, 15.0], tilts_deg=[0.0, 5.0], repeats=1, seed=1)
     ids = [stroke.stroke_id for stroke in config.planned()]
     assert ids == ["H15-a5-r01", "H11-a0-r01", "H15-a0-r01", "H11-a5-r01"]
     keys = [step.key[:8] for step in run(config)]
     assert keys[:5] == ["3151a9d3", "6e3abc46", "e6b62adf", "5fcba0e0", "edc00d96"]
+    press = Press(stroke_id="a", condition=Condition(depth_mm=11.0, tilt_deg=5.0))
+    step = PressStep(3, press)
+    assert step.key != PressStep(4, press).key
+    assert step.key != PressStep(3, press, dwell_s=1.0).key
+    steeper = press.model_copy(update={"condition": Condition(depth_mm=11.0, tilt_deg=6.0)})
+    assert step.key != PressStep(3, steeper).key
+    measured = press.model_copy(update={"reached_mm": 10.9, "dip_to_touch_s": 1.2})
+    assert CaptureStep(3, measured).key == CaptureStep(3, press).key, "what was measured does not change what was asked"
 
 
 def test_board_views_come_after_every_so_many_strokes_and_not_at_the_end() -> None:
@@ -139,17 +147,6 @@ def test_a_list_keeps_its_order_and_names_and_shuffles_only_for_a_seed() -> None
 # Grids and their sheets
 
 GRID: dict[str, Any] = {"depths_mm": [11.0, 13.0, 15.0, 17.0, 20.0], "tilts_deg": [0.0, 5.0, 10.0]}
-
-
-def test_keys_tell_steps_apart() -> None:
-    press = Press(stroke_id="a", condition=Condition(depth_mm=11.0, tilt_deg=5.0))
-    step = PressStep(3, press)
-    assert step.key != PressStep(4, press).key
-    assert step.key != PressStep(3, press, dwell_s=1.0).key
-    steeper = press.model_copy(update={"condition": Condition(depth_mm=11.0, tilt_deg=6.0)})
-    assert step.key != PressStep(3, steeper).key
-    measured = press.model_copy(update={"reached_mm": 10.9, "dip_to_touch_s": 1.2})
-    assert CaptureStep(3, measured).key == CaptureStep(3, press).key, "what was measured does not change what was asked"
 
 
 def test_patches_tile_the_sheet_without_overlap() -> None:
