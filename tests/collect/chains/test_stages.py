@@ -40,7 +40,7 @@ from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import rig_toml
 from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.recording import Recording
-from tests.command import brushloop
+from tests.command import refused, said
 from tests.sessions.conftest import Make
 
 # The demo
@@ -298,17 +298,11 @@ def test_a_fresh_sheet_is_asked_for_before_anything_is_planned(tmp_path: Path, m
 @pytest.mark.soak
 @pytest.mark.timeout(600)
 def test_a_character_is_written_twice_and_compared(tmp_path: Path) -> None:
-    def printed(*words: str | Path, code: int = 0) -> str:
-        """What the command prints, or why it is refused before anything moves (code 2)."""
-        ran = brushloop(*words)
-        assert ran.returncode == code, ran.stderr
-        return ran.stderr if code else ran.stdout
-
     out, sessions = tmp_path / "written", tmp_path / "sessions"
     write = ("write", "子", "--config", tmp_path / "rig.toml", "--out", out, "--sessions", sessions)
     write = (*write, "--no-tui", "--cell-mm", "48", "--repeats")
     with simulate(tmp_path):
-        printed(*write, "2")
+        said(*write, "2")
     [session] = sessions.iterdir()
     assert [stroke.stroke_id for stroke in Recording(session).stroke_records()] == ["子-r01", "子-r02"]
 
@@ -326,10 +320,10 @@ def test_a_character_is_written_twice_and_compared(tmp_path: Path) -> None:
     assert (out / "figure-13.png").stat().st_size > 10_000
 
     # Done is done, and what was planned stays: another count is another plan.
-    assert "brushloop collect" not in printed(*write, "2")
-    assert "repeats: plans 2 writings, not 3: use another --out" in printed(*write, "3", code=2)
+    assert "brushloop collect" not in said(*write, "2")
+    assert "repeats: plans 2 writings, not 3: use another --out" in refused(*write, "3")
 
     # A session is compared with the plan that it was drawn from, and with no other.
     plan = tmp_path / "plan"
-    printed("write", "plan", "--out", plan, "--steps", "1", "--cell-mm", "48", "子")
-    assert "'子' was not drawn from this plan" in printed("write", "compare", session, "--plan", plan, code=2)
+    said("write", "plan", "--out", plan, "--steps", "1", "--cell-mm", "48", "子")
+    assert "'子' was not drawn from this plan" in refused("write", "compare", session, "--plan", plan)

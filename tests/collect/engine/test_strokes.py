@@ -222,26 +222,6 @@ def test_ink_on_a_patch_that_should_be_blank_is_seen_before_the_brush_is_dipped(
     assert world.well.ml == ink_ml
 
 
-FIGURE = """kind = "write"
-cell_mm = [50.0, 36.0]
-[[figures]]
-name = "bar"
-[[figures.strokes]]
-points = [[12.0, 18.0, 5.0, 0.0, 0.0], [37.0, 18.0, 5.0, 0.0, 0.0]]
-"""
-SHALLOW = """[[figures.strokes]]
-points = [[12.0, 26.0, 1.0, 0.0, 0.0], [37.0, 26.0, 1.0, 0.0, 0.0]]
-"""
-
-
-def test_the_peak_force_of_a_figure_is_that_of_its_deepest_stroke(lab: Lab) -> None:
-    (lab.folder / "protocol.toml").write_text(FIGURE + SHALLOW, encoding="utf-8")
-    lab.run()
-    [drawn] = lab.state.results(PressResult)
-    assert (drawn.peak_force_n or 0.0) > 0.02, "the shallow stroke comes last and reaches 0.007 N"
-    assert drawn.depths_mm == pytest.approx((5.0, 1.0), abs=0.1)
-
-
 # A camera that distorts, with its lens file
 
 K1 = -0.08

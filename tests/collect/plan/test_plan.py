@@ -11,10 +11,7 @@ from typing import Any, cast
 
 import cv2
 import pytest
-from typer.testing import CliRunner
 
-from brushloop.calibrate.errors import CalibrationError
-from brushloop.collect.cli import app
 from brushloop.collect.engine.recorder import StepContext
 from brushloop.collect.engine.run import Run
 from brushloop.collect.errors import ConfigError, StepVoid
@@ -44,9 +41,10 @@ from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import rig_toml
 from brushloop.drivers.sim.world import World
-from brushloop.sessions.events import StepResult
+from brushloop.sessions.events import PressResult, StepResult
 from brushloop.sessions.records import Condition
 from tests.collect.sent import not_checked, not_sent, noting
+from tests.command import refused, said
 from tests.rigs import Lab
 from tests.runs import answered_alike
 
@@ -211,23 +209,16 @@ async def cabinet(rig_path: Path) -> AsyncIterator[ArcsServer]:
     await server.stop()
 
 
-def plan(rig_path: Path, name: str, *options: str) -> str:
-    arguments = ["plan", "--config", str(rig_path), "--protocol", str(EXAMPLES / name), *options]
-    ran = CliRunner().invoke(app, arguments, catch_exceptions=False)
-    assert ran.exit_code == 0
-    return ran.stdout
-
-
 def test_a_plan_is_shown_as_tables_and_a_picture_that_cannot_be_made_is_refused_before_anything_else(
     rig_path: Path,
 ) -> None:
-    words = " ".join(plan(rig_path, "protocol.toml").split())
+    command = ("collect", "plan", "--config", rig_path, "--protocol", EXAMPLES / "protocol.toml")
+    words = said(*command)
     for expected in ("42 patches", "a fresh one before", "150 press", "not counting"):
         assert expected in words
     rig_path.write_text("[robot")  # is not even read
-    with pytest.raises(CalibrationError, match=r"plan\.xyz: must end in \.png or \.svg or \.pdf or \.jpg$") as refused:
-        plan(rig_path, "protocol.toml", "--picture", str(rig_path.with_name("plan.xyz")))
-    assert refused.value.exit_code == 2
+    why = refused(*command, "--picture", rig_path.with_name("plan.xyz"))
+    assert why.endswith("plan.xyz: must end in .png or .svg or .pdf or .jpg")
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in EXAMPLES.glob("*.toml")))
@@ -268,14 +259,14 @@ async def test_the_first_pose_out_of_reach_of_our_tool_is_named_whatever_is_set_
     rig_path: Path, cabinet: ArcsServer
 ) -> None:
     """The same pose is as far away with either tool set; only a wrong conversion would bring it into reach."""
-    config, refused = load_rig(rig_path), list[str]()
+    config, messages = load_rig(rig_path), list[str]()
     row = [(brush_pose(x_mm, 0.0, 200.0), 10.0, f"{x_mm:.0f}") for x_mm in range(700, 1200, 20)]
     for offset in ([0.0] * 6, [0.0, 0.0, 0.18, 0.0, 0.0, 0.0], [0.05, -0.1, 0.3, 0.0, 0.0, 1.0]):
         cabinet.cabinet.tcp_offset = offset
         with pytest.raises(ConfigError, match=r"paper: .* no joint solution for (\d+): x = \1") as caught:
             await ask_reach(rig_path, config, row)
-        refused.append(str(caught.value))
-    assert refused == [refused[0]] * 3
+        messages.append(str(caught.value))
+    assert messages == [messages[0]] * 3
     cabinet._methods["rob1.RobotConfig.getTcpOffset"] = lambda _: [math.nan] * 6
     with pytest.raises(ProtocolViolation, match="getTcpOffset: expected 6 finite numbers"):
         await ask_reach(rig_path, config, row)
@@ -297,9 +288,7 @@ def test_files_that_are_missing_or_swapped_are_named(
     rig_path.rename(rig_path.with_name("r.toml"))
     rig_path.with_name("p.toml").write_text((EXAMPLES / "protocol.toml").read_text())
     monkeypatch.chdir(rig_path.parent)
-    with pytest.raises(ConfigError) as refused:
-        CliRunner().invoke(app, [command, *arguments], catch_exceptions=False)
-    assert str(refused.value).startswith(words)
+    assert refused("collect", command, *arguments).startswith(words)
 
 
 # A press is believed where the brush was seen at its depth
@@ -387,7 +376,8 @@ every_dips = 2
 strokes = 1
 """
 FIGURE = "[[figures]]\nname = 'a'\n" + "".join(
-    f"[[figures.strokes]]\npoints = [[12.0, {y}, 6.0, 4.0, 30.0], [24.0, {y}, 8.0, 0.0, 60.0]]\n" for y in (12.0, 24.0)
+    f"[[figures.strokes]]\npoints = [[12.0, {y}, {deep_mm}, 4.0, 30.0], [24.0, {y}, 1.0, 0.0, 60.0]]\n"
+    for y, deep_mm in ((12.0, 8.0), (24.0, 1.0))
 )
 KINDS = {
     "grid": 'kind = "grid"\ndepths_mm = [9.0]\ntilts_deg = [5.0]\nrepeats = 2\nboard_every = 1\n',
@@ -446,3 +436,8 @@ def test_what_a_run_sends_the_plan_has_checked(lab: Lab, monkeypatch: pytest.Mon
             assert not not_sent(config, planned, one.sent), one.step
         assert rounded(planned.poses) <= rounded(all_poses(config, wanted, one.plane)), one.step
     assert {one.step.kind for one in made} >= {StepKind.ZERO_TOUCH, StepKind.BOARD}
+    if wanted.kind == "write":
+        [drawn] = lab.state.results(PressResult)
+        assert drawn.depths_mm == pytest.approx((8.0, 1.0), abs=0.1)
+        # The peak force is that of the deepest stroke: the shallow one comes last, with 0.007 N.
+        assert (drawn.peak_force_n or 0.0) > 0.02

@@ -21,7 +21,7 @@ from brushloop.drivers.host import Clock
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.faults import Device, Fault
 from brushloop.drivers.sim.rig import rig_toml
-from tests.command import brushloop
+from tests.command import brushloop, refused, said
 from tests.drivers.arcs.test_rpc import Replayed
 from tests.rigs import Lab
 
@@ -52,10 +52,10 @@ def rig_file(tmp_path: Path, old: str = "", new: str = "") -> Path:
     ],
 )
 def test_a_bad_rig_is_refused_in_one_line(tmp_path: Path, old: str, new: str, message: str) -> None:
-    with pytest.raises(ConfigError, match=message) as refused:
+    with pytest.raises(ConfigError, match=message) as caught:
         load_rig(rig_file(tmp_path, old, new))
-    assert refused.value.exit_code == 2
-    assert "\n" not in str(refused.value) or "TOML" in message
+    assert caught.value.exit_code == 2
+    assert "\n" not in str(caught.value) or "TOML" in message
 
 
 def test_a_real_sensor_is_never_waited_for_longer_than_a_tenth_of_a_second(tmp_path: Path) -> None:
@@ -87,10 +87,10 @@ def test_a_value_from_the_environment_is_refused_by_its_variable(
     # Another one that is in order is not blamed.
     monkeypatch.setenv("BRUSHLOOP_ROBOT__HOST", "192.0.2.7")
     monkeypatch.setenv(f"BRUSHLOOP_{name}", value)
-    with pytest.raises(ConfigError, match=message) as refused:
+    with pytest.raises(ConfigError, match=message) as caught:
         load_rig(rig_file(tmp_path))
-    assert refused.value.exit_code == 2
-    assert "ROBOT__HOST" not in str(refused.value)
+    assert caught.value.exit_code == 2
+    assert "ROBOT__HOST" not in str(caught.value)
 
 
 # What is shown of a rig.toml, and what in it cannot be true
@@ -104,15 +104,13 @@ def rig(tmp_path: Path) -> Path:
 def test_the_loopback_rig_contradicts_nothing_a_contradiction_ends_with_code_5_and_an_unusable_file_with_code_2(
     rig: Path,
 ) -> None:
-    ran = brushloop("rig", "check", rig)
-    assert ran.returncode == 0
-    assert "plausible     tool length" in ran.stdout
-    assert re.search(r"not measured  lens +not calibrated", ran.stdout)
-    assert ran.stdout.rstrip().endswith("10 values are plausible, 0 contradict others, 7 were not measured")
+    words = said("rig", "check", rig)
+    assert "plausible tool length" in words
+    assert "not measured lens not calibrated" in words
+    assert words.endswith("10 values are plausible, 0 contradict others, 7 were not measured")
     assert brushloop("rig", "check", rig_file(rig.parent, "max_depth_mm = 22.0", "max_depth_mm = 47.0")).returncode == 5
-    ran = brushloop("rig", "check", rig_file(rig.parent, "safe_z_mm = 180.0", "safe_z_mm = 18.0"))
-    assert (ran.returncode, ran.stderr.count("\n")) == (2, 1)
-    assert "motion.safe_z_mm = 18 is below" in ran.stderr
+    why = refused("rig", "check", rig_file(rig.parent, "safe_z_mm = 180.0", "safe_z_mm = 18.0"))
+    assert "motion.safe_z_mm = 18 is below" in why
 
 
 @pytest.mark.parametrize(
@@ -153,25 +151,23 @@ def test_the_picture_shows_the_box_and_every_place(rig: Path, tmp_path: Path) ->
     )
     rig_file(rig.parent, "[ink.device]", wipe_and_wash + "[ink.device]")
     picture = tmp_path / "rig.svg"
-    assert brushloop("rig", "show", rig, "--picture", picture).returncode == 0
+    said("rig", "show", rig, "--picture", picture)
     drawn = picture.read_text()
     for words in ("from above", "box of limits", "board", "sheet"):
         assert f"<!-- {words}" in drawn, words
     for words in ("well", "wipe, over the rim", "wash pot", "park", "touch point"):
         assert f"<!-- {words} -->" in drawn, words
-    refused = brushloop("rig", "show", rig, "--picture", tmp_path / "rig.gif")
-    assert refused.returncode == 2
-    assert "must end in" in refused.stderr
+    assert "must end in" in refused("rig", "show", rig, "--picture", tmp_path / "rig.gif")
 
 
 def test_what_was_taught_says_what_was_never_measured(rig: Path) -> None:
     mass = Taught(0.0, "as set on the pendant", known="not weighed")
     Notebook().with_values({"robot.payload_kg": mass}).finished("arm").save(rig)
-    said = " ".join(brushloop("rig", "check", rig).stdout.split())
-    assert "robot.payload_kg 0.0 kg as set on the pendant, not weighed" in said
-    assert "not measured step proof" in said
-    assert "brushloop rig teach proof --arm" in said
-    assert "step arm" not in said
+    words = said("rig", "check", rig)
+    assert "robot.payload_kg 0.0 kg as set on the pendant, not weighed" in words
+    assert "not measured step proof" in words
+    assert "brushloop rig teach proof --arm" in words
+    assert "step arm" not in words
 
 
 # The doctor
@@ -211,9 +207,8 @@ async def test_whatever_is_wrong_is_reported_with_a_remedy_and_every_other_devic
 
 def test_a_rig_in_order_is_reported_with_all_that_was_answered_and_left_as_it_was(lab: Lab) -> None:
     report = lab.folder / "report.zip"
-    ran = brushloop("doctor", "--config", lab.folder / "rig.toml", "--report", report)
-    assert ran.returncode == 0
-    assert "Read it before you send it" in ran.stdout
+    command = ("doctor", "--config", lab.folder / "rig.toml", "--report", report)
+    assert "Read it before you send it" in said(*command)
     with zipfile.ZipFile(report) as archive:
         document = json.loads(archive.read("report.json"))
         rtde = json.loads(archive.read("rtde.json"))
@@ -247,9 +242,8 @@ def test_a_rig_in_order_is_reported_with_all_that_was_answered_and_left_as_it_wa
     assert lab.rig.arcs.cabinet.power.mode == "PowerOff"
     assert lab.rig.world.motion._next_id == 0
     before = report.read_bytes()
-    again = brushloop("doctor", "--config", lab.folder / "rig.toml", "--report", report)
-    assert (again.returncode, report.read_bytes()) == (2, before), "an archive is never overwritten"
-    assert "is not overwritten" in again.stderr
+    assert "is not overwritten" in refused(*command)
+    assert report.read_bytes() == before
 
 
 def test_names_addresses_and_paths_stay_in_the_lab(rig: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -277,9 +271,7 @@ def test_on_the_first_day_there_is_no_rig_yet_and_the_archive_holds_what_is_know
     squares = Taught([26.0, 20.0], "typed")
     values = {"aside.address": address, "camera.source": stream, "board.squares": squares}
     Notebook().with_values(values).save(rig)
-    ran = brushloop("doctor", "--config", rig, "--report", report)
-    assert ran.returncode == 0, ran.stderr
-    assert "new.toml yet" in ran.stdout
+    assert "new.toml yet" in said("doctor", "--config", rig, "--report", report)
     archive = Replayed(report)
     answered = {line["method"]: line["answer"] for line in archive.lines}
     assert answered["rob1.RobotState.getSafetyModeType"] == {"result": "Normal"}
