@@ -54,7 +54,6 @@ def rig_file(tmp_path: Path, old: str = "", new: str = "") -> Path:
 def test_a_bad_rig_is_refused_in_one_line(tmp_path: Path, old: str, new: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message) as caught:
         load_rig(rig_file(tmp_path, old, new))
-    assert caught.value.exit_code == 2
     assert "\n" not in str(caught.value) or "TOML" in message
 
 
@@ -89,7 +88,6 @@ def test_a_value_from_the_environment_is_refused_by_its_variable(
     monkeypatch.setenv(f"BRUSHLOOP_{name}", value)
     with pytest.raises(ConfigError, match=message) as caught:
         load_rig(rig_file(tmp_path))
-    assert caught.value.exit_code == 2
     assert "ROBOT__HOST" not in str(caught.value)
 
 
