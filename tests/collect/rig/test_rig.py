@@ -133,7 +133,9 @@ def test_a_value_that_cannot_be_true_is_named_with_its_remedy(
     assert remedy in checks[name].remedy
 
 
-def test_what_is_shown_is_where_the_tip_goes(rig: Path) -> None:
+def test_what_is_shown_is_where_the_tip_goes_in_a_picture_with_the_box_and_every_place(
+    rig: Path, tmp_path: Path
+) -> None:
     places = places_of(load_rig(rig))
     # Yaw 90: paper x runs along base y, paper y against base x.
     assert places["sheet lower right"] == pytest.approx([460.0, 134.0, 98.03])
@@ -141,9 +143,6 @@ def test_what_is_shown_is_where_the_tip_goes(rig: Path) -> None:
     table = brushloop("rig", "show", rig).stdout
     assert all(name in table for name in places)
     assert re.search(r"park .* 250\.0 .* -120\.0 .* 210\.0", table)
-
-
-def test_the_picture_shows_the_box_and_every_place(rig: Path, tmp_path: Path) -> None:
     wipe_and_wash = (
         "[ink.wipe]\nrim_mm = [322.0, 20.0]\nz_mm = 131.0\n[ink.wash]\npot_mm = [300.0, 100.0]\ndip_z_mm = 125.0\n"
     )

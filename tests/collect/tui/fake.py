@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import threading
 from collections.abc import AsyncGenerator, Awaitable, Callable
 from concurrent.futures import wait
 from dataclasses import dataclass, replace
@@ -162,13 +161,13 @@ FAILED = picture(state=State.FAILED, error=ERROR, messages=("capture 13: blob 21
 
 
 class FakeEngine:
-    """`RunnableEngine` without an arm; a stop or a park leads straight to stopped."""
+    """`Engine` without an arm, which notes what is asked of it; a stop or a park leads straight to its end."""
 
     def __init__(self, now: Snapshot) -> None:
         self.now = now
         self.calls: list[str] = []
         self.looks = 0
-        self._over = threading.Event()
+        self.finished = False
 
     def snapshot(self) -> Snapshot:
         self.looks += 1
@@ -193,22 +192,18 @@ class FakeEngine:
     def park(self) -> None:
         self.calls.append("park")
         self.now = replace(self.now, state=State.STOPPED, parked=True, prompt=None)
-        self._over.set()
+        self.finished = True
 
     def stop(self) -> None:
         self.calls.append("stop")
-        self._over.set()
+        self.finished = True
 
     def start(self) -> None:
         self.calls.append("start")
 
-    @property
-    def finished(self) -> bool:
-        return self._over.is_set()
-
     def join(self) -> None:
         self.calls.append("join")
-        assert self._over.wait(5.0)
+        assert self.finished
         raise CollectAborted("stopped; the same command resumes from here")
 
 
