@@ -300,7 +300,7 @@ class _Person:
             "r: radius": f"{brush.radius_mm:g}",
             "l: length": f"{brush.length_mm:g}",
             "can bus": lab.can_bus,
-            "serial line": "" if lab.ink is None else lab.ink.path,
+            "serial line": lab.ink_path,
         }
         return next((answer for part, answer in answers.items() if part in words), "")
 

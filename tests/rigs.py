@@ -260,7 +260,7 @@ class WirelessRig(LoopbackRig):
             patch = stack.enter_context(pytest.MonkeyPatch.context())
             patch.setattr(devices, "OpenCvCamera", lambda table, clock, _: SceneCamera(self, table, clock))
             patch.setattr(devices, "SriM8123", lambda *arguments: LoopSensor(self, *arguments))
-            patch.setattr("serial.Serial", lambda *_, **__: MemoryLine(self.ink and self.ink.instrument))
+            patch.setattr("serial.serial_for_url", lambda *_, **__: MemoryLine(self.ink and self.ink.instrument))
             for server, port in ((self.arcs, PORTS["arcs"]), (self.rtde, PORTS["rtde"])):
                 await server.start(self.address, port)
                 stack.push_async_callback(server.stop)

@@ -45,7 +45,7 @@ class InkTable(BaseModel, ABC, frozen=True, extra="forbid"):
 
     kind: str
     port: str = Field(min_length=1)
-    """Device file or COM port, or what else the device is reached by."""
+    """Device file, COM port or URL of pyserial, or what else the device is reached by."""
     dose_ml: Annotated[float, Field(gt=0.0, le=2.0)]
     """Size of one dose."""
     max_per_minute_ml: Annotated[float, Field(gt=0.0, le=100.0)] = 5.0
@@ -124,6 +124,8 @@ def crc16(data: bytes) -> int:
 
 
 POLL_S = 0.02
+STALE_BYTES = 4096
+"""More than can wait on a line."""
 REPLUG = "Check cable, power and the path of the port, then connect again."
 
 T = TypeVar("T")
@@ -133,8 +135,8 @@ class SerialPort:
     """Requests and replies over pyserial, without blocking the event loop."""
 
     def __init__(self, device: str, path: str, baud: int, gap_s: float = 0.0) -> None:
-        """`path` is the device file or COM port; `gap_s` a silence before each request, which separates frames in
-        Modbus RTU."""
+        """`path` is a device file, COM port or URL of pyserial; `gap_s` a silence before each request, which separates
+        frames in Modbus RTU."""
         self._device = device
         self._path = path
         self._baud = baud
@@ -150,7 +152,7 @@ class SerialPort:
 
         try:
             self._port = await asyncio.to_thread(
-                serial.Serial, self._path, self._baud, timeout=POLL_S, write_timeout=1.0, exclusive=True
+                serial.serial_for_url, self._path, self._baud, timeout=POLL_S, write_timeout=1.0, exclusive=True
             )
         except (OSError, ValueError) as error:
             why = f"cannot open {self._path}: {error}"
@@ -213,8 +215,8 @@ class SerialPort:
         if port is None or self._closing.is_set():
             raise NotConnected(self._device, op, "not connected")
         time.sleep(self._gap_s)
-        if waiting := port.in_waiting:
-            port.read(waiting)  # late replies and noise from before this request
+        if port.in_waiting:
+            port.read(STALE_BYTES)  # late replies and noise from before this request
         deadline_s = time.monotonic() + timeout_s
         port.write(request)
         received = b""

@@ -1,91 +1,57 @@
-"""Serial instruments on a pty: the ink station's firmware, a Modbus pump, and the line and faults that both share."""
+"""Serial instruments: the ink station's firmware, a Modbus pump, and the line and faults that both share."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import os
 import struct
-import tempfile
 import time
-import tty
 from collections.abc import Callable
-from pathlib import Path
-from typing import Self
 
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.ink import pump
 from brushloop.drivers.ink.station import number_of, seal, unseal
+from brushloop.drivers.loopback import LoopbackServer
 
 GARBAGE = b"\xff\x00*\n\x86\x01ok 1*0000\n"
 LATE_S = 0.3
 RESERVOIR_ML = 100.0
 
 
-class PtyLine:
-    """An instrument on a pseudo terminal, served by the running event loop; open `path` as the serial port.
+class InstrumentServer(LoopbackServer):
+    """An instrument whose serial line is carried by a network: pyserial opens it by `socket://HOST:PORT`.
 
     Its method `take` removes one request from a buffer, None while it is incomplete; `answer` carries it out and
     returns the reply, None for silence.
-
-    `path` is a link of its own that goes with the cable, as udev's do: the kernel gives the number of a closed
-    terminal to the next one, so a driver that connects again by number would reach another instrument.
     """
 
     def __init__(self, instrument: StationFirmware | PumpFirmware) -> None:
+        super().__init__()
         self.instrument = instrument
-        self.path = ""
         self.next_fault: Callable[[], str | None] = lambda: None
         """Asked for the fault of each request."""
-        self._terminal: tuple[int, int] | None = None
-        self._buffer = bytearray()
 
-    def __enter__(self) -> Self:
-        """Open the pty and serve it."""
-        master, slave = self._terminal = os.openpty()
-        tty.setraw(slave)  # or the terminal would echo, and translate line ends
-        self.path = str(Path(tempfile.mkdtemp(prefix="brushloop-line-")) / "tty")
-        Path(self.path).symlink_to(os.ttyname(slave))
-        asyncio.get_running_loop().add_reader(master, self._read)
-        return self
+    async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Answer requests until the client disconnects."""
+        buffer = bytearray()
+        while data := await reader.read(4096):
+            buffer += data
+            while (request := self.instrument.take(buffer)) is not None:
+                self._meet(request, writer)
 
-    def __exit__(self, *_: object) -> None:
-        """Close the pty."""
-        self.unplug()
-        Path(self.path).parent.rmdir()
-
-    def unplug(self) -> None:
-        """Pull the cable: the port is gone."""
-        terminal, self._terminal = self._terminal, None
-        if terminal is not None:
-            asyncio.get_running_loop().remove_reader(terminal[0])
-            Path(self.path).unlink(missing_ok=True)
-            for end in terminal:
-                os.close(end)
-
-    def _read(self) -> None:
-        assert self._terminal is not None
-        self._buffer += os.read(self._terminal[0], 4096)
-        while (request := self.instrument.take(self._buffer)) is not None:
-            self._meet(request)
-
-    def _write(self, reply: bytes) -> None:
-        if self._terminal is not None:
-            with contextlib.suppress(OSError):
-                os.write(self._terminal[0], reply)
-
-    def _meet(self, request: bytes) -> None:
+    def _meet(self, request: bytes, writer: asyncio.StreamWriter) -> None:
         fault = self.next_fault()
         if fault == "unplug":
-            self.unplug()
+            assert self._server is not None
+            self._server.close()
+            self.drop_clients()
             return
         reply = None if fault == "deaf" else self.instrument.answer(request)
         if reply is None or fault == "mute":
             return
         if fault == "late":
-            asyncio.get_running_loop().call_later(LATE_S, self._write, reply)
+            asyncio.get_running_loop().call_later(LATE_S, self.write, writer, reply)
         else:
-            self._write(GARBAGE if fault == "garbage" else reply)
+            self.write(writer, GARBAGE if fault == "garbage" else reply)
 
 
 BRUSH_ML = 0.5

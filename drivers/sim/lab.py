@@ -108,7 +108,7 @@ class UnknownLab(LoopbackRig):
         """What a person can read in the lab now: on labels, plugs, the print and the pendant."""
         facts, table, brush = self.facts, self.facts.config.table, self.facts.config.brush
         columns, rows = table.board_squares
-        ink = "none, a person pours" if self.ink is None else f"{facts.config.ink_device} on {self.ink.path}"
+        ink = "none, a person pours" if self.ink is None else f"{facts.config.ink_device} on {self.ink_path}"
         return [
             "an unknown lab; simulated: nothing measured in it is a result on paper",
             f"robot     the pendant shows the address {self.host}",

@@ -1,4 +1,4 @@
-"""The loopback rig: one world, the devices around it on 127.0.0.1 and on ptys, its `rig.toml`, and its process."""
+"""The loopback rig: one world, the devices around it on 127.0.0.1, its `rig.toml`, and its process."""
 
 import asyncio
 import contextlib
@@ -13,7 +13,7 @@ from typing import Any, Self
 from brushloop.drivers.force.simulator import ForceBoard, SocketcandServer
 from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL
 from brushloop.drivers.host import alongside
-from brushloop.drivers.ink.simulator import PUMP_ML, PtyLine, PumpFirmware, StationFirmware
+from brushloop.drivers.ink.simulator import PUMP_ML, InstrumentServer, PumpFirmware, StationFirmware
 from brushloop.drivers.loopback import LoopbackServer, RigRefused
 from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.config import SimConfig
@@ -76,10 +76,10 @@ class LoopbackRig:
             board = ForceBoard(self.world.wrench, noise_n=noise_n, noise_nm=noise_nm, seed=config.seed)
             board.next_fault = functools.partial(self.faults.kind_met, Device.FORCE)
             self.force = self.servers["force"] = SocketcandServer(board, rate_hz=config.force_hz)
-        self.ink: PtyLine | None = None
+        self.ink: InstrumentServer | None = None
         if config.ink_device != "none":
             firmware = PumpFirmware if config.ink_device == "pump" else StationFirmware
-            self.ink = PtyLine(firmware(self.world.well))
+            self.ink = self.servers["ink"] = InstrumentServer(firmware(self.world.well))
             self.ink.next_fault = functools.partial(self.faults.kind_met, Device.INK)
         self._ports = ports or {}
         self._open = contextlib.AsyncExitStack()
@@ -91,8 +91,6 @@ class LoopbackRig:
                 await self.start(name)
             if self.force is not None:
                 await asyncio.to_thread(push_on, self.config.brush)  # it is slow to find
-            if self.ink is not None:
-                opening.enter_context(self.ink)
             watching = alongside(self.faults.watch(self.arcs.cabinet.safety_stop), "faults")
             await opening.enter_async_context(watching)
             self._open = opening.pop_all()
@@ -109,10 +107,15 @@ class LoopbackRig:
         for server in self.servers.values():
             await server.stop()
 
+    @property
+    def ink_path(self) -> str:
+        """Where pyserial opens the line of the ink device; empty without one."""
+        return "" if self.ink is None else f"socket://{self.host}:{self.ink.port}"
+
     def toml(self) -> str:
         """A `rig.toml` for this rig, as an operator would have taught it."""
         ports = {name: server.port for name, server in self.servers.items()}
-        return rig_toml(self.config, self.host, "" if self.ink is None else self.ink.path, ports)
+        return rig_toml(self.config, self.host, self.ink_path, ports)
 
     def labels(self, control: Path | None = None) -> list[str]:
         """What a person can read at the rig, whose control socket may be at `control`."""

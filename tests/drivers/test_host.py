@@ -13,8 +13,10 @@ import pytest
 from brushloop.collect.errors import CameraLate, describe
 from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, Stale
 from brushloop.drivers.host import Clock
-from brushloop.drivers.ink.simulator import PtyLine, StationFirmware
+from brushloop.drivers.ink.port import SerialPort
+from brushloop.drivers.ink.simulator import InstrumentServer, StationFirmware
 from brushloop.drivers.ink.station import InkStation, InkStationConfig
+from brushloop.drivers.sim.rig import HOST
 from tests.waiting import until
 
 
@@ -49,46 +51,50 @@ def station_at(path: str) -> InkStation:
 
 
 @pytest.fixture
-async def line() -> AsyncIterator[PtyLine]:
-    with PtyLine(StationFirmware()) as line:
-        yield line
+async def line() -> AsyncIterator[InstrumentServer]:
+    line = InstrumentServer(StationFirmware())
+    await line.start(HOST, 0)
+    yield line
+    await line.stop()
 
 
 @pytest.fixture
-async def station(line: PtyLine) -> AsyncIterator[InkStation]:
-    station = station_at(line.path)
+async def station(line: InstrumentServer) -> AsyncIterator[InkStation]:
+    station = station_at(f"socket://{HOST}:{line.port}")
     await station.connect()
     yield station
     await station.close()
 
 
-async def test_a_pulled_cable_is_a_lost_connection_at_once_and_leads_to_no_other_station(
-    line: PtyLine, station: InkStation
-):
+async def test_a_pulled_cable_is_a_lost_connection_at_once(line: InstrumentServer, station: InkStation):
     line.next_fault = lambda: "unplug"
     with pytest.raises(ConnectionLost, match=r"may be in the well.*Check cable") as lost:
         await station.dose(1.0)
     assert lost.value.op == "dose"
-    # the kernel gives the number of the closed terminal to the next one
-    with PtyLine(StationFirmware()), pytest.raises(ConnectionLost, match="cannot open"):
-        await station_at(line.path).connect()
+    with pytest.raises(ConnectionLost, match="cannot open"):
+        await station_at(f"socket://{HOST}:{line.port}").connect()
 
 
-async def test_a_port_that_is_missing_or_held_by_somebody_else_is_not_opened(
-    tmp_path: Path, line: PtyLine, station: InkStation
-):
+async def test_a_port_that_is_missing_or_held_by_somebody_else_is_not_opened(tmp_path: Path):
     nowhere = station_at(str(tmp_path / "ttyUSB0"))
     with pytest.raises(ConnectionLost, match=r"cannot open .*ttyUSB0"):
         await nowhere.connect()
     with pytest.raises(NotConnected):
         await nowhere.light()
     await nowhere.close()
+    ends = os.openpty()
+    holder, other = (SerialPort("ink", os.ttyname(ends[1]), 9600) for _ in range(2))
+    await holder.open()
     with pytest.raises(ConnectionLost, match="lock"):
-        await station_at(line.path).connect()
-    await station.light()
+        await other.open()
+    await holder.close()
+    for end in ends:
+        os.close(end)
 
 
-async def test_closing_ends_an_exchange_that_waits(line: PtyLine, station: InkStation, monkeypatch: pytest.MonkeyPatch):
+async def test_closing_ends_an_exchange_that_waits(
+    line: InstrumentServer, station: InkStation, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setattr("brushloop.drivers.ink.station.REPLY_S", 1000.0)
     line.next_fault = lambda: "mute"
     asking = asyncio.create_task(station.light())
@@ -98,11 +104,11 @@ async def test_closing_ends_an_exchange_that_waits(line: PtyLine, station: InkSt
         await asking
 
 
-async def test_an_exchange_that_is_cancelled_ends_before_the_next_begins(line: PtyLine, station: InkStation):
+async def test_an_exchange_that_is_cancelled_ends_before_the_next_begins(line: InstrumentServer, station: InkStation):
     on_the_line: list[str] = []
-    faults, reply = iter(["late"]), line._write
+    faults, reply = iter(["late"]), line.write
     line.next_fault = lambda: (on_the_line.append("request"), next(faults, None))[1]
-    line._write = lambda data: (on_the_line.append("reply"), reply(data))[1]  # type: ignore[method-assign]
+    line.write = lambda *sent: (on_the_line.append("reply"), reply(*sent))[1]  # type: ignore[method-assign]
     asking = asyncio.create_task(station.light())
     await asyncio.sleep(0)
     asking.cancel()

@@ -123,7 +123,7 @@ class InLab(Person):
             "L:": str(brush.length_mm),
             "Deepest press": str(facts.max_depth_mm),
             "Delivery per revolution": "0.1",
-            "Its serial line": "" if lab.ink is None else lab.ink.path,
+            "Its serial line": lab.ink_path,
             "CAN bus": lab.can_bus,
         }
         return next((v for start, v in read.items() if question.startswith(start)), "")

@@ -86,7 +86,7 @@ def plug(monkeypatch: pytest.MonkeyPatch) -> Plug:
 
     def put(instrument: Any) -> Line:
         line = Line(instrument)
-        monkeypatch.setattr("serial.Serial", lambda *_, **__: line)
+        monkeypatch.setattr("serial.serial_for_url", lambda *_, **__: line)
         return line
 
     return put

@@ -28,6 +28,7 @@ from brushloop.drivers.camera import CameraTable
 from brushloop.drivers.camera.source import Capture
 from brushloop.drivers.force.simulator import FRAME_S, ForceBoard, SocketcandServer
 from brushloop.drivers.force.sri_m8123 import COMMAND_ID, LOOPBACK_CHANNEL, START
+from brushloop.drivers.ink.simulator import InstrumentServer
 from brushloop.drivers.loopback import LoopbackServer, RigRefused
 from brushloop.drivers.loopback import ask as ask_rig
 from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
@@ -111,7 +112,7 @@ def test_these_are_all_the_servers_there_are():
         return {kind, *(b for k in kind.__subclasses__() for b in below(k))}
 
     ours = {k for k in below(LoopbackServer) if k.__module__.startswith("brushloop.drivers.")} - {LoopbackServer}
-    assert ours == {ArcsServer, RtdeServer, MjpegServer, ControlServer, SocketcandServer}
+    assert ours == {ArcsServer, RtdeServer, MjpegServer, ControlServer, SocketcandServer, InstrumentServer}
     assert all(k.start is LoopbackServer.start for k in ours), "a server that listens in its own way must refuse too"
 
 
