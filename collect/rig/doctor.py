@@ -18,6 +18,7 @@ import statistics
 import time
 import zipfile
 from collections.abc import Awaitable, Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -29,12 +30,13 @@ from brushloop.calibrate.board.pix2len import see_board
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.rig.config import PREFIX, RigConfig
 from brushloop.collect.rig.devices import identified, make_robot
-from brushloop.drivers.arcs.controller import MOVING_ALLOWED, RobotMode, survey
+from brushloop.drivers.arcs.controller import MOVING_ALLOWED, RobotMode
 from brushloop.drivers.arcs.settings import ArcsTable
-from brushloop.drivers.arcs.telemetry import rtde_answers
+from brushloop.drivers.arcs.telemetry import RtdeStream
+from brushloop.drivers.arcs.wire import Framing, RpcConnection, open_arcs
 from brushloop.drivers.camera import OpenCvCamera
 from brushloop.drivers.devices import Device, Stamp
-from brushloop.drivers.errors import DeviceError
+from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, RpcError
 from brushloop.drivers.force.sri_m8123 import ForceTable, SriM8123
 from brushloop.drivers.host import Clock
 from brushloop.drivers.ink.port import InkTable
@@ -262,6 +264,87 @@ def _user() -> str:
         return getpass.getuser()
     except (KeyError, OSError):  # a process whose user has no name
         return ""
+
+
+# ---------------------------------------------------------------- a transcript of questions that change nothing
+
+OF_THE_CONTROLLER = (
+    "SystemInfo.getControlSoftwareVersionCode",
+    "SystemInfo.getControlSoftwareFullVersion",
+    "RuntimeMachine.getRuntimeState",
+)
+OF_THE_ROBOT = (
+    *("RobotConfig.getRobotType", "RobotConfig.getRobotSubType", "RobotConfig.getControlBoxType", "RobotConfig.getDof"),
+    *("RobotConfig.getTcpOffset", "RobotConfig.getPayload", "RobotConfig.getCollisionLevel"),
+    *("RobotManage.getOperationalMode", "RobotManage.isSimulationEnabled", "MotionControl.getSpeedFraction"),
+    *("MotionControl.getExecId", "MotionControl.getQueueSize", "RobotState.getRobotModeType"),
+    *("RobotState.getSafetyModeType", "RobotState.isPowerOn", "RobotState.isSteady", "RobotState.getJointState"),
+    *("RobotState.getTcpPose", "RobotState.getJointPositions"),
+)
+"""Asked without parameters; then kinematics are asked where the arm is, and for the newest messages."""
+MESSAGES = 5
+NO_ANSWER: dict[type[DeviceError], str] = {DeviceTimeout: "silence", ConnectionLost: "lost"}
+"""What a transcript says instead of an answer; `refused` for any other error."""
+
+
+async def survey(host: str, port: int, framing: Framing) -> list[dict[str, Any]]:
+    """Ask everything on one connection, in the driver's order: version, then all about the first robot.
+
+    Each exchange has `method`, `params`, `took_ms` and `answer`: `result` or `error` as the controller sent it, else
+    `silence`, `lost` or `refused`, which says why there is none; then the next question is asked. Ends early where the
+    controller does not connect or hangs up. Sets, powers and moves nothing.
+    """
+    connection = RpcConnection(host, port, framing=framing)
+    exchanges: list[dict[str, Any]] = []
+
+    async def ask(method: str, params: dict[str, Any] | None = None, step: Awaitable[Any] | None = None) -> Any:
+        """The result of `method`, or of `step`; None without one."""
+        if connection.lost:
+            return None
+        began_s, answer = time.monotonic(), dict[str, Any]()
+        try:
+            answer["result"] = await (step or connection.call(method, params))
+        except RpcError as error:
+            answer["error"] = {"code": error.code, "message": error.message}
+        except DeviceError as error:
+            answer[NO_ANSWER.get(type(error), "refused")] = error.what
+        took_ms = round((time.monotonic() - began_s) * 1e3, 3)
+        exchanges.append({"method": method, "params": params, "answer": answer, "took_ms": took_ms})
+        return answer.get("result")
+
+    try:
+        await ask("connect", step=open_arcs(connection))
+        if "result" in exchanges[0]["answer"]:
+            exchanges.clear()  # the login has no answer to keep
+        else:
+            with suppress(DeviceError):  # a cabinet that does not answer the login may answer the rest
+                await connection.open(login=False)
+        await ask("SystemInfo.getInterfaceVersionCode")
+        names = await ask("getRobotNames")
+        robot = str(names[0]) if isinstance(names, list) and names else "rob1"  # pyright: ignore[reportUnknownArgumentType]
+        methods = (*OF_THE_CONTROLLER, *(f"{robot}.{name}" for name in OF_THE_ROBOT))
+        *_, pose, joints = [await ask(method) for method in methods]
+        if joints and pose:
+            await ask(f"{robot}.RobotAlgorithm.forwardKinematics", {"q": joints})
+            await ask(f"{robot}.RobotAlgorithm.inverseKinematics", {"qnear": joints, "pose": pose})
+        await ask(f"{robot}.Trace.peek", {"num": MESSAGES, "last_time": 0})
+    finally:
+        await connection.close()
+    return exchanges
+
+
+async def rtde_answers(host: str, port: int) -> dict[str, Any]:
+    """What RTDE offers by name, and the newest sample of pose and joints; `refused` says why something is missing."""
+    stream = RtdeStream(host, port)
+    answers: dict[str, Any] = {}
+    try:
+        await stream.open()
+        answers["sample"] = (await stream.samples())[-1]
+    except DeviceError as error:
+        answers["refused"] = str(error)
+    finally:
+        await stream.close()
+    return {"offered": stream.offered, **answers}
 
 
 async def write_report(

@@ -1,27 +1,14 @@
-"""Typed calls to the controller: what is sent over one connection, and what codes, modes and errors mean at the arm.
-
-`survey` is a transcript of untyped ones, which change nothing: what a cabinet answered, for a report of a defect.
-"""
+"""Typed calls to the controller: what is sent over one connection, and what codes, modes and errors mean at the arm."""
 
 import asyncio
-import time
-from collections.abc import AsyncGenerator, Awaitable, Callable
-from contextlib import asynccontextmanager, suppress
+from collections.abc import AsyncGenerator, Callable
+from contextlib import asynccontextmanager
 from enum import IntEnum, StrEnum
 from typing import Any
 
 from brushloop.drivers.arcs.wire import DEVICE, Framing, RpcConnection, numbers, open_arcs
 from brushloop.drivers.devices import Pose
-from brushloop.drivers.errors import (
-    ConnectionLost,
-    DeviceError,
-    DeviceTimeout,
-    MotionRefused,
-    NotPowered,
-    ProtocolViolation,
-    RobotNotSafe,
-    RpcError,
-)
+from brushloop.drivers.errors import DeviceError, MotionRefused, NotPowered, ProtocolViolation, RobotNotSafe
 from brushloop.drivers.geometry import from_wire, to_wire
 
 LOOPBACK_CONTROL_BOX = "brushloop-loopback"
@@ -222,73 +209,6 @@ def accepted(op: str, code: object) -> None:
         known = next((member for member in ReturnCode if member == abs(code)), None)
         name, remedy = ("UNKNOWN", "") if known is None else (known.name, REFUSAL_REMEDY.get(known, ""))
         raise MotionRefused(DEVICE, op, code, name, remedy)
-
-
-# ---------------------------------------------------------------- a transcript of questions that change nothing
-
-OF_THE_CONTROLLER = (
-    "SystemInfo.getControlSoftwareVersionCode",
-    "SystemInfo.getControlSoftwareFullVersion",
-    "RuntimeMachine.getRuntimeState",
-)
-OF_THE_ROBOT = (
-    *("RobotConfig.getRobotType", "RobotConfig.getRobotSubType", "RobotConfig.getControlBoxType", "RobotConfig.getDof"),
-    *("RobotConfig.getTcpOffset", "RobotConfig.getPayload", "RobotConfig.getCollisionLevel"),
-    *("RobotManage.getOperationalMode", "RobotManage.isSimulationEnabled", "MotionControl.getSpeedFraction"),
-    *("MotionControl.getExecId", "MotionControl.getQueueSize", "RobotState.getRobotModeType"),
-    *("RobotState.getSafetyModeType", "RobotState.isPowerOn", "RobotState.isSteady", "RobotState.getJointState"),
-    *("RobotState.getTcpPose", "RobotState.getJointPositions"),
-)
-"""Asked without parameters; then kinematics are asked where the arm is, and for the newest messages."""
-MESSAGES = 5
-NO_ANSWER: dict[type[DeviceError], str] = {DeviceTimeout: "silence", ConnectionLost: "lost"}
-"""What a transcript says instead of an answer; `refused` for any other error."""
-
-
-async def survey(host: str, port: int, framing: Framing) -> list[dict[str, Any]]:
-    """Ask everything on one connection, in the driver's order: version, then all about the first robot.
-
-    Each exchange has `method`, `params`, `took_ms` and `answer`: `result` or `error` as the controller sent it, else
-    `silence`, `lost` or `refused`, which says why there is none; then the next question is asked. Ends early where the
-    controller does not connect or hangs up. Sets, powers and moves nothing.
-    """
-    connection = RpcConnection(host, port, framing=framing)
-    exchanges: list[dict[str, Any]] = []
-
-    async def ask(method: str, params: dict[str, Any] | None = None, step: Awaitable[Any] | None = None) -> Any:
-        """The result of `method`, or of `step`; None without one."""
-        if connection.lost:
-            return None
-        began_s, answer = time.monotonic(), dict[str, Any]()
-        try:
-            answer["result"] = await (step or connection.call(method, params))
-        except RpcError as error:
-            answer["error"] = {"code": error.code, "message": error.message}
-        except DeviceError as error:
-            answer[NO_ANSWER.get(type(error), "refused")] = error.what
-        took_ms = round((time.monotonic() - began_s) * 1e3, 3)
-        exchanges.append({"method": method, "params": params, "answer": answer, "took_ms": took_ms})
-        return answer.get("result")
-
-    try:
-        await ask("connect", step=open_arcs(connection))
-        if "result" in exchanges[0]["answer"]:
-            exchanges.clear()  # the login has no answer to keep
-        else:
-            with suppress(DeviceError):  # a cabinet that does not answer the login may answer the rest
-                await connection.open(login=False)
-        await ask("SystemInfo.getInterfaceVersionCode")
-        names = await ask("getRobotNames")
-        robot = str(names[0]) if isinstance(names, list) and names else "rob1"  # pyright: ignore[reportUnknownArgumentType]
-        methods = (*OF_THE_CONTROLLER, *(f"{robot}.{name}" for name in OF_THE_ROBOT))
-        *_, pose, joints = [await ask(method) for method in methods]
-        if joints and pose:
-            await ask(f"{robot}.RobotAlgorithm.forwardKinematics", {"q": joints})
-            await ask(f"{robot}.RobotAlgorithm.inverseKinematics", {"qnear": joints, "pose": pose})
-        await ask(f"{robot}.Trace.peek", {"num": MESSAGES, "last_time": 0})
-    finally:
-        await connection.close()
-    return exchanges
 
 
 @asynccontextmanager

@@ -156,20 +156,6 @@ class RtdeStream:
                 await stream[1].wait_closed()
 
 
-async def rtde_answers(host: str, port: int) -> dict[str, Any]:
-    """What RTDE offers by name, and the newest sample of pose and joints; `refused` says why something is missing."""
-    stream = RtdeStream(host, port)
-    answers: dict[str, Any] = {}
-    try:
-        await stream.open()
-        answers["sample"] = (await stream.samples())[-1]
-    except DeviceError as error:
-        answers["refused"] = str(error)
-    finally:
-        await stream.close()
-    return {"offered": stream.offered, **answers}
-
-
 QUICK_S = 0.05
 """An answer that took longer, as on a busy computer, does not say well enough when the arm was there."""
 MOVED_MM = 0.2

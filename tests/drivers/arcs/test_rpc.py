@@ -14,7 +14,8 @@ from typing import Any
 
 import pytest
 
-from brushloop.drivers.arcs.controller import Controller, survey
+from brushloop.collect.rig.doctor import survey
+from brushloop.drivers.arcs.controller import Controller
 from brushloop.drivers.arcs.wire import Framing, answer_in
 from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation
 from brushloop.drivers.sim.arcs_server import ArcsServer
