@@ -68,7 +68,6 @@ async def alongside(work: Coroutine[Any, Any, None], name: str) -> AsyncGenerato
 WAITING = 64
 """Length of the backlog: refused processes connect to learn who holds the name, and are never served."""
 
-
 UNNAMED = "a process that cannot be named"
 
 

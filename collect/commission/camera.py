@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hashlib
+import time
 from collections.abc import AsyncGenerator, Sequence
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from brushloop.collect.operator import Prompt
 from brushloop.collect.photograph.frames import Gray, each_frame
 from brushloop.collect.rig.devices import identified
 from brushloop.drivers.camera import OpenCvCamera
-from brushloop.drivers.camera.source import CameraTable, Locked, found_settings
+from brushloop.drivers.camera.source import PROPERTIES, CameraTable, Locked
 from brushloop.drivers.devices import Frame, Stamp
 from brushloop.drivers.host import Clock
 
@@ -223,6 +224,22 @@ async def opened(visit: Visit, source: str | None = None) -> AsyncGenerator[Open
     camera = OpenCvCamera(CameraTable(kind="opencv", source=source, latency_ms=LATE_MS, locked=locked), visit.clock)
     async with identified(camera):
         yield camera
+
+
+def found_settings(device: int, settle_s: float) -> dict[str, float]:
+    """What a device chose by itself within `settle_s`, by the names of `Locked`. Blocks for that long.
+
+    A setting that the device does not have is left out.
+    """
+    capture = cv2.VideoCapture(device)
+    try:
+        until_s = time.monotonic() + settle_s
+        while time.monotonic() < until_s and capture.read()[0]:
+            pass
+        settings = {name: float(capture.get(getattr(cv2, number))) for name, (number, *_) in PROPERTIES.items()}
+    finally:
+        capture.release()
+    return {name: value for name, value in settings.items() if value > 0.0 or (name == "exposure" and value < -0.5)}
 
 
 async def still(camera: OpenCvCamera, clock: Clock) -> Gray:

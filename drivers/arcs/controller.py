@@ -78,12 +78,10 @@ UNKNOWN_CONDITION = (
     "Look at the pendant before doing anything else.",
 )
 
-
 REFUSAL_REMEDY = {
     ReturnCode.QUEUE_FULL: "Another client is sending motion; close it.",
     ReturnCode.BUSY: "Another program has the arm; stop it on the pendant.",
 }
-
 
 NOT_RUNNING = -1
 """Return code of a motion in any robot mode but Running."""

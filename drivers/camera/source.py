@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import http.client
 import os
-import time
 import urllib.error
 import urllib.request
 from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias, cast
@@ -20,7 +19,6 @@ if TYPE_CHECKING:
 DEVICE = "camera"
 LOOPBACK_SERVER = "brushloop-loopback"
 """The loopback camera's HTTP server name; no camera maker uses it."""
-
 
 Setting = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Side = Annotated[int, Field(ge=16, le=65535)]
@@ -145,24 +143,6 @@ class Capture:
                 remedy = "Choose a value that the camera has; `v4l2-ctl --list-ctrls` lists them."
                 raise DeviceError(DEVICE, "lock", what, remedy=remedy)
         return settings
-
-
-def found_settings(device: int, settle_s: float) -> dict[str, float]:
-    """What a device chose by itself within `settle_s`, by the names of `Locked`. Blocks for that long.
-
-    A setting that the device does not have is left out.
-    """
-    import cv2
-
-    capture = cv2.VideoCapture(device)
-    try:
-        until_s = time.monotonic() + settle_s
-        while time.monotonic() < until_s and capture.read()[0]:
-            pass
-        settings = {name: float(capture.get(getattr(cv2, number))) for name, (number, *_) in PROPERTIES.items()}
-    finally:
-        capture.release()
-    return {name: value for name, value in settings.items() if value > 0.0 or (name == "exposure" and value < -0.5)}
 
 
 def _is_loopback(table: CameraTable) -> bool:

@@ -105,7 +105,6 @@ STILL_N, STILL_NM = 0.05, 0.01
 MIN_BIAS_ROUNDS = 10
 NO_BIAS: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
-
 MOST_STALE_MS = 100.0
 """Longest silence allowed: at 20 mm/s the brush goes down 2 mm in this time without being felt."""
 MOST_STALE_LOOPBACK_MS = 2000.0

@@ -17,9 +17,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from brushloop.collect.commission.camera import found_settings
 from brushloop.drivers import camera as camera_module
 from brushloop.drivers.camera import OpenCvCamera, is_late, looked_at
-from brushloop.drivers.camera.source import CameraTable, Capture, Locked, found_settings
+from brushloop.drivers.camera.source import CameraTable, Capture, Locked
 from brushloop.drivers.devices import Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout
 from brushloop.drivers.host import Clock
