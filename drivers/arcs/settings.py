@@ -3,13 +3,11 @@
 No step here moves the arm or clears a stop.
 """
 
-from __future__ import annotations
-
 import asyncio
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, Field
 
@@ -78,7 +76,7 @@ class Settings:
             "operational mode": self.operational_mode,
         }
 
-    def require(self, op: str, wanted: Settings) -> None:
+    def require(self, op: str, wanted: Self) -> None:
         """Raise `SettingsChanged` naming every setting that is not as wanted."""
         same = (
             max(distance(self.tool, wanted.tool)) <= TOLERANCE,  # one rotation has several sets of angles

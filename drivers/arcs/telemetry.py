@@ -131,8 +131,7 @@ class RtdeStream:
         Only for the newest is the arrival time known. Raises `DeviceTimeout` after silence, `ConnectionLost`,
         `ProtocolViolation`.
         """
-        if self._stream is None:
-            raise NotConnected(STREAM, "read", "not connected")
+        assert self._stream is not None, "open comes first"
         samples: list[list[Any]] = []
         async with in_time(STREAM, "read", SILENCE_S, "sample"):
             while not samples:

@@ -4,15 +4,13 @@ Every server of the rig asks the board, before it answers, whether a fault strik
 each phase is in the table of tests/collect/faults/test_matrix.py.
 """
 
-from __future__ import annotations
-
 import asyncio
 import itertools
 import math
 from collections.abc import Callable, Set
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
@@ -109,7 +107,7 @@ class Fault(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     """How late a `late` reply or push of the robot comes, in real seconds."""
 
     @model_validator(mode="after")
-    def _coherent(self) -> Fault:
+    def _coherent(self) -> Self:
         kinds = KINDS[self.device]
         if self.kind not in kinds:
             raise ValueError(f"kind = {self.kind!r} is not one of {self.device}'s: {', '.join(sorted(kinds))}")

@@ -1,13 +1,11 @@
 """The facts of an unknown lab: what is true there, where its things are, how a seed draws them, what may go wrong."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -120,7 +118,7 @@ class Facts:
             "clear-view": self.clear_mm,
         }[to]
 
-    def patched(self, **config: Any) -> Facts:
+    def patched(self, **config: Any) -> Self:
         """The lab with these fields of its configuration changed."""
         return replace(self, config=replace(self.config, **config))
 
