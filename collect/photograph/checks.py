@@ -29,23 +29,28 @@ class Failure(StrEnum):
     only if the hairs carried ink; its shape comes last.
     """
 
-    EXPOSURE = "exposure"
-    BLURRED = "blurred"
-    CUT = "cut"
-    GLARE = "glare"
-    NEIGHBOUR = "neighbour"
-    BLANK = "blank"
-    DRY = "dry"
-    SMEARED = "smeared"
-    MISPLACED = "misplaced"
-    FAINT = "faint"
-    SPLIT = "split"
-    BENT = "bent"
+    EXPOSURE = "exposure", "well lit", True
+    BLURRED = "blurred", "sharp", True
+    CUT = "cut", "in frame", True
+    GLARE = "glare", "no glare", True
+    NEIGHBOUR = "neighbour", "alone"
+    BLANK = "blank", "inked"
+    DRY = "dry", "wet"
+    SMEARED = "smeared", "no smear"
+    MISPLACED = "misplaced", "in place"
+    FAINT = "faint", "dark"
+    SPLIT = "split", "whole"
+    BENT = "bent", "straight"
 
-    @property
-    def of_picture(self) -> bool:
-        """Whether the photograph failed, not the stroke: the stroke on paper may be sound."""
-        return self in (Failure.EXPOSURE, Failure.BLURRED, Failure.CUT, Failure.GLARE)
+    def __new__(cls, name: str, passed: str, of_picture: bool = False) -> Failure:
+        """`passed` is what a capture is that passed the check; `of_picture` tells that the photograph failed, not the
+        stroke: the stroke on paper may be sound."""
+        failure = str.__new__(cls, name)
+        failure._value_, failure.passed, failure.of_picture = name, passed, of_picture
+        return failure
+
+    passed: str
+    of_picture: bool
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,21 +24,6 @@ if TYPE_CHECKING:
 
 COLOURS = {"both": (166, 166, 166), "captured only": (213, 94, 0), "predicted only": (0, 114, 178)}
 """Colours of a difference, those of `calibrate.report.overlay`."""
-PASSED = {
-    "exposure": "well lit",
-    "blurred": "sharp",
-    "cut": "in frame",
-    "glare": "no glare",
-    "neighbour": "alone",
-    "blank": "inked",
-    "dry": "wet",
-    "smeared": "no smear",
-    "misplaced": "in place",
-    "faint": "dark",
-    "split": "whole",
-    "bent": "straight",
-}
-"""What a capture is that passed a check; the check itself has the name of the failure."""
 
 
 def over_photograph(photo: NDArray[np.uint8], predicted: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -64,10 +49,13 @@ def difference(captured: NDArray[np.bool_], predicted: NDArray[np.bool_]) -> NDA
 
 def checks_content(checks: Sequence[Check]) -> Content:
     """A line for each check with value and limit, those missed first, with what to do about them."""
+    from brushloop.collect.photograph.checks import Failure
+
+    passed = {str(failure): failure.passed for failure in Failure}
     lines: list[Content] = []
     for check in sorted(checks, key=lambda check: check.passed):
         sign, style = ("✓", "") if check.passed else ("!", "bold $text-warning")
-        name = PASSED.get(check.name, check.name) if check.passed else check.name
+        name = passed.get(check.name, check.name) if check.passed else check.name
         value = f"{sign} {name:<10}{_number(check.score):>6}"
         lines.append(Content.assemble((value, style), (f"  {_limit(check)}", "dim")))
         if check.reason:
