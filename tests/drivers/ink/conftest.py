@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -25,32 +25,14 @@ def loop() -> Any:
     return asyncio.get_running_loop()
 
 
-class Script:
-    """An instrument that knows its lines by heart; b"" as a reply is silence."""
-
-    def __init__(self, exchanges: Sequence[tuple[bytes, bytes]]) -> None:
-        self.left = list(exchanges)
-
-    def take(self, buffer: bytearray) -> bytes | None:
-        request = bytes(buffer)
-        buffer.clear()
-        return request or None
-
-    def answer(self, request: bytes) -> bytes:
-        assert self.left, f"nothing was expected, got {request!r}"
-        expected, reply = self.left.pop(0)
-        assert request == expected
-        return reply
-
-
 class Line(MemoryLine):
     """The line of an instrument, with faults. Time passes while nothing is there to be read."""
 
     def __init__(self, instrument: Any) -> None:
         super().__init__(instrument)
-        self.faults: list[str | None] = []
-        """Of the next requests, one each: those of the loopback rig, or unplug."""
-        self.requests = 0
+        self.faults: list[str | bytes | None] = []
+        """Of the next requests, one each: those of the loopback rig, or what comes instead of the reply."""
+        self.requests: list[bytes] = []
         self._late = b""
 
     def write(self, data: bytes) -> None:
@@ -63,7 +45,7 @@ class Line(MemoryLine):
         return super().read(size)
 
     def _answered(self, request: bytes) -> bytes:
-        self.requests += 1
+        self.requests.append(request)
         fault = self.faults.pop(0) if self.faults else None
         if fault == "unplug":
             self.faults.append(fault)
@@ -71,6 +53,8 @@ class Line(MemoryLine):
         reply = b"" if fault == "deaf" else super()._answered(request)
         if fault == "late":
             self._late = reply  # comes once the next request is on the line
+        if isinstance(fault, bytes):
+            return fault
         return {"mute": b"", "late": b"", "garbage": GARBAGE}.get(fault or "", reply)
 
 
@@ -90,14 +74,3 @@ def plug(monkeypatch: pytest.MonkeyPatch) -> Plug:
         return line
 
     return put
-
-
-Scripted = Callable[..., None]
-
-
-@pytest.fixture
-def scripted(plug: Plug) -> Iterator[Scripted]:
-    """Puts an instrument at `PORT` that expects these requests and nothing else until the test ends."""
-    lines: list[Line] = []
-    yield lambda *exchanges: lines.append(plug(Script(exchanges)))
-    assert not (left := [line.instrument.left for line in lines if line.instrument.left]), f"never asked for: {left}"

@@ -21,7 +21,7 @@ from brushloop.drivers.ink.port import InkRefused
 from brushloop.drivers.ink.pump import ModbusPump, ModbusPumpConfig
 from brushloop.drivers.ink.simulator import PumpFirmware, StationFirmware
 from brushloop.drivers.ink.station import CONNECT_ATTEMPTS, InkStation, InkStationConfig
-from tests.drivers.ink.conftest import PORT, Line, Plug, Scripted, loop
+from tests.drivers.ink.conftest import PORT, Line, Plug, loop
 from tests.simulated_time import LoopClock
 from tests.waiting import until
 
@@ -35,7 +35,7 @@ async def connected(device: AnyDevice) -> AnyDevice:
 
 # ---------------------------------------------------------------- the station
 
-HELLO = (b"000 identify*6A60\n", b"000 ok ink-station 1 1.0.0 real*8310\n")
+HELLO = b"000 identify*6A60\n"
 DOSE = b"001 dose 0.500*7A5F\n"
 LEVEL = b"001 level*243E\n"
 
@@ -66,32 +66,32 @@ async def test_a_session_sets_the_light_doses_and_tells_the_level_until_the_rese
 
 
 @pytest.mark.parametrize(
-    ("exchanges", "error", "says"),
+    ("asked", "reply", "error", "says"),
     [
-        ([(LEVEL, b"001 ok 1.5*CD6C\n")], ProtocolViolation, "above 1"),
-        ([(LEVEL, b"001 err 6 jammed*4073\n")], InkRefused, "Look at the pump"),
-        ([(DOSE, b"001 ok 0.400*8194\n")], DeviceError, r"gave 0.400 ml instead of 0.500 ml"),
+        (LEVEL, b"001 ok 1.5*CD6C\n", ProtocolViolation, "above 1"),
+        (LEVEL, b"001 err 6 jammed*4073\n", InkRefused, "Look at the pump"),
+        (DOSE, b"001 ok 0.400*8194\n", DeviceError, r"gave 0.400 ml instead of 0.500 ml"),
     ],
 )
 async def test_a_reply_that_makes_no_sense_or_refuses_is_an_error(
-    scripted: Scripted, exchanges: list[tuple[bytes, bytes]], error: type[DeviceError], says: str
+    line: Line, asked: bytes, reply: bytes, error: type[DeviceError], says: str
 ):
-    scripted(HELLO, *exchanges)
     station = await connected(a_station())
+    line.faults = [reply]
     with pytest.raises(error, match=says):
-        await (station.level() if exchanges[0][0] == LEVEL else station.dose(0.5))
+        await (station.level() if asked == LEVEL else station.dose(0.5))
+    assert line.requests == [HELLO, asked]
 
 
-async def test_a_board_that_starts_slowly_is_waited_for_and_another_device_is_refused(scripted: Scripted):
-    hello, answer = HELLO
-    scripted(*[(hello, b"")] * (CONNECT_ATTEMPTS - 1), (hello, answer))
+async def test_a_board_that_starts_slowly_is_waited_for_and_another_device_is_refused(line: Line):
+    line.faults = [*["mute"] * (CONNECT_ATTEMPTS - 1), b"000 ok ink-station 1 1.0.0 real*8310\n"]
     identity = await a_station().connect()
     assert (identity.model, identity.firmware, identity.simulated) == ("ink-station", "1.0.0", False)
+    assert line.requests == [HELLO] * CONNECT_ATTEMPTS
     for other in (b"000 ok ink-station 2 9.0 real*24F2\n", b"000 ok gcode 1.1 real x*EE49\n"):
         station = a_station()
-        refusal = pytest.raises(ProtocolViolation, match=r"expected ink-station with protocol 1.*Check that the path")
-        scripted((hello, other))
-        with refusal:
+        line.faults = [other]
+        with pytest.raises(ProtocolViolation, match=r"expected ink-station with protocol 1.*Check that the path"):
             await station.connect()
         await station.close()
         with pytest.raises(NotConnected):
@@ -137,8 +137,6 @@ STOP = bytes.fromhex("01 06 00 04 00 00 C8 0B")
 SPEED = bytes.fromhex("01 06 00 01 13 88 D5 5C")
 START = bytes.fromhex("01 06 00 04 00 01 09 CB")
 REFUSED = bytes.fromhex("01 86 02 C3 A1")
-CONNECTED = [(PROBE, b""), (STOP, STOP)]
-BYE = [(STOP, STOP)]
 
 
 def a_pump(**fields: float) -> ModbusPump:
@@ -164,8 +162,7 @@ async def pump(pump_line: Line, rotor: PumpFirmware) -> AsyncIterator[ModbusPump
     assert not rotor.running
 
 
-async def test_a_dose_sets_the_speed_starts_and_stops(scripted: Scripted):
-    scripted(*CONNECTED, (SPEED, SPEED), (START, START), (STOP, STOP), *BYE)
+async def test_a_dose_sets_the_speed_starts_and_stops(pump_line: Line):
     pump = a_pump()
     identity = await pump.connect()
     assert (identity.model, identity.simulated) == ("Modbus RTU pump, unit 1", False)
@@ -177,6 +174,7 @@ async def test_a_dose_sets_the_speed_starts_and_stops(scripted: Scripted):
         with pytest.raises(LimitExceeded, match="ml is outside"):
             await pump.dose(volume_ml)
     await pump.close()
+    assert pump_line.requests == [PROBE, STOP, SPEED, START, STOP, STOP]
 
 
 async def test_it_doses_before_every_nth_dip(pump_line: Line):
@@ -185,8 +183,8 @@ async def test_it_doses_before_every_nth_dip(pump_line: Line):
     assert pump._table.doses_ml(7) == pytest.approx(0.04)
 
 
-async def test_a_line_that_echoes_is_refused(scripted: Scripted):
-    scripted((PROBE, PROBE))
+async def test_a_line_that_echoes_is_refused(pump_line: Line):
+    pump_line.faults = [PROBE]
     pump = a_pump()
     with pytest.raises(ProtocolViolation, match=r"echoes.*Switch off local echo"):
         await pump.connect()
@@ -195,12 +193,11 @@ async def test_a_line_that_echoes_is_refused(scripted: Scripted):
         await pump.dose(0.1)
 
 
-async def test_a_dose_that_the_pump_refuses_was_not_started(scripted: Scripted):
-    scripted(*CONNECTED, (SPEED, REFUSED), *BYE)
-    pump = await connected(a_pump())
+async def test_a_dose_that_the_pump_refuses_was_not_started(pump_line: Line, pump: ModbusPump):
+    pump_line.faults = [REFUSED]
     with pytest.raises(InkRefused, match=r"2 \(illegal register\). The pump was not started"):
         await pump.dose(0.01)
-    await pump.close()
+    assert pump_line.requests == [PROBE, STOP, SPEED]
 
 
 async def dosing(pump: ModbusPump, rotor: PumpFirmware) -> asyncio.Task[None]:
@@ -270,8 +267,8 @@ async def test_a_reply_from_before_a_request_does_not_confirm_it(pump_line: Line
 async def test_closing_in_mid_dose_leaves_the_pump_stopped(
     rotor: PumpFirmware, pump_line: Line, pump: ModbusPump, requests: int
 ):
-    dose, before = asyncio.create_task(pump.dose(0.02)), pump_line.requests
-    while pump_line.requests < before + requests:
+    dose, before = asyncio.create_task(pump.dose(0.02)), len(pump_line.requests)
+    while len(pump_line.requests) < before + requests:
         await asyncio.sleep(0)
     await pump.close()
     with pytest.raises(NotConnected):
