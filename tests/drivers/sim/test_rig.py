@@ -1,4 +1,4 @@
-"""The loopback rig as a whole: its servers, that none is reached from another machine, its live control, its camera.
+"""The loopback rig as a whole: its servers, that none is reached from another machine, its control, faults and camera.
 
 A lab that is drawn from a seed is such a rig too.
 """
@@ -17,6 +17,7 @@ import tomllib
 from collections.abc import AsyncIterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import can
@@ -33,7 +34,7 @@ from brushloop.drivers.loopback import LoopbackServer, RigRefused
 from brushloop.drivers.loopback import ask as ask_rig
 from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.config import SimConfig, View
-from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
+from brushloop.drivers.sim.faults import ALWAYS, Device, Fault, FaultBoard, Phase, fault_of
 from brushloop.drivers.sim.lab import UnknownLab
 from brushloop.drivers.sim.lab_facts import draw, in_picture
 from brushloop.drivers.sim.rig import HOST, ControlServer, LoopbackRig, serve
@@ -225,6 +226,72 @@ async def test_no_late_picture_overtakes_another_and_the_server_notices_that_its
         assert rig.camera.clients == 1
         stream.close()
         await until(lambda: rig.camera.clients == 0, "the server to notice")
+
+
+# ---------------------------------------------------------------- when a fault begins, and what it strikes
+
+ARM = "rob1.MotionControl."
+
+
+@pytest.mark.parametrize(
+    ("fault", "moments"),
+    [
+        ({}, [({}, "a b", [True, False])]),
+        ({"on": "moveLine"}, [({}, f"{ARM}getExecId {ARM}moveLines {ARM}moveLine", [False, False, True])]),
+        ({"on": f"{ARM}moveLine"}, [({}, f"moveLine {ARM}moveLine", [False, True])]),
+        (
+            {"on": "x", "nth": 2, "phase": "descending", "count": 2},
+            [
+                ({}, "x x", [False, False]),
+                ({"doing": Phase.DESCENDING}, "x y x", [False, False, True]),
+                ({"doing": Phase.PARKED}, "y x x", [False, True, False]),  # once begun it goes on
+            ],
+        ),
+        ({"press": 3}, [({"presses": [None] * 4}, "x", [False]), ({"presses": [None] * 3}, "x", [True])]),
+        (
+            {"for_s": 2.0},  # from its beginning
+            [({"at_s": 100.0}, "x x", [True, True]), ({"at_s": 101.9}, "x", [True]), ({"at_s": 102.0}, "x", [False])],
+        ),
+        ({"for_s": 2.0, "count": 1}, [({}, "x x", [True, False])]),
+        (
+            {"device": "ink", "kind": "garbage", "phase": "lifting", "count": 2},  # begins without a request
+            [
+                ({}, "x", [False]),
+                ({"doing": Phase.LIFTING}, "", []),
+                ({"doing": Phase.PARKED}, "x x x", [True, True, False]),
+            ],
+        ),
+    ],
+)
+def test_a_fault_strikes_the_requests_that_its_conditions_name(
+    monkeypatch: pytest.MonkeyPatch, fault: dict[str, Any], moments: list[tuple[dict[str, Any], str, list[bool]]]
+) -> None:
+    # As much of a world as the board looks at: its presses, its clock, and what the arm is doing.
+    world: Any = SimpleNamespace(at_s=0.0, doing=Phase.PARKED, presses=[])
+    world.clock = SimpleNamespace(real_s=lambda: world.at_s)
+    monkeypatch.setattr(FaultBoard, "phase", lambda _: world.doing)
+    board, hung = FaultBoard(world), fault_of({"device": "robot", "kind": "mute"} | fault)
+    board.hang(hung)
+    for changes, ops, expected in moments:
+        vars(world).update(changes)
+        board.begin_due(lambda _mode: None)
+        assert [board.meet(hung.device, op) is not None for op in ops.split()] == expected
+    assert board.strikes == sum(sum(expected) for _, _, expected in moments)
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"kind": "loud"}, "kind = 'loud' is not one of robot's: deaf, drop,"),
+        ({"device": "telemetry", "on": "moveLine"}, "only the robot has methods"),
+        ({"kind": "emergency-stop", "nth": 2}, "counts nothing here"),
+        ({"a\nb\x1b[31m": 1}, "Extra inputs are not permitted"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_with_one_printable_line(fields: dict[str, object], words: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(words)) as caught:
+        fault_of({"device": "robot", "kind": "mute"} | fields)
+    assert str(caught.value).isprintable()
 
 
 # ---------------------------------------------------------------- a lab drawn from a seed, and its person
