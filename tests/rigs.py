@@ -59,6 +59,9 @@ COARSE = SimConfig(rate=60.0, view=SMALL_VIEW, force_hz=100.0)
 BARE = SimConfig(rate=300.0, view=SMALL_VIEW, ink_device="none", force_sensor=False)
 """The same, without ink device and force sensor, and fast."""
 SHARP = SimConfig(rate=60.0, view=SHARP_VIEW, table=SMALL_TABLE)
+WIPE = "\n[ink.wipe]\nrim_mm = [322.0, 20.0]\nz_mm = 130.0\n"
+WASH = "\n[ink.wash]\npot_mm = [305.0, 80.0]\ndip_z_mm = 125.0\nevery_dips = 2\nstrokes = 2\n"
+"""Tables of a `rig.toml`, at places beside the sheet that the arm reaches."""
 TOUCH_DEPTH_MM = 1.0
 """Zero touch goes no deeper; it visits its own place in every process."""
 

@@ -97,12 +97,6 @@ def test_motion_is_never_blindly_repeated_and_an_arm_at_fault_not_lifted_before_
 # What an operator asks of a run
 
 
-@pytest.fixture
-def lab(lab: Lab) -> Lab:
-    lab.write_protocol("[11.0]", "[0.0]")
-    return lab
-
-
 def test_a_request_made_twice_is_withdrawn_and_retake_and_skip_exclude_each_other() -> None:
     control = RunControl()
     control.toggle(OperatorRequest.RETAKE)
@@ -116,6 +110,7 @@ def test_a_request_made_twice_is_withdrawn_and_retake_and_skip_exclude_each_othe
 
 
 def test_the_operator_asks_for_a_new_sheet_and_for_another_take_of_the_first_stroke_on_it(lab: Lab) -> None:
+    lab.write_protocol("[11.0]")
     engine = lab.engine(on_screen=True)
     engine.request(OperatorRequest.RETAKE)
     engine.request(OperatorRequest.NEW_SHEET)
@@ -198,7 +193,6 @@ def test_a_jog_between_strokes_that_fails_leaves_the_paper_where_it_was(
         return await perform(self, step)
 
     monkeypatch.setattr(Run, "perform", performed)
-    lab.write_protocol("[11.0, 15.0]", "[0.0]")
     engine = lab.engine(on_screen=True)
     engine.request(OperatorRequest.JOG)
     engine.start()
@@ -212,7 +206,6 @@ def test_a_jog_between_strokes_that_fails_leaves_the_paper_where_it_was(
 def test_a_guided_set_up_measures_again_when_it_is_asked_to_and_later_views_of_the_board_are_not_asked_about(
     lab: Lab,
 ) -> None:
-    lab.write_protocol("[11.0, 15.0]")
     with (lab.folder / "protocol.toml").open("a") as protocol:
         protocol.write("board_every = 1\n")
     engine = lab.started(on_screen=True, guided=True)

@@ -26,12 +26,6 @@ UNDER = brush_pose(480.0, 40.0, PAPER_Z_MM - 20.0, tilt_deg=10.0)
 """20 mm under the paper, leaning."""
 
 
-@pytest.fixture
-def lab(lab: Lab) -> Lab:
-    lab.write_protocol("[11.0]", "[0.0]", repeats=2)
-    return lab
-
-
 def pause_after(engine: Engine, strokes: int = 1) -> None:
     until(engine, lambda now: now.strokes_done == strokes)
     engine.pause()

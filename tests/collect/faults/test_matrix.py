@@ -262,17 +262,6 @@ def assert_the_session_is_whole(lab: Lab, name: str, phase: str) -> None:
     store.release()
 
 
-def test_once_the_cause_is_mended_the_same_command_goes_on(lab: Lab) -> None:
-    engine = lab.engine()
-    start_with_fault(lab, engine, "drop", "travel")
-    assert end_of(engine) is not None
-    lab.rig.faults.clear()
-    lab.rig.clock.shift(FAST)
-
-    lab.run()
-    assert len(lab.state.used_patches) == 2, "the press that was cut lies on one, its repetition on another"
-
-
 DOWN = "The brush may be down"
 DEEP_RATE = 2.0
 ENDS: dict[str, Callable[[Lab, SteppedEngine], object]] = {

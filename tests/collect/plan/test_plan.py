@@ -45,7 +45,7 @@ from brushloop.sessions.events import PressResult, StepResult
 from brushloop.sessions.records import Condition
 from tests.collect.sent import not_checked, not_sent, noting
 from tests.command import refused, said
-from tests.rigs import Lab
+from tests.rigs import WASH, WIPE, Lab
 from tests.runs import answered_alike
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
@@ -311,31 +311,24 @@ class MadeUpRobot:
         return [replace(pose, z_mm=pose.z_mm + self.off_mm) for pose in targets]
 
 
-async def pressed(config: RigConfig, robot: MadeUpRobot, depth_mm: float = 13.0, dwell_s: float = 0.2) -> float:
+async def pressed(config: RigConfig, robot: MadeUpRobot, depth_mm: float = 13.0, dwell_s: float = 0.0) -> float:
     nothing = cast(Any, None)
     procedures = Procedures(Rig(config, nothing, cast(Any, robot), nothing))
     return await procedures.press(Sheet(config.paper).patch(7), Condition(depth_mm, 10.0), dwell_s)
 
 
-async def test_the_way_into_the_paper_and_out_again_is_handed_over_as_one(config: RigConfig):
-    robot = MadeUpRobot()
-    assert await pressed(config, robot) == pytest.approx(13.0)
-    touch_mm = config.paper.touch_z_mm
-    assert all(pose.z_mm > touch_mm + 7.0 for pose in robot.moved)
-    assert robot.queued[-1].target.z_mm > touch_mm + 50.0
-    assert min(line.target.z_mm for line in robot.queued) == pytest.approx(touch_mm - 13.0, abs=0.01)
-    assert [line.least_s for line in robot.queued if line.least_s] == [0.2]
-
-
 @pytest.mark.parametrize(("depth_mm", "dwell_s", "lasts_s"), [(13.0, 0.0, 0.1), (0.04, 2.0, 2.0)])
-async def test_every_press_stays_long_enough_to_be_seen(
+async def test_the_way_into_the_paper_and_out_again_is_handed_over_as_one_and_is_long_enough_to_be_seen(
     config: RigConfig, depth_mm: float, dwell_s: float, lasts_s: float
 ):
-    robot = MadeUpRobot()
+    robot, touch_mm = MadeUpRobot(), config.paper.touch_z_mm
     assert await pressed(config, robot, depth_mm, dwell_s) == pytest.approx(depth_mm)
-    near, deep = (line for line in robot.queued if line.target.z_mm < config.paper.touch_z_mm - 1e-6)
-    assert deep.least_s == lasts_s
+    assert all(pose.z_mm > touch_mm + 7.0 for pose in robot.moved)
+    assert robot.queued[-1].target.z_mm > touch_mm + 50.0
+    near, deep = (line for line in robot.queued if line.target.z_mm < touch_mm - 1e-6)
+    assert deep.target.z_mm == pytest.approx(touch_mm - depth_mm, abs=0.01)
     assert 0.0 < near.target.z_mm - deep.target.z_mm <= 0.051
+    assert [line.least_s for line in robot.queued if line.least_s] == [lasts_s]
 
 
 @pytest.mark.parametrize(
@@ -364,17 +357,6 @@ def test_a_stroke_may_come_down_on_its_way(config: RigConfig) -> None:
 
 # Every target that reaches the arm's queue is one that the plan has checked, for every kind of step
 
-EXTRAS = """
-[ink.wipe]
-rim_mm = [322.0, 20.0]
-z_mm = 130.0
-
-[ink.wash]
-pot_mm = [305.0, 80.0]
-dip_z_mm = 125.0
-every_dips = 2
-strokes = 1
-"""
 FIGURE = "[[figures]]\nname = 'a'\n" + "".join(
     f"[[figures.strokes]]\npoints = [[12.0, {y}, {deep_mm}, 4.0, 30.0], [24.0, {y}, 1.0, 0.0, 60.0]]\n"
     for y, deep_mm in ((12.0, 8.0), (24.0, 1.0))
@@ -422,7 +404,7 @@ def rounded(poses: Iterable[tuple[Pose, ...]]) -> set[tuple[float, ...]]:
 @pytest.mark.parametrize("text", KINDS.values(), ids=KINDS)
 def test_what_a_run_sends_the_plan_has_checked(lab: Lab, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
     rig_path, path, made = lab.folder / "rig.toml", lab.folder / "protocol.toml", noted_steps(lab, monkeypatch)
-    lab.edit_rig("", EXTRAS)
+    lab.edit_rig("", WIPE + WASH)
     wanted, config = protocol(lab.folder, text), load_rig(rig_path)
     check_protocol(rig_path, path, config, wanted)
     answered_alike(lab.engine(on_screen=True), "t")  # whoever jogs says at once that the tip touches

@@ -23,7 +23,7 @@ from brushloop.drivers.sim.faults import Device, Fault
 from brushloop.drivers.sim.rig import rig_toml
 from tests.command import brushloop, refused, said
 from tests.drivers.arcs.test_rpc import Replayed
-from tests.rigs import Lab
+from tests.rigs import WASH, WIPE, Lab
 
 RIG = rig_toml(SimConfig())
 
@@ -49,6 +49,9 @@ def rig_file(tmp_path: Path, old: str = "", new: str = "") -> Path:
         ("stale_ms = 100.0", "stale_ms = 3000.0", r"force: stale_ms = 3000: must be from 20 to 2000;"),
         ("[motion]", '[touch]\nmethod = "camera"\npoints_mm = [[4.0, 4.0]]\n[motion]', r"touch: .*by camera three are"),
         ("[motion]", "[quality]\ndark_level = 200.0\nbright_level = 150.0\n[motion]", r"quality: .*dark_level"),
+        ("[motion]", WIPE.replace("322.0", "120.0") + "[motion]", r"ink.wipe.rim_mm = .* lies on the sheet"),
+        ("[motion]", WIPE.replace("130.0", "250.0") + "[motion]", r"ink.wipe.z_mm = 250 is outside"),
+        ("[motion]", WASH.replace("305.0", "100.0") + "[motion]", r"ink.wash.pot_mm = .* lies on the sheet"),
     ],
 )
 def test_a_bad_rig_is_refused_in_one_line(tmp_path: Path, old: str, new: str, message: str) -> None:
@@ -143,10 +146,7 @@ def test_what_is_shown_is_where_the_tip_goes_in_a_picture_with_the_box_and_every
     table = brushloop("rig", "show", rig).stdout
     assert all(name in table for name in places)
     assert re.search(r"park .* 250\.0 .* -120\.0 .* 210\.0", table)
-    wipe_and_wash = (
-        "[ink.wipe]\nrim_mm = [322.0, 20.0]\nz_mm = 131.0\n[ink.wash]\npot_mm = [300.0, 100.0]\ndip_z_mm = 125.0\n"
-    )
-    rig_file(rig.parent, "[ink.device]", wipe_and_wash + "[ink.device]")
+    rig_file(rig.parent, "[ink.device]", WIPE + WASH + "[ink.device]")
     picture = tmp_path / "rig.svg"
     said("rig", "show", rig, "--picture", picture)
     drawn = picture.read_text()
