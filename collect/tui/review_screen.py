@@ -51,7 +51,7 @@ from brushloop.model.similarity import csim
 from brushloop.sessions.disk import check_folder
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError
 from brushloop.sessions.events import CaptureResult, Press, Remark
-from brushloop.sessions.journal import JOURNAL_NAME, read_header, replay
+from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.messages import decode_gray, decode_still
 from brushloop.sessions.recording import add_remark, merged_file, remarks_of
@@ -101,7 +101,7 @@ class Review:
     def read(self) -> None:
         """Read the journal and the remarks again."""
         state, remarks = replay(self.folder / JOURNAL_NAME), remarks_of(self.folder)
-        self.open, self.header = state.is_open, read_header(self.folder, state)
+        self.open = state.is_open
         odd, captures = odd_waits(waits_of(state)), list[ReviewCapture]()
         for step in state.files.values():
             if isinstance(result := step.result, CaptureResult):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from typing import Any
-from unittest.mock import AsyncMock
 
 import pytest
 from textual._compositor import Compositor
@@ -24,11 +23,3 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
         return None
 
     monkeypatch.setattr(Compositor, "render_update", rendered)
-
-
-@pytest.fixture(autouse=True)
-def model_so_far(monkeypatch: pytest.MonkeyPatch) -> AsyncMock:
-    """What the fit beside a run says, nothing at first: no process is started."""
-    fit = AsyncMock(return_value=None)
-    monkeypatch.setattr("brushloop.collect.tui.so_far.model_so_far", fit)
-    return fit
