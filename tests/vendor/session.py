@@ -1,6 +1,7 @@
 """A whole session of the maker's own client; runs alone, since that client holds the GIL while it waits.
 
-Usage: session.py PORT RTDE_PORT. The last line of the output is one JSON object: what every step returned.
+Usage: python -m tests.vendor.session PORT RTDE_PORT.
+The last line of the output is one JSON object: what every step returned.
 """
 
 from __future__ import annotations
@@ -14,16 +15,9 @@ from typing import Any
 
 import pyaubo_sdk as sdk  # pyright: ignore[reportMissingImports]
 
+from tests.waiting import wait_until
+
 SEEN: dict[str, Any] = {}
-
-
-def until(true: Callable[[], bool], timeout_s: float = 5.0) -> bool:
-    deadline = time.monotonic() + timeout_s
-    while not true():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.005)
-    return True
 
 
 def failure(call: Callable[[], object]) -> str:
@@ -68,9 +62,9 @@ def power(robot: Any) -> None:
     SEEN["mode before"] = str(state.getRobotModeType())
     SEEN["refused"] = robot.getMotionControl().moveLine(state.getTcpPose(), 1.0, 0.1, 0.0, 0.0)
     manage.poweron()
-    SEEN["idle"] = until(lambda: state.getRobotModeType() == sdk.RobotModeType.Idle)
+    wait_until(lambda: state.getRobotModeType() == sdk.RobotModeType.Idle, "power")
     manage.startup()
-    SEEN["running"] = until(lambda: state.getRobotModeType() == sdk.RobotModeType.Running)
+    wait_until(lambda: state.getRobotModeType() == sdk.RobotModeType.Running, "the brakes to open")
     SEEN["safety"] = str(state.getSafetyModeType())
     SEEN["power on"] = state.isPowerOn()
     SEEN["joint state"] = [str(s) for s in state.getJointState()]
@@ -82,17 +76,20 @@ def move(rpc: Any, robot: Any) -> None:
     start = state.getTcpPose()
     SEEN["move"] = [motion.moveLine(shifted(start, 0.05), 1.0, 0.1, 0.0, 0.0), motion.getExecId() >= 0]
     SEEN["queue"] = motion.getQueueSize()
-    SEEN["arrived"] = until(lambda: at_rest(robot))
+    wait_until(lambda: at_rest(robot), "the move to end")
     SEEN["moved by"] = state.getTcpPose()[0] - start[0]
     SEEN["same"] = motion.moveLine(state.getTcpPose(), 1.0, 0.1, 0.0, 0.0)
     for way, stop in (("stopLine", lambda: motion.stopLine(2.0, 2.0)), ("abort", machine.abort)):
         before = state.getTcpPose()
         motion.moveLine(shifted(before, -0.04), 1.0, 0.01, 0.0, 0.0)
         time.sleep(0.05)
-        SEEN[way] = [stop(), until(lambda: at_rest(robot), 1.0), before[0] - state.getTcpPose()[0]]
+        stopped = stop()
+        wait_until(lambda: at_rest(robot), f"rest after {way}", timeout_s=1.0)
+        SEEN[way] = [stopped, before[0] - state.getTcpPose()[0]]
     motion.moveLine(start, 1.0, 0.05, 0.0, 0.0)
     SEEN["pause"] = [machine.pause(), str(machine.getRuntimeState()), motion.getExecId() >= 0]
-    SEEN["resume"] = [machine.resume(), str(machine.getRuntimeState()), until(lambda: at_rest(robot))]
+    SEEN["resume"] = [machine.resume(), str(machine.getRuntimeState())]
+    wait_until(lambda: at_rest(robot), "the path to end")
     SEEN["fraction"] = [motion.setSpeedFraction(0.5), motion.getSpeedFraction(), motion.setSpeedFraction(1.0)]
 
 
@@ -106,7 +103,7 @@ def joints(robot: Any) -> None:
     SEEN["ik far"] = algorithm.inverseKinematics(q, [2.0, 0.0, 0.2, 3.14, 0.0, 0.0])[1]
     target = [v + 0.05 for v in q]
     SEEN["joint move"] = motion.moveJoint(target, 2.0, 1.0, 0.0, 0.0)
-    until(lambda: at_rest(robot))
+    wait_until(lambda: at_rest(robot), "the joints to arrive")
     SEEN["joints off"] = max(abs(a - b) for a, b in zip(target, state.getJointPositions(), strict=True))
 
 
@@ -146,7 +143,7 @@ def subscribe(port: int) -> None:
         if channel >= 0:
             break
     SEEN["rtde topic"] = [channel, rtde.subscribe(channel, take)]
-    until(lambda: len(pushed) >= 10)
+    wait_until(lambda: len(pushed) >= 10, "ten samples")
     q, pose, running, normal = pushed[9]
     SEEN["rtde pushed"] = [len(q), len(pose), running, normal]
     SEEN["rtde removed"] = rtde.removeTopic(False, channel)
