@@ -9,7 +9,6 @@ python -m pytest tests/contract --rig rig.toml     a real arm; asks before it mo
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import dataclasses
 import sys
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -25,10 +24,9 @@ from brushloop.drivers.devices import Identity, Pose
 from brushloop.drivers.errors import DeviceError, LimitExceeded
 from brushloop.drivers.geometry import distance
 from brushloop.drivers.host import Clock
-from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.rig import HOST, rig_toml
-from brushloop.drivers.sim.world import SimClock, World
+from brushloop.drivers.sim.rig import LoopbackRig
+from brushloop.drivers.sim.world import SimClock
 from tests.simulated_time import MemoryLoop
 
 RATE = 5.0
@@ -164,17 +162,13 @@ async def rig(request: pytest.FixtureRequest) -> AsyncIterator[RigConfig]:
         yield request.config.stash[RIG]
         return
     framing, _, rtde = request.param.partition(", ")
-    config = SimConfig(rate=RATE, force_sensor=False, ink_device="none")
-    server = ArcsServer(World(config, SimClock(RATE, asyncio.get_running_loop().time)))
-    pushing = RtdeServer(server)
-    async with contextlib.AsyncExitStack() as serving:
-        for started in (server, pushing):
-            await started.start(HOST, 0)
-            serving.push_async_callback(started.stop)
+    rig = LoopbackRig(SimConfig(rate=RATE, force_sensor=False, ink_device="none"))
+    rig.world.clock = SimClock(RATE, asyncio.get_running_loop().time)
+    async with rig:
         path = request.getfixturevalue("tmp_path") / "rig.toml"
-        path.write_text(rig_toml(config, ports={"arcs": server.port, "rtde": pushing.port}), encoding="utf-8")
+        path.write_text(rig.toml(), encoding="utf-8")
         loopback = load_rig(path)
-        how = {"framing": framing, "rtde_port": pushing.port if rtde else None}
+        how = {"framing": framing, "rtde_port": rig.rtde.port if rtde else None}
         yield loopback.model_copy(update={"robot": loopback.robot.model_copy(update=how)})
 
 
