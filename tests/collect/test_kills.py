@@ -58,25 +58,20 @@ class Toll:
     sessions: int = 0
 
 
-@pytest.fixture
-def lab(wired_lab: Lab) -> Lab:
-    return wired_lab
-
-
-def test_a_session_that_is_killed_three_times_ends_whole(lab: Lab) -> None:
+def test_a_session_that_is_killed_three_times_ends_whole(wired_lab: Lab) -> None:
     toll = Toll(random.Random(1))
     while toll.kills < 3:
-        session(lab, toll, kills=3 - toll.kills)
+        session(wired_lab, toll, kills=3 - toll.kills)
 
 
 @pytest.mark.soak
 @pytest.mark.timeout(3600)
-def test_two_hundred_kills_over_forty_sessions_lose_nothing(lab: Lab) -> None:
+def test_two_hundred_kills_over_forty_sessions_lose_nothing(wired_lab: Lab) -> None:
     toll = Toll(random.Random(2))
-    press_slowly(lab)
-    lab.write_protocol(heights="[11.0, 13.0, 15.0]")
+    press_slowly(wired_lab)
+    wired_lab.write_protocol(heights="[11.0, 13.0, 15.0]")
     while toll.kills < 200 or toll.sessions < 40:
-        session(lab, toll, kills=max(1, -(-(200 - toll.kills) // max(1, 40 - toll.sessions))))
+        session(wired_lab, toll, kills=max(1, -(-(200 - toll.kills) // max(1, 40 - toll.sessions))))
         sys.stdout.write(f"{toll.kills} kills, {toll.in_paper} in the paper, {toll.sessions} sessions, nothing lost\n")
     assert toll.in_paper >= 10
 
@@ -250,10 +245,12 @@ def check_the_brush_lifts(lab: Lab) -> bool:
 
 
 @pytest.mark.parametrize("phase", [pytest.param(Phase.DESCENDING, marks=pytest.mark.soak), Phase.PRESSED])
-def test_killed_with_the_brush_in_the_paper_it_lifts_by_itself(lab: Lab, phase: Phase) -> None:
-    press_slowly(lab)
-    lab.write_protocol("[15.0]", dwell_s=60.0)
-    process = lab.process()
-    wait_until(lambda: above_mm(lab) < -TOUCH_DEPTH_MM and seen(lab)["phase"] == phase, phase, process=process)
+def test_killed_with_the_brush_in_the_paper_it_lifts_by_itself(wired_lab: Lab, phase: Phase) -> None:
+    press_slowly(wired_lab)
+    wired_lab.write_protocol("[15.0]", dwell_s=60.0)
+    process = wired_lab.process()
+    wait_until(
+        lambda: above_mm(wired_lab) < -TOUCH_DEPTH_MM and seen(wired_lab)["phase"] == phase, phase, process=process
+    )
     process.kill()
-    assert check_the_brush_lifts(lab), "it was no longer in the paper"
+    assert check_the_brush_lifts(wired_lab), "it was no longer in the paper"

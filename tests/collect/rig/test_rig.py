@@ -170,20 +170,15 @@ def test_what_was_taught_says_what_was_never_measured(rig: Path) -> None:
 # The doctor
 
 
-@pytest.fixture
-def lab(wired_lab: Lab) -> Lab:
-    return wired_lab
-
-
 async def test_whatever_is_wrong_is_reported_with_a_remedy_and_every_other_device_is_still_asked(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
+    wired_lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("brushloop.drivers.force.sri_m8123.CONNECT_S", 2.0)
-    lab.rig.faults.hang(Fault(device=Device.INK, kind="deaf", count=100))
-    lab.rig.faults.hang(Fault(device=Device.FORCE, kind="no-second", count=10_000))
-    lab.edit_rig("DICT_5X5_1000", "DICT_4X4_1000")
-    lab.rig.arcs.cabinet.safety_stop()
-    findings = await examine(load_rig(lab.folder / "rig.toml"), Clock())
+    wired_lab.rig.faults.hang(Fault(device=Device.INK, kind="deaf", count=100))
+    wired_lab.rig.faults.hang(Fault(device=Device.FORCE, kind="no-second", count=10_000))
+    wired_lab.edit_rig("DICT_5X5_1000", "DICT_4X4_1000")
+    wired_lab.rig.arcs.cabinet.safety_stop()
+    findings = await examine(load_rig(wired_lab.folder / "rig.toml"), Clock())
     assert not any(finding.well for finding in findings)
     problems = ("board corners found", "no whole round", "no reply", "ProtectiveStop")
     remedies = ("into view", "wiring", "", "pendant")
@@ -192,19 +187,19 @@ async def test_whatever_is_wrong_is_reported_with_a_remedy_and_every_other_devic
         assert problem in finding.problem
         assert finding.remedy
         assert remedy in finding.remedy
-    assert lab.rig.arcs.cabinet.power.safety == SafetyMode.PROTECTIVE_STOP, "not cleared"
+    assert wired_lab.rig.arcs.cabinet.power.safety == SafetyMode.PROTECTIVE_STOP, "not cleared"
 
-    lab.rig.faults.clear()
-    lab.edit_rig(f"port = {lab.rig.arcs.port}\n", "port = 9\n")
-    ran = await asyncio.to_thread(brushloop, "doctor", "--config", lab.folder / "rig.toml")
+    wired_lab.rig.faults.clear()
+    wired_lab.edit_rig(f"port = {wired_lab.rig.arcs.port}\n", "port = 9\n")
+    ran = await asyncio.to_thread(brushloop, "doctor", "--config", wired_lab.folder / "rig.toml")
     assert (ran.returncode, ran.stderr) == (4, "")
     for words in ("no answer", "127.0.0.1:9", "ink-station"):
         assert words in ran.stdout
 
 
-def test_a_rig_in_order_is_reported_with_all_that_was_answered_and_left_as_it_was(lab: Lab) -> None:
-    report = lab.folder / "report.zip"
-    command = ("doctor", "--config", lab.folder / "rig.toml", "--report", report)
+def test_a_rig_in_order_is_reported_with_all_that_was_answered_and_left_as_it_was(wired_lab: Lab) -> None:
+    report = wired_lab.folder / "report.zip"
+    command = ("doctor", "--config", wired_lab.folder / "rig.toml", "--report", report)
     assert "Read it before you send it" in said(*command)
     with zipfile.ZipFile(report) as archive:
         document = json.loads(archive.read("report.json"))
@@ -236,8 +231,8 @@ def test_a_rig_in_order_is_reported_with_all_that_was_answered_and_left_as_it_wa
     assert answered["rob1.RobotState.getSafetyModeType"] == {"result": "Normal"}
     assert answered["rob1.MotionControl.getSpeedFraction"]["result"] == 1.0
     assert all(line["took_ms"] > 0.0 for line in lines)
-    assert lab.rig.arcs.cabinet.power.mode == "PowerOff"
-    assert lab.rig.world.motion._next_id == 0
+    assert wired_lab.rig.arcs.cabinet.power.mode == "PowerOff"
+    assert wired_lab.rig.world.motion._next_id == 0
     before = report.read_bytes()
     assert "is not overwritten" in refused(*command)
     assert report.read_bytes() == before
@@ -260,9 +255,9 @@ def test_names_addresses_and_paths_stay_in_the_lab(rig: Path, monkeypatch: pytes
     assert scrubbed.endswith("on <host>; 200 rounds/s, 0.1600 mm/px")
 
 
-def test_on_the_first_day_there_is_no_rig_yet_and_the_archive_holds_what_is_known(lab: Lab) -> None:
-    robot = load_rig(lab.folder / "rig.toml").robot
-    rig, report = lab.folder / "new.toml", lab.folder / "report.zip"
+def test_on_the_first_day_there_is_no_rig_yet_and_the_archive_holds_what_is_known(wired_lab: Lab) -> None:
+    robot = load_rig(wired_lab.folder / "rig.toml").robot
+    rig, report = wired_lab.folder / "new.toml", wired_lab.folder / "report.zip"
     address = Taught(f"{robot.host}:{robot.port}", "typed")
     stream = Taught("http://cam.example/stream", "typed")
     squares = Taught([26.0, 20.0], "typed")
