@@ -22,7 +22,7 @@ from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.faults import Device, Fault
 from brushloop.drivers.sim.rig import rig_toml
 from tests.command import brushloop, refused, said
-from tests.drivers.arcs.test_rpc import Replayed
+from tests.drivers.arcs.test_connections import Replayed
 from tests.rigs import WASH, WIPE, Lab
 
 RIG = rig_toml(SimConfig())
