@@ -16,7 +16,7 @@ from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.geometry import to_wire
 from brushloop.drivers.loopback import LoopbackServer
 from brushloop.drivers.sim.cabinet import Cabinet, methods
-from brushloop.drivers.sim.faults import KINDS, LOST, STOPS, Device, Fault, FaultBoard
+from brushloop.drivers.sim.faults import STOPS, Device, Fault, FaultBoard
 from brushloop.drivers.sim.world import World
 
 PIECE_S = 0.001
@@ -88,10 +88,10 @@ class ArcsServer(LoopbackServer):
             for payload in decoder.feed(data):
                 request = request_of(payload)
                 op = request.get("method", "")
-                if self.faults.meet(Device.ROBOT, op, LOST) is not None:
-                    continue
+                fault = self.faults.meet(Device.ROBOT, op)
+                if fault is not None and fault.kind == "deaf":
+                    continue  # the request never arrived: it is neither carried out nor answered
                 answer = b"SUCCEED" if op == "login" else self._answer(request)
-                fault = self.faults.meet(Device.ROBOT, op, KINDS[Device.ROBOT] - LOST)
                 if fault is not None and fault.kind in STOPS:
                     self.cabinet.safety_stop(STOPS[fault.kind])
                 await send(writer, bytes if bare else encode, answer, fault)

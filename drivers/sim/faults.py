@@ -7,7 +7,7 @@ each phase is in the table of tests/collect/faults/test_matrix.py.
 import asyncio
 import itertools
 import math
-from collections.abc import Callable, Set
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Any, Self
@@ -62,8 +62,6 @@ class Device(StrEnum):
     FORCE = "force"
 
 
-LOST = frozenset({"deaf"})
-"""The request never arrives: it is neither carried out nor answered."""
 REPLIES = frozenset({"mute", "late", "split", "duplicate", "wrong-id", "malformed", "garbage", "drop"})
 """The request is carried out; something is wrong with its reply."""
 STOPS = {
@@ -74,7 +72,7 @@ STOPS = {
 """The cabinet stops the arm by itself; only a person ends that."""
 
 KINDS: dict[Device, frozenset[str]] = {
-    Device.ROBOT: LOST | REPLIES | STOPS.keys(),
+    Device.ROBOT: frozenset({"deaf"}) | REPLIES | STOPS.keys(),
     Device.TELEMETRY: frozenset({"mute", "late"}),
     Device.CAMERA: frozenset({"black", "frozen", "torn"}),
     Device.INK: frozenset({"deaf", "mute", "garbage", "late", "unplug"}),
@@ -207,15 +205,12 @@ class FaultBoard:
                 self.take(hung.ident)
         return tuple(self._hanging.values())
 
-    def meet(self, device: Device, op: str = "", kinds: Set[str] | None = None) -> Fault | None:
-        """The fault that strikes this request, push, frame or round of a device; it counts as one strike.
-
-        With `kinds`, only faults of these kinds.
-        """
+    def meet(self, device: Device, op: str = "") -> Fault | None:
+        """The fault that strikes this request, push, frame or round of a device; it counts as one strike."""
         for hung in self.hanging:
             fault = hung.fault
             waits = fault.on is not None and fault.on != op and not op.endswith(f".{fault.on}")
-            if fault.device is not device or waits or fault.kind not in (kinds or KINDS[device]):
+            if fault.device is not device or waits:
                 continue
             if hung.until_s is None and not fault.by_itself and self._holds(fault):
                 hung.seen += 1
