@@ -295,8 +295,8 @@ class _Person:
         answers = {
             "address of the cabinet": lab.host,
             "squares of the print": "{}x{}".format(*table.board_squares),
-            "side of a square": f"{facts.printed_square_mm:g}",
-            "side of a marker": f"{facts.printed_marker_mm:g}",
+            "side of a square": f"{facts.printed_mm[0]:g}",
+            "side of a marker": f"{facts.printed_mm[1]:g}",
             "r: radius": f"{brush.radius_mm:g}",
             "l: length": f"{brush.length_mm:g}",
             "can bus": lab.can_bus,

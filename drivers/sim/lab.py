@@ -107,7 +107,7 @@ class UnknownLab(LoopbackRig):
     def labels(self, control: Path | None = None) -> list[str]:
         """What a person can read in the lab now: on labels, plugs, the print and the pendant."""
         facts, table, brush = self.facts, self.facts.config.table, self.facts.config.brush
-        columns, rows = table.board_squares
+        (columns, rows), (square_mm, marker_mm) = table.board_squares, facts.printed_mm
         ink = "none, a person pours" if self.ink is None else f"{facts.config.ink_device} on {self.ink_path}"
         return [
             "an unknown lab; simulated: nothing measured in it is a result on paper",
@@ -115,8 +115,8 @@ class UnknownLab(LoopbackRig):
             *(f"camera    {stream}" for stream in self.streams),
             f"force     SRI M8123 on the gateway {self.can_bus}",
             f"ink       {ink}",
-            f"print     ChArUco, {columns} x {rows} squares of {facts.printed_square_mm:g} mm, "
-            f"markers of {facts.printed_marker_mm:g} mm, {table.board_dictionary}",
+            f"print     ChArUco, {columns} x {rows} squares of {square_mm:g} mm, "
+            f"markers of {marker_mm:g} mm, {table.board_dictionary}",
             f"brush     radius R = {brush.radius_mm:g} mm, length L = {brush.length_mm:g} mm, "
             f"press at most {facts.max_depth_mm:g} mm",
             *(() if control is None else (f"hand      brushloop sim hand {control} bring pin",)),

@@ -84,9 +84,8 @@ class Facts:
     payload_kg: float
     camera_port: int
     """Of the camera that shows the sheet."""
-    printed_square_mm: float
-    printed_marker_mm: float
-    """Sizes that the line below the print states, mm."""
+    printed_mm: tuple[float, float]
+    """Sides of a square and of a marker that the line below the print states."""
     swapped: tuple[str, ...] = ()
     """Corners that the person takes for each other."""
     cable_after: int | None = None
@@ -187,8 +186,7 @@ def _guess(rng: np.random.Generator, seed: int, rate: float, picture_px: tuple[i
         cabinet_tcp=typed,
         payload_kg=payload_kg,
         camera_port=camera_port,
-        printed_square_mm=table.board_square_mm,
-        printed_marker_mm=table.board_marker_mm,
+        printed_mm=(table.board_square_mm, table.board_marker_mm),
     )
 
 
@@ -327,7 +325,7 @@ def trapped(facts: Facts, trap: Trap) -> tuple[Facts, Facts]:
         case Trap.WRONG_BOARD_SIZE:  # a board that was printed too small is measured
             square_mm, marker_mm = SHRUNK * table.board_square_mm, SHRUNK * table.board_marker_mm
             wrong = facts.patched(table=replace(table, board_square_mm=square_mm, board_marker_mm=marker_mm))
-            return wrong, replace(wrong, printed_square_mm=square_mm, printed_marker_mm=marker_mm)
+            return wrong, replace(wrong, printed_mm=(square_mm, marker_mm))
         case Trap.TCP_IN_METRES:
             return replace(facts, cabinet_tcp=(0.0, 0.0, facts.config.tool_mm / 1e6, 0.0, 0.0, 0.0)), facts
         case Trap.PARK_IN_PICTURE:

@@ -116,8 +116,8 @@ class InLab(Person):
         read = {
             "Address of the cabinet": lab.host,
             "Squares of the print": "{}x{}".format(*table.board_squares),
-            "Side of a square": str(facts.printed_square_mm),
-            "Side of a marker": str(facts.printed_marker_mm),
+            "Side of a square": str(facts.printed_mm[0]),
+            "Side of a marker": str(facts.printed_mm[1]),
             "Family of its markers": table.board_dictionary,
             "R:": str(brush.radius_mm),
             "L:": str(brush.length_mm),
