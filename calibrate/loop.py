@@ -115,12 +115,11 @@ class LoopRecord(Sealed):
             )
         points, _, measure, row = max(self.lost, key=lambda lost: lost[0])
         near = [is_near(below, interval, self.goal_points) if interval else None for below, interval, *_ in self.lost]
-        sure = " So few strokes do not make it certain." if None in near else ""
+        sure = " More strokes have to be pressed again to be certain." if None in near else ""
         return Point(
             points <= self.goal_points,
-            f"Strokes pressed again ({self.again}) are at most {max(0.0, points):.1f} points less similar to their "
-            f"originals than other presses of the same condition are ({measure.upper()}, {row.alignment}, {row.tone}); "
-            f"the project's goal is {self.goal_points:g} or less.{sure}",
+            f"Strokes pressed again ({self.again}) lose up to {max(0.0, points):.1f} points of {measure.upper()} "
+            f"against other such presses ({row.alignment}, {row.tone}); the goal is {self.goal_points:g}.{sure}",
         )
 
 

@@ -117,7 +117,7 @@ class Recovered:
             if vague := self._flagged(flag):
                 yield f"warning: {vague} presses do not tell {name}: the interval covers most of the commanded range"
         if 2 * (bound := self._flagged(Flag.AT_BOUND)) > many:
-            yield f"warning: {bound} presses end at a bound: the model does not fit this brush; do not repeat these"
+            yield f"warning: {bound} presses end at a bound: do not repeat these, give a fit of this brush (--fit)"
         for stroke_id, why in self.refused:
             yield f"not used: {stroke_id}: {why}"
         yield str(self.out)
@@ -147,7 +147,8 @@ def recover(request: RecoverRequest, progress: Progress = unseen) -> Recovered:
     rows = [row for press in presses if (row := _row(press, inverter, refused))]
     if not rows:
         why = f": {refused[0][0]}: {refused[0][1]}" if refused else ""
-        raise CalibrationError(str(session.recording.path), f"no stroke could be recovered{why}")
+        way_out = "" if request.fit else "; the published model was inverted: give a fit of this brush (--fit)"
+        raise CalibrationError(str(session.recording.path), f"no stroke could be recovered{why}{way_out}")
     recovered = Recovered(session, inverter.model.name, with_model_error(rows, fitted), refused, request.out)
     request.out.parent.mkdir(parents=True, exist_ok=True)
     write_whole(request.out, csv_text(COLUMNS, recovered.csv_rows()))

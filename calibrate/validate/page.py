@@ -251,7 +251,7 @@ def measured(report: Report) -> str:
     sessions = f"{len(report.sessions)} sessions" if len(report.sessions) > 1 else "one session"
     return (
         f"{compared} brush presses{at}, from {sessions}, were compared with what {models} stroke models predict for "
-        f"them{left}. Each press is one vertical dab of {brush} ({report.source})."
+        f"them{left}. Each press goes straight down and up, with {brush} ({report.source})."
     )
 
 

@@ -65,7 +65,7 @@ def refusal(
     what = _what(first, models)
     if first["type"].startswith("union_tag"):
         loc.append("kind")
-    more = f"; and {len(errors) - 1} more" if len(errors) > 1 else ""
+    more = f"; errors besides this one: {len(errors) - 1}" if len(errors) > 1 else ""
     where: Path | str = path
     for set_at, variable in (environment or {}).items():
         if tuple(loc[: len(set_at)]) == set_at and all(isinstance(part, int) for part in loc[len(set_at) :]):

@@ -34,14 +34,14 @@ LEAVE = yes_or_no(
 )
 NOT_PARKED = yes_or_no(
     "The arm is not parked: it rests where it was stopped, perhaps with the brush down. "
-    "The next run begins by lifting it. Leave it as it is?",
-    "leave it as it is",
-    "stay",
+    "The next run begins by lifting it. Quit all the same?",
+    "quit, and leave the arm where it is",
+    "back to this screen",
 )
-UNSEEN = yes_or_no(f"{NOT_AT_REST} Leave this screen anyway?", "leave it as it is", "stay")
+UNSEEN = yes_or_no(f"{NOT_AT_REST} Quit all the same?", "quit, and leave the arm where it is", "back to this screen")
 NO_RUN = Snapshot(state=State.DONE)
 """What is shown before the first run of a day and between two of them."""
-LOOK, BACK = Choice("v", "look through the captures"), Choice("q", "back")
+LOOK, BACK = Choice("v", "look through the captures"), Choice("q", "back to the run")
 ANALYSE = Choice("a", "analyse: calibrate, fit the brush, compare the models, and write the report")
 
 

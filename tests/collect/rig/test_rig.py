@@ -39,7 +39,7 @@ def rig_file(tmp_path: Path, old: str = "", new: str = "") -> Path:
     ("old", "new", "message"),
     [
         ("port = 30004", "port = 70000", r"rig.toml: robot.port: .*65535.*given: 70000"),
-        ("[brush]", "[bursh]", r"rig.toml: bursh: unknown field; did you mean brush\?; and 1 more$"),
+        ("[brush]", "[bursh]", r"rig.toml: bursh: unknown field; did you mean brush\?; errors besides this one: 1$"),
         ('kind = "ink-station"\n', "", r"ink.device.kind: is missing: one of 'ink-station', 'modbus-pump'$"),
         ("touch_z_mm = 120.030", "touch_z_mm = nan", r"paper.touch_z_mm: .*finite"),
         ("touch_point_mm = [2.0,", "touch_point_mm = [-2.0,", r"paper.touch_point_mm: \[-2, 2\] does not lie on the"),
