@@ -240,7 +240,7 @@ def _check_brush(path: Path, brush: BrushConfig, strokes: Iterable[Planned], pat
         for _, _, asked in marks_of(stroke, patch):
             bundle_mm = brush.length_mm * math.cos(math.radians(asked.tilt_deg))
             bundle = f"the bundle at {asked.tilt_deg:g} deg"
-            for name, most_mm in (("brush.max_depth_mm of the rig", brush.max_depth_mm), (bundle, bundle_mm)):
+            for name, most_mm in (("the rig's brush.max_depth_mm", brush.max_depth_mm), (bundle, bundle_mm)):
                 if asked.depth_mm > most_mm:
                     what = f"{asked.depth_mm:g} mm is deeper than {name} = {most_mm:.4g} mm allows"
                     raise ConfigError(path, stroke.stroke_id, what)

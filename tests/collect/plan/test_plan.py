@@ -114,7 +114,7 @@ REPLAYED = 'kind = "list"\nof = "s"\npresses = [{stroke_id = "b", depth_mm = 23.
     [
         (LISTED.replace("9.0", "23.0"), [], r"001-H23-a0-r01: 23 mm is deeper"),
         (REPLAYED, [], r"b~1: 23"),
-        (figure(HERE, TOO_DEEP), [], r"a-r01: 23 mm is deeper than brush.max_depth_mm = 22 mm"),
+        (figure(HERE, TOO_DEEP), [], r"a-r01: 23 mm is deeper than the rig's brush.max_depth_mm = 22 mm"),
         (figure(HERE, THERE, patch="[300.0, 60.0]"), [], r"protocol.toml: cell_mm: .* does not fit"),
         (figure(HERE, TOO_TILTED), [], r"tilt = 20.000 deg is outside .*\(a-r01 on patch 0\)"),
         (figure(NEAR_TOUCH, THERE), [TOUCH], r"\[4.0, 26.0\] lies within 5 mm of ink at \[3.0, 26.0\]"),
