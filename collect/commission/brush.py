@@ -90,7 +90,7 @@ class BrushStep(Step):
             level = await device.level()
             gauge = "no gauge" if level is None else f"well {level:.0%} full"
             visit.say(f"{identity.model} {identity.firmware}: {gauge}")
-            while await visit.yes(f"Give {PRIME_ML:g} ml, to fill its tube? The well must stand under it."):
+            while await visit.yes(f"Give {PRIME_ML:g} ml, until its tube drips? The well must stand under it."):
                 visit.working(f"giving {PRIME_ML:g} ml")
                 await device.dose(min(PRIME_ML, config.dose_ml))
                 level = await device.level()

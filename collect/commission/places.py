@@ -49,7 +49,7 @@ BELOW_MM = 2.0
 BOX = tuple(f"robot.limits.{axis}_mm" for axis in "xyz")
 SPEEDS = {
     "robot.limits.tilt_deg": number_of("Widest lean of the brush", 1.0, 30.0, "deg", "15"),
-    "robot.limits.speed_mm_s": number_of("Highest speed of the tip in any motion", 1.0, 500.0, "mm/s", "150"),
+    "robot.limits.speed_mm_s": number_of("Highest speed of the tip in later sessions", 1.0, 500.0, "mm/s", "150"),
     "robot.limits.acc_mm_s2": number_of("Highest acceleration in any motion", 1.0, 5000.0, "mm/s2", "800"),
     "motion.travel_speed_mm_s": number_of("Speed of travel above the sheet", 1.0, 500.0, "mm/s", "100"),
     "motion.press_speed_mm_s": number_of("Speed down into a press", 1.0, 100.0, "mm/s", "15"),

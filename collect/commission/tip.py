@@ -175,7 +175,7 @@ class TipStep(Step):
     async def carry_out(self, visit: Visit) -> None:
         """Have the pin touched until the tip is known well enough. Raises `NotAccepted`."""
         visit.say(
-            "Fix a pin upright where all sides of it can be reached; put the pendant into hand guiding.",
+            "Fix a pin upright where all sides of it can be reached; power the arm, put the pendant into hand guiding.",
             "Touch its point with the tip of the dry brush, each time leaning to another side, and hold still.",
         )
         await self._pin(visit)
