@@ -233,7 +233,7 @@ def fault(
 def hand(
     control: Annotated[Path, typer.Argument(help="The lab's socket, as after `brushloop sim --control`.")],
     act: Annotated[str, typer.Argument(help="bring, measure or mend.")],
-    to: Annotated[str | None, typer.Argument(help="What: pin, board-corner, well, park, hold-board, ...")] = None,
+    to: Annotated[str | None, typer.Argument(help="What, such as pin or square; an unknown word lists all.")] = None,
     index: Annotated[int, typer.Option(min=1, max=999, help="Which one, from 1, such as a direction at the pin.")] = 1,
     corner: Annotated[str | None, typer.Option(help="Such as 'lower left' or 'upper right'.")] = None,
 ) -> None:
