@@ -24,7 +24,7 @@ from brushloop.collect.errors import ConfigError, NeedsOperator, StepError
 from brushloop.collect.operator import Asker, Prompt
 from brushloop.collect.protocols.steps import SelfCheckStep, ZeroTouchStep
 from brushloop.collect.rig.config import PaperConfig, SelfCheckConfig, TouchConfig
-from brushloop.collect.rig.paper import PaperPlane, Sheet
+from brushloop.collect.rig.paper import PaperPlane, Sheet, to_base
 from brushloop.collect.touch import camera
 from brushloop.collect.touch.heights import Touch, at_one_point, plane_of
 from brushloop.collect.touch.measure import measure_plane, used_patches
@@ -363,9 +363,23 @@ def test_a_wide_triangle_is_always_uneven_wide_and_on_free_patches(width: float,
 Fault = Callable[[Bench], None]
 
 
-def arm_goes_elsewhere(bench: Bench) -> None:
-    """By less than half the width of the well, so that the brush is dipped."""
-    bench.bent = lambda pose: replace(pose, x_mm=pose.x_mm + 3.0, y_mm=pose.y_mm - 4.0)
+def goes_to(change: Callable[[float, float], tuple[float, float]]) -> Fault:
+    """An arm that goes to `change(x, y)` of the paper frame when (x, y) is asked for, over the sheet only."""
+
+    def bend(bench: Bench) -> None:
+        paper = bench.rig.config.paper
+        width_mm, height_mm = paper.size_mm
+
+        def bent(pose: Pose) -> Pose:
+            x, y = bench.world.config.table.to_paper(pose.x_mm, pose.y_mm)
+            if not (0.0 <= x <= width_mm and 0.0 <= y <= height_mm):
+                return pose
+            base_x, base_y = to_base(paper, *change(x, y))
+            return replace(pose, x_mm=base_x, y_mm=base_y)
+
+        bench.bent = bent
+
+    return bend
 
 
 def dry_brush(bench: Bench) -> None:
@@ -400,7 +414,8 @@ FAR_APART, ONE_PATCH = (0, 5, 36), (36,)
 @pytest.mark.parametrize(
     ("fault", "patches", "why"),
     [
-        (arm_goes_elsewhere, FAR_APART, "the marks lie off by"),
+        (goes_to(lambda x, y: (244.0 - x, y)), FAR_APART, "mirrored in x"),
+        (goes_to(lambda x, y: (x + 3.0, y - 4.0)), FAR_APART, "the marks lie off by"),
         (dry_brush, FAR_APART, "3 marks were pressed, new marks seen: 0"),
         (mirrored_camera, FAR_APART, "the board is not seen: the photograph is mirrored"),
         (arm_in_the_second_picture, FAR_APART, r"mm2 at \(.*\) mm became dark, more than a mark: is the arm"),
