@@ -83,10 +83,10 @@ class Lens(Frozen):
     def undistort(self, image: Gray) -> Gray:
         """The photograph as a lens without distortion would have taken it. Raises `CaptureRefused` for another size."""
         self.check_size(image, "the photograph")
-        camera, kept = self.camera, np.eye(3)
-        x, y = cv2.initUndistortRectifyMap(camera, np.array(self.distortion), kept, camera, self.size_px, cv2.CV_16SC2)
+        camera, distortion = self.camera, np.array(self.distortion)
+        maps = cv2.initUndistortRectifyMap(camera, distortion, np.eye(3), camera, self.size_px, cv2.CV_16SC2)
         # Linear interpolation, that of `cv2.undistort`, blurs a sharp picture by up to half a pixel more.
-        return cast("Gray", cv2.remap(image, x, y, cv2.INTER_CUBIC))
+        return cast("Gray", cv2.remap(image, *maps, cv2.INTER_CUBIC))
 
 
 def unknown_lens(size_px: tuple[int, int]) -> Lens:

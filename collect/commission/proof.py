@@ -59,7 +59,7 @@ class ProofStep(Step):
         folder = tempfile.mkdtemp(prefix=f"{visit.rig_path.stem}.proof-", dir=visit.rig_path.parent)
         session = await self._run(visit, Path(folder), protocol, dry=False)
         visit.say(f"Recorded in {session}.")
-        self._keep(visit, rig, *read_proof(session))
+        self._keep(visit, rig, session)
 
     async def _doctor(self, visit: Visit, rig: RigConfig) -> None:
         visit.working("asking every device")
@@ -107,14 +107,8 @@ class ProofStep(Step):
                 engine.answer(asked.number, str(await visit.ask(asked, back=False)))
             await asyncio.sleep(POLL_S)
 
-    def _keep(
-        self,
-        visit: Visit,
-        rig: RigConfig,
-        touch: ZeroTouchResult,
-        check: SelfCheckResult,
-        captures: list[CaptureResult],
-    ) -> None:
+    def _keep(self, visit: Visit, rig: RigConfig, session: Path) -> None:
+        touch, check, captures = read_proof(session)
         plane = plane_of(touch)
         by_hand_mm = visit.notebook.get(HEIGHT)
         x_mm, y_mm = visit.notebook.get("paper.touch_point_mm")

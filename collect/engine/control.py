@@ -50,8 +50,7 @@ class RunControl:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self.state = State.IDLE
-        """What the run is doing."""
+        self._state = State.IDLE
         self._loop: asyncio.AbstractEventLoop | None = None
         self._go_on = asyncio.Event()
         self._stop_wanted = False
@@ -62,6 +61,11 @@ class RunControl:
         """Whether everything is collected and the arm parked; the run then ends by itself."""
         self.requests: tuple[OperatorRequest, ...] = ()
         """Requests of the operator that are still pending."""
+
+    @property
+    def state(self) -> State:
+        """What the run is doing."""
+        return self._state
 
     def toggle(self, request: OperatorRequest) -> None:
         """Make or withdraw a request of the operator; from any thread."""
@@ -88,9 +92,9 @@ class RunControl:
         """Run `act` in the engine's event loop now; from any thread, in any state, any number of times."""
         with self._lock:
             self._stop_wanted = True
-            if self._loop is None or self.state in FINAL:
+            if self._loop is None or self._state in FINAL:
                 return
-            if self.state != State.STOPPING and not self.closing:
+            if self._state != State.STOPPING and not self.closing:
                 self._set(State.STOPPING)
             self._loop.call_soon_threadsafe(act)
 
@@ -98,7 +102,7 @@ class RunControl:
         """Pause before the next step, unless the run is to end there; from any thread."""
         with self._lock:
             self._pause_wanted = not self.park_wanted
-            if self._pause_wanted and self.state == State.RUNNING:
+            if self._pause_wanted and self._state == State.RUNNING:
                 self._set(State.PAUSING)
 
     def resume(self) -> None:
@@ -115,7 +119,7 @@ class RunControl:
     async def pause_point(self) -> None:
         """Wait here, between two steps, while the run is paused."""
         with self._lock:
-            if self.state != State.PAUSING:
+            if self._state != State.PAUSING:
                 return
             self._set(State.PAUSED)
         while True:
@@ -142,27 +146,27 @@ class RunControl:
     def end(self, state: State) -> None:
         """End the run in a final state."""
         with self._lock:
-            if state is State.STOPPED and self.state is not State.STOPPING:
+            if state is State.STOPPED and self._state is not State.STOPPING:
                 self._set(State.STOPPING)
             self._set(state)
 
     def _change(self, new: State) -> None:
         self._refuse_after_a_stop()
-        if new is not self.state:  # unchanged if one question follows another
+        if new is not self._state:  # unchanged if one question follows another
             self._set(new)
 
     def _refuse_after_a_stop(self) -> None:
-        if self.state == State.STOPPING:
+        if self._state == State.STOPPING:
             raise asyncio.CancelledError
 
     def _end_pause(self) -> None:
         self._pause_wanted = False
-        if self.state == State.PAUSING:
+        if self._state == State.PAUSING:
             self._set(State.RUNNING)
-        elif self.state == State.PAUSED and self._loop is not None:
+        elif self._state == State.PAUSED and self._loop is not None:
             self._loop.call_soon_threadsafe(self._go_on.set)
 
     def _set(self, new: State) -> None:
-        if new not in TRANSITIONS[self.state]:
-            raise RuntimeError(f"{self.state} -> {new} is not in the table of transitions")
-        self.state = new
+        if new not in TRANSITIONS[self._state]:
+            raise RuntimeError(f"{self._state} -> {new} is not in the table of transitions")
+        self._state = new

@@ -42,14 +42,14 @@ class Failure(StrEnum):
     SPLIT = "split", "whole"
     BENT = "bent", "straight"
 
-    def __new__(cls, name: str, passed: str, of_picture: bool = False) -> Failure:
-        """`passed` is what a capture is that passed the check; `of_picture` tells that the photograph failed, not the
-        stroke: the stroke on paper may be sound."""
+    def __new__(cls, name: str, if_passed: str, of_picture: bool = False) -> Failure:
+        """`if_passed` is what a capture is that passed; `of_picture` tells that the photograph failed, not the stroke:
+        the stroke on paper may be sound."""
         failure = str.__new__(cls, name)
-        failure._value_, failure.passed, failure.of_picture = name, passed, of_picture
+        failure._value_, failure.if_passed, failure.of_picture = name, if_passed, of_picture
         return failure
 
-    passed: str
+    if_passed: str
     of_picture: bool
 
 

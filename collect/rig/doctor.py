@@ -321,7 +321,7 @@ async def survey(host: str, port: int, framing: Framing) -> list[dict[str, Any]]
                 await connection.open(login=False)
         await ask("SystemInfo.getInterfaceVersionCode")
         names = await ask("getRobotNames")
-        robot = str(names[0]) if isinstance(names, list) and names else "rob1"  # pyright: ignore[reportUnknownArgumentType]
+        robot = str(cast("list[Any]", names)[0]) if isinstance(names, list) and names else "rob1"
         methods = (*OF_THE_CONTROLLER, *(f"{robot}.{name}" for name in OF_THE_ROBOT))
         *_, pose, joints = [await ask(method) for method in methods]
         if joints and pose:

@@ -51,11 +51,11 @@ def checks_content(checks: Sequence[Check]) -> Content:
     """A line for each check with value and limit, those missed first, with what to do about them."""
     from brushloop.collect.photograph.checks import Failure
 
-    passed = {str(failure): failure.passed for failure in Failure}
+    if_passed = {str(failure): failure.if_passed for failure in Failure}
     lines: list[Content] = []
     for check in sorted(checks, key=lambda check: check.passed):
         sign, style = ("✓", "") if check.passed else ("!", "bold $text-warning")
-        name = passed.get(check.name, check.name) if check.passed else check.name
+        name = if_passed.get(check.name, check.name) if check.passed else check.name
         value = f"{sign} {name:<10}{_number(check.score):>6}"
         lines.append(Content.assemble((value, style), (f"  {_limit(check)}", "dim")))
         if check.reason:

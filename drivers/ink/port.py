@@ -125,7 +125,7 @@ def crc16(data: bytes) -> int:
 
 POLL_S = 0.02
 STALE_BYTES = 4096
-"""More than can wait on a line."""
+"""More than can wait on a line; pyserial does not count what waits where a network carries the line."""
 REPLUG = "Check cable, power and the path of the port, then connect again."
 
 T = TypeVar("T")
