@@ -94,30 +94,30 @@ class LoopRecord(Sealed):
         return [row for row in self.stats if (row.alignment, row.tone) == key]
 
     @property
-    def lost(self) -> list[tuple[float, Interval | None, str, Stat]]:
-        """Points below another press with their 95 % interval, the measure, and the statistics that say so.
+    def lost(self) -> list[tuple[float, Interval | None, bool | None, str, Stat]]:
+        """Points below another press, their 95 % interval, whether they are within the goal, the measure, and its row.
 
-        Over the originals that have both; empty where no original condition was pressed twice.
+        Over the originals that have both; empty where no condition was pressed twice. The third is None if not certain.
         """
-        lost: list[tuple[float, Interval | None, str, Stat]] = []
+        lost: list[tuple[float, Interval | None, bool | None, str, Stat]] = []
         for row, measure in itertools.product(self.stats, MEASURES):
             of: Summary = getattr(row, measure)
             if row.model == AGAIN and of.below_ceiling is not None:
-                lost.append((of.below_ceiling, of.below_interval, measure, row))
+                below, interval = of.below_ceiling, of.below_interval
+                near = is_near(below, interval, self.goal_points) if interval else None
+                lost.append((below, interval, near, measure, row))
         return lost
 
     @property
     def answer(self) -> Point:
         """The result in one sentence."""
         if not self.lost:
-            return Point(
-                None, f"{self.again}: no original condition was pressed twice, so its repeatability is unknown."
-            )
-        points, _, measure, row = max(self.lost, key=lambda lost: lost[0])
-        near = [is_near(below, interval, self.goal_points) if interval else None for below, interval, *_ in self.lost]
-        sure = " More strokes have to be pressed again to be certain." if None in near else ""
+            return Point(None, f"{self.again}: no condition was pressed twice, so its repeatability is unknown.")
+        points, *_, measure, row = max(self.lost, key=lambda lost: lost[0])
+        good = min((near for _, _, near, *_ in self.lost), key=(False, None, True).index)
+        sure = " More strokes have to be pressed again to be certain." if good is None else ""
         return Point(
-            points <= self.goal_points,
+            good,
             f"Strokes pressed again ({self.again}) lose up to {max(0.0, points):.1f} points of {measure.upper()} "
             f"against other such presses ({row.alignment}, {row.tone}); the goal is {self.goal_points:g}.{sure}",
         )
