@@ -44,7 +44,7 @@ FINE = 4
 """Oversampling: strokes are moved on a raster finer by this factor, near their own 20 px/mm, then area-averaged."""
 BEST_SHIFT_PX = 6
 """Most that a size-normalised image is shifted each way."""
-AT_ONCE = 8
+AT_ONCE = 4
 """Images that are compared at once; for the arrays of many, the system would give the memory anew each time."""
 _REACH = range(-BEST_SHIFT_PX, BEST_SHIFT_PX + 1)
 SHIFTS = np.array(sorted(itertools.product(_REACH, _REACH), key=lambda shift: shift[0] ** 2 + shift[1] ** 2))

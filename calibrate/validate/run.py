@@ -316,12 +316,13 @@ def _score(
             for why in reasons:
                 refused.extend(Refused(press.session, press.stroke.stroke_id, why) for press in presses)
             predictions = [[images[model.name]] if model.name in images else [] for model in models]
+            of_models = [key_of(*drawn) for drawn in predictions]
+            of_presses = [key_of(press.images) for press in presses]
             for number, press in enumerate(presses):
-                others = [presses[other].images for other in others_of(number, len(group))]
-                compared = (*predictions, others)
-                key = key_of("score", press.images, *map(len, compared), *itertools.chain.from_iterable(compared))
+                others = others_of(number, len(group))
+                key = key_of("score", of_presses[number], *of_models, *(of_presses[other] for other in others))
                 numbers.setdefault(key, []).append(group[number])
-                yield key, (press.images, compared)
+                yield key, (press.images, (*predictions, [presses[other].images for other in others]))
 
     what, count = f"{session.header.session_id}: compared", sum(map(len, groups))
     for key, arrays in counted(scheduler.finished(score_job, jobs(), session.store), what, count, progress):
