@@ -89,7 +89,14 @@ class PathOrCommand(TyperGroup):
         if not args and self.no_args_is_help:
             args = ["--help"]
         if not args or args[0] not in self.commands:
-            self.commands[first].epilog = f"Other commands, each with a --help of its own: {', '.join(others)}."
+
+            def context(of: Any, info_name: str, parent: Any, **more: Any) -> Any:
+                return type(ctx)(of, info_name=ctx.info_name, parent=ctx.parent, **more)
+
+            command: Any = self.commands[first]
+            command.epilog = f"Other commands, each with a --help of its own: {', '.join(others)}."
+            # Its usage line shows what was typed: the name of the group.
+            command.context_class, command.options_metavar = context, f"[{'|'.join(others)}] [OPTIONS]"
             args = [first, *args]
         return super().parse_args(ctx, args)
 
@@ -106,6 +113,7 @@ CharacterData = Annotated[
     Path | None,
     Option(help="Folder with a file for each character, as 字.json, from github.com/chanind/hanzi-writer-data."),
 ]
+FIT = "Brush fit, the session's own by default; CCD-BSM as published with `published`, or if there is no fit."
 PlanFile = Annotated[Path, Option(help="The plan's folder, or its plan.json.")]
 Written = Annotated[Path, Argument(help="The session in which a plan was written.")]
 
@@ -134,9 +142,7 @@ class FitRequest:
 
     session: Annotated[Path, Argument(help="A session of presses, or of drags: its folder or its .mcap file.")]
     prior: Annotated[Path | None, Option(help="A dragfit of this brush, whose place and width are adapted.")] = None
-    strokes: Annotated[
-        int | None, Option(min=1, help="With --prior: only this many strokes, as different as possible.")
-    ] = None
+    strokes: Annotated[int | None, Option(min=1, help="With --prior: how many strokes, as unlike as possible.")] = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,12 +154,8 @@ class ValidateRequest:
     generators: Annotated[tuple[Path, ...], Option("--generator", help="A trained generator.safetensors.")] = ()
     fit: Annotated[Path | None, Option(help="Brush fit, the one in use by default; of drags, a dragfit.")] = None
     out: Annotated[Path | None, Option(help="Folder of the report; <session>/validation by default.")] = None
-    gates: Annotated[
-        tuple[str, ...], Option("--gate", help="Like 'csim_avg>=0.90', quoted; exit code 5 if missed.")
-    ] = ()
-    ablations: Annotated[
-        bool, Option("--ablations", help="Other lambdas, and similarity by number of fitted presses.")
-    ] = False
+    gates: Annotated[tuple[str, ...], Option("--gate", help="As 'csim_avg>=0.90', quoted; exit code 5 if missed.")] = ()
+    ablations: Annotated[bool, Option("--ablations", help="Other lambdas, and scores by presses fitted.")] = False
     curves: Annotated[tuple[str, ...], Option(help="NAME=FOLDER of a training, for figures 9 and 12.")] = ()
     held_out: Annotated[bool, Option(help="Fit to other conditions, each condition left out in turn.")] = True
     scheduler: Annotated[str, Option(help="An existing Dask cluster, as tcp://host:8786.")] = ""
@@ -180,9 +182,7 @@ class ExportRequest:
     session: Annotated[Path, Argument(help="A closed session's folder, or an .mcap file.")]
     out: Annotated[Path, Argument(help="The new folder.")]
     kind: Annotated[str, Option("--format", help="How tables are written: csv or parquet.")] = "csv"
-    crops: Annotated[
-        bool, Option("--crops", help="Rectified crops at 20 px/mm with masks, instead of photographs.")
-    ] = False
+    crops: Annotated[bool, Option("--crops", help="Not photographs: rectified crops at 20 px/mm with masks.")] = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +191,7 @@ class RecoverRequest:
 
     session: Annotated[Path, Argument(help="A session's folder or its .mcap file; imports count as sessions.")]
     out: Annotated[Path, Option(help="CSV to write; protocol-replay.toml goes beside it.")] = Path("recovered.csv")
-    fit: Annotated[Path | None, Option(help="A brush fitted to captures; else CCD-BSM as published.")] = None
+    fit: Annotated[Path | None, Option(help=FIT)] = None
     depth_range_mm: tuple[float, float] = (2.0, 30.0)
     tilt_range_deg: tuple[float, float] = (0.0, 30.0)
     presses: int | None = None
@@ -206,9 +206,7 @@ class CompareLoopRequest:
 
     original: Annotated[Path, Argument(help="The session whose strokes were pressed again.")]
     again: Annotated[Path, Argument(help="The session of the replay protocol.")]
-    fit: Annotated[Path | None, Option(help="Brush fit that recovered depth and tilt; else CCD-BSM as published.")] = (
-        None
-    )
+    fit: Annotated[Path | None, Option(help=FIT)] = None
     out: Annotated[Path, Option(help="Folder for loop.html, loop.csv, loop.json.")] = Path("loop")
     command: str = field(default_factory=_command_line)
     """Named by the report as what made it."""
@@ -294,9 +292,7 @@ class BoardOptions:
     checkerboard: Annotated[str, Option(help="Inner corners of a checkerboard, as 9x6.")] = ""
     charuco: Annotated[str, Option(help="Squares of a ChArUco board, as 26x20.")] = ""
     square_mm: Annotated[float, Option(min=0.5, max=1000.0, help="Side of a square, measured on the print.")] = 12.0
-    marker_mm: Annotated[
-        float, Option(min=0.0, max=1000.0, help="Side of a marker; 0: three quarters of a square.")
-    ] = 0.0
+    marker_mm: Annotated[float, Option(min=0, max=1000, help="Side of a marker; 0: three quarters of a square.")] = 0.0
     dictionary: Annotated[str, Option(help="Markers of the ChArUco board.")] = "DICT_5X5_1000"
 
 

@@ -80,10 +80,13 @@ sys.stderr.write(json.dumps(found))
 )
 def test_bad_input_is_one_line_and_exit_code_2(tmp_path: Path, arguments: tuple[str, ...], words: str) -> None:
     ran = brushloop(*arguments, cwd=tmp_path)
-    assert ran.returncode == 2
-    assert ran.stderr.count("\n") == 1
+    assert (ran.returncode, ran.stderr.count("\n")) == (2, 1)
     assert words in ran.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_group_of_commands_says_how_it_is_typed_and_what_else_there_is() -> None:
+    assert brushloop("collect", "--bogus").stderr.startswith("Usage: brushloop collect [plan] [OPTIONS]\n")
 
 
 def test_the_page_about_exit_codes_is_that_of_the_code() -> None:
