@@ -137,7 +137,7 @@ def compare(request: CompareLoopRequest, progress: Progress = unseen) -> Written
     if repeated != first.header.session_id:
         what = "repeats no session" if repeated is None else f"repeats {repeated}"
         raise CalibrationError(where, f"{what}, not {first.header.session_id}")
-    model, fit = BrushFit.model_of(request.fit, first.header)
+    model, fit = BrushFit.model_of(request.fit, first)
     refused: list[Refused] = []
     originals, repetitions = (
         list(read_presses(session, refused, uncommanded, too_thin, progress=progress)) for session in (first, second)

@@ -27,7 +27,7 @@ from brushloop.calibrate.stats import Floats, student_95
 from brushloop.model.inversion import Flag, Inverter, Range
 from brushloop.sessions.disk import csv_text
 from brushloop.sessions.records import Condition
-from brushloop.sessions.terminal import Progress, unseen
+from brushloop.sessions.terminal import Progress, plain, unseen
 
 PROTOCOL = "protocol-replay.toml"
 COLUMNS = (
@@ -117,7 +117,7 @@ class Recovered:
             if vague := self._flagged(flag):
                 yield f"warning: {vague} presses do not tell {name}: the interval covers most of the commanded range"
         if 2 * (bound := self._flagged(Flag.AT_BOUND)) > many:
-            yield f"warning: {bound} presses end at a bound: do not repeat these, give a fit of this brush (--fit)"
+            yield f"warning: {bound} presses end at a bound: do not repeat them, fit this brush first (`brushloop fit`)"
         for stroke_id, why in self.refused:
             yield f"not used: {stroke_id}: {why}"
         yield str(self.out)
@@ -147,9 +147,9 @@ def recover(request: RecoverRequest, progress: Progress = unseen) -> Recovered:
     rows = [row for press in presses if (row := _row(press, inverter, refused))]
     if not rows:
         why = f": {refused[0][0]}: {refused[0][1]}" if refused else ""
-        way_out = "" if request.fit else "; the published model was inverted: give a fit of this brush (--fit)"
+        way_out = "" if fitted else f"; {inverter.model.label} was inverted: fit this brush first (`brushloop fit`)"
         raise CalibrationError(str(session.recording.path), f"no stroke could be recovered{why}{way_out}")
-    recovered = Recovered(session, inverter.model.name, with_model_error(rows, fitted), refused, request.out)
+    recovered = Recovered(session, inverter.model.label, with_model_error(rows, fitted), refused, request.out)
     request.out.parent.mkdir(parents=True, exist_ok=True)
     write_whole(request.out, csv_text(COLUMNS, recovered.csv_rows()))
     write_whole(recovered.protocol, _protocol(recovered, request))
@@ -165,7 +165,7 @@ def _protocol(recovered: Recovered, request: RecoverRequest) -> str:
         for row in recovered.rows
     )
     return (
-        f"# Recovered by {recovered.model} from {header.session_id} ({header.source}), "
+        f"# Recovered by {plain(recovered.model)} from {header.session_id} ({header.source}), "
         f"recording sha256 {recovered.session.sha256}.\n"
         'kind = "list"\n'
         f"of = {json.dumps(header.session_id, ensure_ascii=False)}\n"
@@ -176,7 +176,7 @@ def _protocol(recovered: Recovered, request: RecoverRequest) -> str:
 
 def _inverter(request: RecoverRequest, session: OpenSession) -> tuple[Inverter, Collection[Condition]]:
     """The inverter, and the conditions that its brush was fitted to."""
-    model, fit = BrushFit.model_of(request.fit, session.header)
+    model, fit = BrushFit.model_of(request.fit, session)
     # A fitted brush marks nothing above its zero offset.
     least_mm = 0.0 if fit is None else 0.5 - fit.parameters["h0_mm"]
     fitted = set[Condition]() if fit is None else {Condition(*pair) for pair in fit.cells}

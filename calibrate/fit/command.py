@@ -10,14 +10,14 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 from pydantic import model_validator
 
-from brushloop.calibrate.artefact import FITS, FittedValue, SessionFit, made_by, put_to_use
+from brushloop.calibrate.artefact import FITS, FittedValue, SessionFit, current, made_by, put_to_use
 from brushloop.calibrate.commands import FitRequest
 from brushloop.calibrate.compare import MM_PER_PX, SHOWN_MM, SHOWN_ROWS, brush_of
 from brushloop.calibrate.errors import CalibrationError
@@ -50,6 +50,8 @@ from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Header
 from brushloop.sessions.terminal import Progress, unseen
 
+PUBLISHED = Path("published")
+"""As `--fit`: no fit, but the model of the paper."""
 FEWEST_CONDITIONS = 5
 SMOOTH_POINTS = 24
 
@@ -76,13 +78,14 @@ class BrushFit(SessionFit):
         return FittedPress(self.radius_mm, self.length_mm, values, np.array(self.edges_mm), np.array(self.ends_mm))
 
     @classmethod
-    def model_of(cls, fit: Path | None, header: Header) -> tuple[StrokeModel, BrushFit | None]:
-        """The model of a fit and the fit itself; without one, CCD-BSM as published for the brush of a recording.
+    def model_of(cls, fit: Path | None, session: OpenSession) -> tuple[StrokeModel, BrushFit | None]:
+        """The model of a fit, the one in use of the session by default, and that fit.
 
-        Raises `CalibrationError`.
+        CCD-BSM as published for its brush and None if there is no fit, or for `PUBLISHED`. Raises `CalibrationError`.
         """
-        if fit is None:
-            return stroke_model("ccd-bsm", brush_of(header)), None
+        fit = fit or current(session.recording.path.parent, FITS)
+        if fit is None or fit == PUBLISHED:
+            return replace(stroke_model("ccd-bsm", brush_of(session.header)), label="CCD-BSM as published"), None
         artefact = cls.read(fit)
         return fitted_model(artefact.press(), f"CCD-BSM fitted on {artefact.session_id}"), artefact
 

@@ -63,17 +63,15 @@ def recovered(session: Path, out: Path, **options: Any) -> Recovered:
 def test_a_session_is_inverted_and_can_be_replayed(tmp_path: Path) -> None:
     out = tmp_path / "out" / "recovered.csv"
     words = said("recover", session(tmp_path), "--out", out)
-    assert "3 presses recovered by ccd-bsm (imported photographs)" in words
+    assert "3 presses recovered by CCD-BSM as published (imported photographs)" in words
     assert "H: recovered -0.0" in words
     assert "3 of 3 intervals (95 %) hold the command" in words
     assert "warning: the intervals of 3 presses leave out the error of the model" in words
     protocol = load_protocol(out.with_name(PROTOCOL))
     assert isinstance(protocol, ListConfig)
-    assert protocol.of == "shots"
-    assert [press.stroke_id for press in protocol.presses] == ["p0", "p1", "p2"]
+    assert (protocol.of, [press.stroke_id for press in protocol.presses]) == ("shots", ["p0", "p1", "p2"])
     rows = rows_of(out)
-    assert rows[0]["commanded_depth_mm"] == "12"
-    assert rows[0]["source"] == "imported photographs"
+    assert (rows[0]["commanded_depth_mm"], rows[0]["source"]) == ("12", "imported photographs")
     for row, press, (height, tilt) in zip(rows, protocol.presses, PRESSES, strict=True):
         # The preprocessing's own threshold is what is left: .03 mm of depth.
         assert float(row["depth_mm"]) == pytest.approx(height, abs=0.08)
@@ -82,6 +80,9 @@ def test_a_session_is_inverted_and_can_be_replayed(tmp_path: Path) -> None:
         assert press.depth_mm == pytest.approx(float(row["depth_mm"]), abs=1e-3)
     few = recovered(tmp_path / "sessions" / "shots", tmp_path, presses=2)  # spread evenly over the session
     assert ([row.stroke_id for row in few.rows], few.refused) == (["p0", "p1"], [])
+    said("fit", few.session.recording.path)
+    models = [recovered(few.session.recording.path, tmp_path, fit=fit).model for fit in (None, Path("published"))]
+    assert models == ["CCD-BSM fitted on shots", "CCD-BSM as published"], "the fit in use, unless told otherwise"
 
 
 def test_what_cannot_be_inverted_is_refused_and_writes_nothing(tmp_path: Path) -> None:

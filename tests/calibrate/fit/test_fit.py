@@ -193,8 +193,7 @@ def test_one_command_leads_from_photographs_to_a_fit_and_a_report(
     path = current(session, FITS)
     assert path is not None
     fit = BrushFit.read(path)
-    assert fit.strokes == 5
-    assert set(fit.cells) == set(CONDITIONS)
+    assert (fit.strokes, set(fit.cells)) == (5, set(CONDITIONS))
     assert fit.csim_percent[FITTED] > fit.csim_percent[UNCALIBRATED] + 3.0
     report = Report.read(session / "validation" / "report.json")
     fitted = report.model(NAME)
