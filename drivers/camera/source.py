@@ -80,10 +80,10 @@ class Capture:
 
     def __init__(self, table: CameraTable) -> None:
         """Raises `ConnectionLost` where it does not open, and `DeviceError` for a setting that it does not keep."""
-        # Set before the first capture: otherwise the libraries would write their own lines across the screen, and look
-        # for a camera in the same room behind a proxy.
+        # OpenCV reads these at its first capture; without them FFmpeg writes its own lines across the screen, and looks
+        # for a camera in the same room behind a proxy: "none" is no address. RTSP over TCP is OpenCV's own default.
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-        os.environ["no_proxy"] = "*"
+        os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", "http_proxy;none|rtsp_flags;prefer_tcp")
         import cv2
 
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
