@@ -1,11 +1,11 @@
-# Two commands matter: `make demo` and `make test`. Both set everything up on a machine with python3.11+ and make.
+# Three commands matter: `make setup`, `make demo` and `make test`. They need python3.11+, and set up what they need.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 TORCH ?= auto
 
-.PHONY: demo test suite lint types bench docs soak clean
+.PHONY: setup demo test suite lint types bench docs soak clean
 .DELETE_ON_ERROR:
 
 $(VENV)/bin/python:
@@ -21,6 +21,8 @@ $(STAMP): requirements/run.lock requirements/install.py pyproject.toml | $(VENV)
 $(STAMP)-dev: requirements/run.lock requirements/dev.lock requirements/install.py pyproject.toml | $(VENV)/bin/python
 	$(BIN)/python requirements/install.py dev --torch $(TORCH)
 	@touch $(STAMP) $@
+
+setup: $(STAMP)  ## make .venv with all that the commands need, and run none of them
 
 # Bytecode is kept, whatever the shell says: without it each of the demo's processes compiles some 600 modules again.
 demo: $(STAMP)  ## press, calibrate, press again and validate on the loopback rig; `brushloop demo --full` does more
