@@ -101,21 +101,20 @@ class CameraStep(Step):
 
     async def _source(self, visit: Visit) -> None:
         """Ask for a camera and show its picture, until the person says that it is the one over the sheet."""
-        devices = sorted((p.name[5:] for p in Path("/dev").glob("video*") if p.name[5:].isdecimal()), key=int)
-        number = f", or the number of a video device ({', '.join(devices)})" if devices else ""
-        question = Prompt(f"Address of the camera's stream, as http://192.0.2.8/stream.mjpg{number}", read=str)
+        devices = video_devices(Path("/dev"))
+        number = f", or the number of a video device: {', '.join(devices.values())}" if devices else ""
+        address = Prompt(f"Address of the camera's stream, as http://192.0.2.8/stream.mjpg{number}", read=str)
         source = over_sheet = ""
         while over_sheet != YES.key:
-            source = str(await visit.ask(question))
+            source = str(await visit.ask(address))
             visit.working(f"waiting for a picture of {source}")
             async with opened(visit, source) as camera:
                 picture = await still(camera, visit.clock)
-            view = await _board_in(visit, picture, source, lying=False)
-            height, width = picture.shape
-            seen, probably = ("the board is seen", YES) if view is not None else ("no board is seen", NO)
-            visit.say(f"{source}: {width} x {height} px; {seen}", picture=picture)
-            asked = choice_of("Is this the picture of the camera over the sheet?", (YES, NO), probably.key)
-            over_sheet = await visit.ask(asked)
+            label, (height, width) = devices.get(source, source), picture.shape
+            visit.say(f"{label}: {width} x {height} px", picture=picture)
+            probably = NO if await _board_in(visit, picture, source, lying=False) is None else YES
+            question = f"Is this, by {label}, the picture of the camera over the sheet?"
+            over_sheet = await visit.ask(choice_of(question, (YES, NO), probably.key))
         # What a device chose by itself; the settings of a stream only its own set-up can change.
         locked = await asyncio.to_thread(found_settings, int(source), SETTLE_S) if source.isdecimal() else {}
         if not locked:
@@ -166,9 +165,10 @@ class CameraStep(Step):
     async def _held(self, visit: Visit, camera: OpenCvCamera, folder: Path, index: int, views: list[BoardView]) -> bool:
         """Take one photograph of the held board, so that a resumed session does not; False if the person skips it."""
         where = HOLD[index] if index < len(HOLD) else "where it is still missing"
-        how = f"View {index + 1}: cover the sheet, and hold the second print {where}, all of it sharp; keep still."
+        how = f"View {index + 1}: cover the board on the table, hold the second print {where}, all sharp; keep still."
+        why = "Slanted views show how the lens bends the picture."
         async with shown_live(visit, camera):
-            if not await visit.brought(f"hold-board {index}", how, may_skip=True):
+            if not await visit.brought(f"hold-board {index}", f"{how} {why}", may_skip=True):
                 return False
         visit.working("looking for the board in the picture")
         picture = await still(camera, visit.clock)
@@ -184,13 +184,14 @@ class CameraStep(Step):
 
 
 async def _board_in(visit: Visit, picture: Gray, name: str, *, lying: bool) -> BoardView | None:
-    """The board in a picture; None, with a warning, where it is not seen.
+    """The board in a picture, and how much of it is seen; None, with a warning, where it is not.
 
     Raises `NotAccepted` where the camera is mirrored or, by a board that is `lying` flat, the print is another one than
     was described. A board in the hand may only look so.
     """
+    board = board_of(visit.notebook)
     try:
-        return await asyncio.to_thread(find_board, picture, board_of(visit.notebook), name)
+        view = await asyncio.to_thread(find_board, picture, board, name)
     except CalibrationError as error:
         if "mirrored" in error.what:
             raise NotAccepted(f"{error.what}.", MIRRORED) from None
@@ -199,6 +200,18 @@ async def _board_in(visit: Visit, picture: Gray, name: str, *, lying: bool) -> B
             raise NotAccepted(f"{error.what}.", OTHER_PRINT) from None
         visit.say(f"The board is not seen: the picture {error.what}", picture=picture, tone="warning")
         return None
+    columns, rows = board.squares
+    if not lying:
+        visit.say(f"{len(view.ids)} of {(columns - 1) * (rows - 1)} corners of the board are seen", picture=picture)
+    return view
+
+
+def video_devices(folder: Path) -> dict[str, str]:
+    """Each video device in `/dev`: its number, and that with the link which tells two alike apart, by serial number or
+    else by socket."""
+    links = {link.resolve().name: link.name for by in ("path", "id") for link in sorted(folder.glob(f"v4l/by-{by}/*"))}
+    numbers = sorted((path.name[5:] for path in folder.glob("video*") if path.name[5:].isdecimal()), key=int)
+    return {number: f"{number} ({links.get(f'video{number}', 'unnamed')})" for number in numbers}
 
 
 def still_missing(views: Sequence[BoardView]) -> tuple[str, ...]:

@@ -112,7 +112,7 @@ class UnknownLab(LoopbackRig):
         return [
             "an unknown lab; simulated: nothing measured in it is a result on paper",
             f"robot     the pendant shows the address {self.host}",
-            *(f"camera    {stream}" for stream in self.streams),
+            *(f"camera {n}  {stream}" for n, stream in enumerate(self.streams, 1)),
             f"force     SRI M8123 on the gateway {self.can_bus}",
             f"ink       {ink}",
             f"print     ChArUco, {columns} x {rows} squares of {square_mm:g} mm, "

@@ -9,6 +9,7 @@ import threading
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, ClassVar
 from unittest.mock import Mock
 
@@ -17,7 +18,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from brushloop.collect.commission.camera import found_settings
+from brushloop.collect.commission.camera import found_settings, video_devices
 from brushloop.drivers import camera as camera_module
 from brushloop.drivers.camera import OpenCvCamera, is_late, looked_at
 from brushloop.drivers.camera.source import CameraTable, Capture, Locked
@@ -368,3 +369,11 @@ async def test_settings_are_locked_read_back_and_reported(monkeypatch: pytest.Mo
     assert await asyncio.to_thread(found_settings, 0, 0.0) == read_back, "it has no white balance"
     with pytest.raises(DeviceError, match="exposure = 156 was asked for, but 160 is read back"):
         await camera_at("0", locked=Locked(exposure=156.0)).connect()
+
+
+def test_two_cameras_of_one_kind_are_told_apart_by_serial_number_or_by_socket(tmp_path: Path) -> None:
+    for link, device in (("path/usb-1", "video0"), ("path/usb-2", "video2"), ("id/Camera_SN42", "video0")):
+        (tmp_path / device).touch()
+        (tmp_path / "v4l" / f"by-{link}").parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "v4l" / f"by-{link}").symlink_to(tmp_path / device)
+    assert video_devices(tmp_path) == {"0": "0 (Camera_SN42)", "2": "2 (usb-2)"}
