@@ -151,11 +151,7 @@ Rest = Callable[[float, int], Awaitable[Reading]]
 
 
 async def touch_by_force(
-    rest: Rest,
-    reach: Reach,
-    config: ForceTouchConfig,
-    spring: Spring | None = None,
-    near_z_mm: float | None = None,
+    rest: Rest, reach: Reach, config: ForceTouchConfig, spring: Spring | None = None, near_z_mm: float | None = None
 ) -> Contact:
     """Touch once; the brush is left down.
 
@@ -198,9 +194,15 @@ async def touch_by_force(
                 )
             return contact
         if samples > MOST_SAMPLES:
+            unsure = f"it moved by more than {BESIDE_MM:g} mm with the last descent"
+            if contact.sigma_mm > config.sigma_mm:
+                unsure = f"its standard error is {contact.sigma_mm:.3f} mm, more than {config.sigma_mm:g} mm"
+            if not sure:
+                error = contact.spring.sigma_n_mm / contact.spring.n_mm
+                unsure = f"the brush's stiffness is known only to within {error:.0%}, {SPRING_SHARE:.0%} is needed"
             raise StepError(
-                f"the contact is known to only {contact.sigma_mm:.3f} mm after {samples} samples of the force, "
-                f"{config.sigma_mm:g} mm are asked for: the sensor is too noisy for this brush"
+                f"the contact is not known well enough after {samples} samples of the force: {unsure}. The sensor is "
+                "too noisy for this brush: look for vibration and a loose cable, or choose another touch.method"
             )
         near_z_mm = contact.z_mm
 
