@@ -310,7 +310,7 @@ class _Person:
             return "a"
         if "well filled" in prompt.question:
             return {"station": "i", "pump": "p", "none": "n"}[self._lab.facts.config.ink_device]
-        return "enter" if prompt.default else "y" if "Agreed?" in prompt.question else "n"
+        return "enter" if prompt.default else "y" if prompt.question.endswith(("Agreed?", "0 kg?")) else "n"
 
 
 async def _day(lab: UnknownLab, loop: asyncio.AbstractEventLoop) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from brushloop.collect.commission.visit import Notebook, Step, Taught, Visit
+from brushloop.collect.errors import NotAccepted
 from brushloop.collect.operator import Prompt
 from brushloop.collect.rig.check import tool_length
 from brushloop.collect.rig.doctor import Finding, write_report
@@ -161,6 +162,9 @@ class ArmStep(Step):
                 tone="warning",
             )
         as_set, (payload_kg, *cog_mm) = "as set on the pendant", settings.payload
+        weightless = "Payload is 0 kg on the pendant, but a brush has weight: the guided arm drifts. Go on with 0 kg?"
+        if not payload_kg and not await visit.yes(weightless):
+            raise NotAccepted("the payload is 0 kg.", "Weigh holder, sensor and brush, and set it on the pendant.")
         values = {
             "robot.kind": Taught("aubo-arcs", f"{name} answered"),
             "robot.host": Taught(host, "typed, and answered"),

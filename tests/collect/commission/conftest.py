@@ -106,7 +106,7 @@ class InLab(Person):
             return KEYS[self.lab.facts.config.ink_device]
         if "The arm moves by itself" in question:
             return "a"
-        return default or ("y" if "Agreed?" in question else "n")
+        return default or ("y" if question.endswith(("Agreed?", "Go on with 0 kg?")) else "n")
 
     def _typed(self, question: str) -> str:
         if question.startswith("Address of the camera"):

@@ -39,6 +39,13 @@ from brushloop.drivers.sim.world import tool_of
 from tests.collect.commission.conftest import BACK, Answering, Person, in_lab
 
 
+async def test_a_payload_of_0_kg_ends_the_step_unless_it_is_confirmed(tmp_path: Path) -> None:
+    with in_lab(41) as person:
+        person.lab.arcs.cabinet.payload[0] = 0.0
+        with pytest.raises(NotAccepted, match="payload is 0 kg"):
+            await ArmStep().carry_out(Answering(person.lab.host, "n").visit(tmp_path / "rig.toml"))
+
+
 async def test_holds_that_were_not_upright_are_named_and_asked_for_again(tmp_path: Path) -> None:
     with in_lab(41, rate=30.0, picture_px=(800, 600)) as person:
         bring, hasty = person.bring, [6, 0, 0, 0]
