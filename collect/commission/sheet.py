@@ -66,7 +66,8 @@ class SheetStep(Step):
                 if kind == BOARD and number % 2:
                     continue  # the sheet's own corners give its origin, and need more touches
                 for corner in CORNERS:
-                    how = f"Bring the tip to the {corner} corner of {thing}" + (" once more." if number else ".")
+                    why = f" once more: the sheet's corner is not known to {GOOD_MM:g} mm yet." if number else "."
+                    how = f"Bring the tip to the {corner} corner of {thing}{why}"
                     await touch(visit, f"{kind} {number} {corner}", how, may_skip=True)
                 if kind == BOARD:
                     with visit.asked_again_if_refused(BOARD):

@@ -179,7 +179,10 @@ class TipStep(Step):
             "Touch its point with the tip of the dry brush, each time leaning to another side, and hold still.",
         )
         await self._pin(visit)
-        visit.say("Now the direction of the brush: hold it upright, a set square on the table beside it.")
+        visit.say(
+            "Now the direction of the brush: hold it upright, a set square on the table beside it.",
+            f"All {UPRIGHTS} holds are asked for; the goal for their mean is a standard error of {WORST_DEG:g} deg.",
+        )
         await self._uprights(visit)
 
     async def _pin(self, visit: Visit) -> None:
@@ -237,7 +240,7 @@ class TipStep(Step):
                     f"after {MOST_UPRIGHTS} holds the direction of the brush is not known to {WORST_DEG:g} deg.",
                     "Hold the brush along a set square, not by eye; or skip the holds: it is then not measured.",
                 )
-            how = f"Hold {index + 1} of {UPRIGHTS}: brush along the set square, wrist turned differently each time."
+            how = f"Hold {index + 1}: brush along the set square, wrist turned differently each time."
             if not await touch(visit, f"upright {index}", how, may_skip=True):
                 if measured_axis(visit.notebook) is None:
                     visit.say("The direction of the brush is not measured.", tone="warning")
@@ -264,8 +267,9 @@ class TipStep(Step):
             return False
         known = axis.holds >= UPRIGHTS and axis.sigma_deg <= WORST_DEG
         if len(holds) >= LEAST_UPRIGHTS:
-            error = f"{axis.sigma_deg:.2f} deg (goal: {WORST_DEG:g} deg)"
-            visit.say(f"{'✓' if known else '·'} standard error after {axis.holds} of {UPRIGHTS} holds: {error}")
+            to_come = max(UPRIGHTS - axis.holds, 0 if known else 1)
+            reached = f"{'✓' if known else '·'} standard error after {axis.holds} holds: {axis.sigma_deg:.2f} deg"
+            visit.say(f"{reached}; {to_come} more to come" if to_come else reached)
         return known
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
