@@ -50,9 +50,7 @@ def browse() -> None:
 def plan(
     config: Rig = RIG_FILE,
     protocol: Annotated[Path, typer.Option(help="The protocol to plan.")] = PROTOCOL_FILE,
-    picture: Annotated[
-        Path | None, typer.Option(help="Draw the sheets into this file: .png, .svg, .pdf or .jpg.")
-    ] = None,
+    picture: Annotated[Path | None, typer.Option(help="Draw the sheets: a .png, .svg, .pdf or .jpg.")] = None,
     arm: Annotated[
         bool, typer.Option("--arm", help="Plan for a run with --arm, which includes the self-check; moves nothing.")
     ] = False,

@@ -97,6 +97,7 @@ async def zero_touch(context: StepContext, step: ZeroTouchStep) -> ZeroTouchResu
         run.light = await rig.ink.light()
     if rig.force is not None and rig.config.force is not None:
         await rig.force.bias(rig.config.force.bias_s)
+        run.progress.zeroed(rig.config.force.max_n)
     if step.method is not None:
         await within_limits("", rig.config, step_poses(rig.config, run.procedures.plane, step))
     touch = touch_of(rig.config, step)

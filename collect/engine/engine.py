@@ -120,7 +120,6 @@ class Engine:
             target_mm=None if rig is None else self._run.procedures.target_mm,
             parked=self._parked(),
             rest_unknown=self._rest_unknown,
-            force_ceiling_n=None if self._rig_config.force is None else self._rig_config.force.max_n,
             requests=self._run.control.requests,
             no_pose_s=no_pose_s,
         )

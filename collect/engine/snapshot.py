@@ -148,7 +148,7 @@ class Snapshot:
     force_n: float | None = None
     """Force less the sensor's bias; None without a sensor or a fresh sample."""
     force_ceiling_n: float | None = None
-    """Force above which the arm is stopped while the brush is down; None without a sensor."""
+    """Force above which the arm is stopped while the brush is down; None without a sensor, and until it is zeroed."""
     ink_level: float | None = None
     """Level of the well before the last dip, 0 to 1; None if nothing measures it."""
     prompt: Prompt | None = None
@@ -266,6 +266,10 @@ class Progress:
                 self._peaks_n.append(force_n)
             elif self._peaks_n:
                 self._peaks_n[-1] = max(self._peaks_n[-1], force_n)
+
+    def zeroed(self, ceiling_n: float) -> None:
+        """Note that the force sensor is zeroed, and the force above which the arm is stopped."""
+        self._change(force_ceiling_n=ceiling_n)
 
     def over(self, error: str = "") -> None:
         """Note that the run is over, and why if it ended early."""

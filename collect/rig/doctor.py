@@ -133,7 +133,7 @@ async def _force(config: ForceTable, clock: Clock) -> Finding:
         rate_hz = 1e9 * (newest.stamp.seq - first.seq) / max(newest.stamp.host_ns - first.host_ns, 1)
         finding.latency_ms = (clock.now_ns() - newest.stamp.host_ns) / 1e6
         force_n, dropped = math.hypot(*newest.force_n), sensor.assembler
-        finding.notes = f"{rate_hz:.0f} rounds/s, {force_n:.3f} N at rest, which is taken off"
+        finding.notes = f"{rate_hz:.0f} rounds/s, {force_n:.3f} N at rest, not zeroed yet"
         if dropped.torn or dropped.refused or sensor.bus_errors:
             finding.problem = f"{dropped.torn} torn, {dropped.refused} refused rounds, {sensor.bus_errors} bus errors"
             finding.remedy = "Check wiring, shielding and termination."

@@ -334,8 +334,8 @@ def _live_rows(now: Snapshot) -> list[tuple[str, Content | str]]:
         to_go = "" if now.tip_mm is None else f"   {math.dist(now.target_mm, now.tip_mm):.2f} mm to go"
         target = _place_text(now.target_mm) + to_go
     if now.force_n is not None:
-        ceiling = "" if now.force_ceiling_n is None else f" (stops at {now.force_ceiling_n:g} N)"
-        force = f"{now.force_n:6.3f} N{ceiling}   trace up to {scale_n(now.trace_n):.2g} N"
+        ceiling = "not zeroed yet" if now.force_ceiling_n is None else f"stops at {now.force_ceiling_n:g} N"
+        force = f"{now.force_n:6.3f} N ({ceiling})   trace up to {scale_n(now.trace_n):.2g} N"
     return [("Tip", tip), ("Target", target), ("Force", force)]
 
 

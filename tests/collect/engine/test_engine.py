@@ -38,7 +38,7 @@ def test_a_whole_session_is_collected_as_the_protocol_says_and_merged(lab: Lab) 
     lab.edit_rig("", "\n[self_check]\nenabled = false\n")
     now = lab.run(armed=True).snapshot()
     recording = Recording(lab.session)
-    assert (now.state, now.strokes_done, now.strokes_planned) == (State.DONE, 4, 4)
+    assert (now.state, now.strokes_done, now.strokes_planned, now.force_ceiling_n) == (State.DONE, 4, 4, 5.0)
     assert now.source == recording.header.source == "loopback rig"
     captures = sorted(recording.captures(), key=lambda capture: capture.stroke.still)
     assert all(capture.image().shape == (384, 512) for capture in captures)
@@ -60,8 +60,7 @@ def test_a_whole_session_is_collected_as_the_protocol_says_and_merged(lab: Lab) 
     assert min(seen[topic] for topic in (Topic.TCP, Topic.JOINTS, Topic.WRENCH)) > 10
     assert seen[Topic.INK] == 4
     peaks_n = [press.peak_force_n or 0.0 for press in lab.state.results(PressResult)]
-    assert len(peaks_n) == 4
-    assert all(0.02 < peak_n < 0.5 for peak_n in peaks_n)
+    assert [0.02 < peak_n < 0.5 for peak_n in peaks_n] == [True] * 4
 
 
 def test_stop_in_mid_press_voids_the_patch_and_the_same_command_goes_on(lab: Lab) -> None:
@@ -349,8 +348,7 @@ def test_what_a_second_client_did_in_a_pause_is_asked_about_before_anything_move
         assert not sent
         engine.answer(prompt.number, "g")
     wait_for_end(engine)
-    assert engine.snapshot().strokes_done == 4
-    assert lab.rig.arcs.cabinet.tcp_offset[2] == 0.18
+    assert (engine.snapshot().strokes_done, lab.rig.arcs.cabinet.tcp_offset[2]) == (4, 0.18)
     assert max(press.depth_mm for press in lab.rig.world.presses) < 11.1, "none went deeper than asked"
 
 

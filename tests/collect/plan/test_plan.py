@@ -251,8 +251,7 @@ async def test_the_controller_is_asked_for_every_pose_and_nothing_is_powered_set
     assert count > 40
     names = {name.split(".")[-1] for name in asked}
     assert names == {"getRobotNames", "getTcpOffset", "getJointPositions", "inverseKinematics"}
-    assert cabinet.cabinet.power.mode == RobotMode.POWER_OFF
-    assert cabinet.cabinet.tcp_offset[0] == 0.01
+    assert (cabinet.cabinet.power.mode, cabinet.cabinet.tcp_offset[0]) == (RobotMode.POWER_OFF, 0.01)
 
 
 async def test_the_first_pose_out_of_reach_of_our_tool_is_named_whatever_is_set_on_the_controller(

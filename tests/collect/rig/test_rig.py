@@ -231,8 +231,7 @@ def test_a_rig_in_order_is_reported_with_all_that_was_answered_and_left_as_it_wa
     assert answered["rob1.RobotState.getSafetyModeType"] == {"result": "Normal"}
     assert answered["rob1.MotionControl.getSpeedFraction"]["result"] == 1.0
     assert all(line["took_ms"] > 0.0 for line in lines)
-    assert wired_lab.rig.arcs.cabinet.power.mode == "PowerOff"
-    assert wired_lab.rig.world.motion._next_id == 0
+    assert (wired_lab.rig.arcs.cabinet.power.mode, wired_lab.rig.world.motion._next_id) == ("PowerOff", 0)
     before = report.read_bytes()
     assert "is not overwritten" in refused(*command)
     assert report.read_bytes() == before

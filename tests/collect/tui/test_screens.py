@@ -112,6 +112,11 @@ async def test_q_asks_while_the_run_is_on_and_parks_before_it_leaves(now: Snapsh
     assert run.app.return_code == 0
 
 
+async def test_a_force_is_not_called_zeroed_before_it_is() -> None:
+    async with watched(full_picture(force_ceiling_n=None)) as run:
+        assert "0.041 N (not zeroed yet)" in await run.look()
+
+
 async def test_while_the_arm_is_being_stopped_q_asks_nothing_and_the_red_button_is_named() -> None:
     async with watched(picture(state=State.STOPPING)) as run:
         assert "not seen at rest yet: press the red button" in await run.look()
