@@ -157,7 +157,7 @@ def sim(
         float, typer.Option(min=0, help="Seconds without clients after which to end; 0: never.")
     ] = 0.0,
     brush: Annotated[
-        Path, typer.Option(help="A shipped brush, `loopback` or `paper`, or one described in a brush.toml.")
+        Path, typer.Option(help="A shipped brush, `loopback` or `table2`, or one described in a brush.toml.")
     ] = Path("loopback"),
     control: Annotated[
         Path | None, typer.Option(help="Make a control socket here, for `sim fault` and `sim hand`.")

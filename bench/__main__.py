@@ -37,7 +37,7 @@ ACCURACY = {
     "fit": ("accuracy.fit", 600),
     "few": ("accuracy.few", 900),
     "intervals": ("accuracy.intervals", 600),
-    "paper-brush": ("accuracy.paper_brush", 120),
+    "table2-brush": ("accuracy.table2_brush", 120),
     "drags": ("accuracy.drags", 900),
     "loop": ("accuracy.loop", 600),
     "written": ("accuracy.written", 5400),

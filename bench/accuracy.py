@@ -41,7 +41,7 @@ from brushloop.calibrate.loop import LoopRecord
 from brushloop.calibrate.presses import read_for_fit
 from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.writing.compare import HEADLINE, REFERENCE, SIMULATED, WrittenRecord
-from brushloop.drivers.sim.brush.spec import PAPER, load_brush
+from brushloop.drivers.sim.brush.spec import LIKE_TABLE_2, load_brush
 from brushloop.model.fitted import FittedPress, Prior, learned
 from brushloop.model.generator import SHIPPED_GENERATOR
 from brushloop.model.presses import Presses, image_of
@@ -63,7 +63,7 @@ DRAG_TEST, DRAG_SIZES, ADAPTED = 40, (20, 147), 10
 DRAG_GOALS = {20: (0.845, 0.735), 147: (0.86, 0.76)}
 SESSION_GOAL = (0.845, 0.725)
 WITHIN_POINTS = {"max": 4.0, "min": 4.0, "avg": 2.0}
-"""Points by which an extreme and an average of the paper's brush may differ from Table 2."""
+"""Points by which an extreme and an average of the Table-2 brush may differ from Table 2."""
 
 
 def fit(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
@@ -179,17 +179,17 @@ def loop(*, n: int | None = None, seed: int = 1) -> Sequence[Result]:
 
 
 def written(*, n: int | None = None, seed: int = 1) -> Sequence[Result]:
-    """Table 3: 字 子 永 written ten times by the paper's and the frozen brushes (`n`, six), some 15 minutes each.
+    """Table 3: 字 子 永 written ten times by the Table-2 and the frozen brushes (`n`, six), some 15 minutes each.
 
     Each after practice and three rounds of learning. value = average CSIM (mm, binary, ink = 1); ratio = 100 less the
     CSIM of the round before anything was learned, over 100 less the value.
     """
     results: list[Result] = []
-    brushes = [PAPER, *NAMED]
+    brushes = [LIKE_TABLE_2, *NAMED]
     for name in brushes[: rounds_of(n, len(brushes))]:
         with tempfile.TemporaryDirectory() as scratch:
             folder, out = Path(scratch), Path(scratch) / "written"
-            brush = PAPER if name == PAPER else brush_toml(folder / "brush.toml", NAMED[name], name)
+            brush = LIKE_TABLE_2 if name == LIKE_TABLE_2 else brush_toml(folder / "brush.toml", NAMED[name], name)
             with simulated_rig(folder, brush, RATE, seed) as rig:
                 words = ("--out", out, "--sessions", folder / "sessions", "--repeats", str(WRITINGS))
                 rig.run("write", CHARACTERS, *words, "--practice", "--learn", str(ROUNDS))
@@ -310,7 +310,7 @@ def _drag_results(
         yield Result(f"{name}.{measure}", value, "of 1", f"goal {goal:g}", value / goal, len(found), seed, where)
 
 
-def paper_brush(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
+def table2_brush(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     """The paper's Table 2 beside the same table of the simulated brush whose constants were searched so that it agrees.
 
     Agreement is no evidence for the model. The rows of ccd-bsmg were not part of the search. `n` presses of each
@@ -319,7 +319,7 @@ def paper_brush(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     """
     repeats = rounds_of(n, 10)
     with tempfile.TemporaryDirectory() as scratch:
-        session = press_session(Path(scratch) / "paper", load_brush(Path(PAPER)).brush, repeats * CELLS, seed)
+        session = press_session(Path(scratch) / "table2", load_brush(Path(LIKE_TABLE_2)).brush, repeats * CELLS, seed)
         brushloop("validate", session, "--no-held-out", "--generator", SHIPPED_GENERATOR)
         rows = _table(session / "validation" / "summary.csv")
     shown = [
@@ -333,7 +333,7 @@ def paper_brush(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
         ratio = min(allowed / max(abs(off[which]), 0.01) for which, allowed in WITHIN_POINTS.items())
         peer = f"goal {' / '.join(f'{points:g}' for points in WITHIN_POINTS.values())} points off the paper"
         where = ", ".join(f"{which} {paper:.2f} {off[which]:+.2f}" for which, paper in printed.items())
-        name, value = f"paper-brush.{model}.{measure}", printed["avg"] + off["avg"]
+        name, value = f"table2-brush.{model}.{measure}", printed["avg"] + off["avg"]
         results.append(Result(name, value, "%", peer, ratio, repeats * len(CELLS), seed, f"{where}; {machine()}"))
     return results
 

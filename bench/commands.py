@@ -97,7 +97,7 @@ def report(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     strokes = rounds_of(n, COLLECTED)
     with tempfile.TemporaryDirectory() as folder:
         repeats = max(1, round(strokes / len(DESIGN)))
-        with simulated_rig(Path(folder), "paper", RATE, seed + 1) as rig:
+        with simulated_rig(Path(folder), "table2", RATE, seed + 1) as rig:
             session = collect_grid(Path(folder), rig, DEPTHS_MM, TILTS_DEG, repeats, seed)
         used = measure(*BRUSHLOOP, "analyse", session)
     where = f"loopback rig, {strokes} presses; {machine()}"

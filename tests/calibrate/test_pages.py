@@ -24,7 +24,7 @@ from tests.photographed import imported_presses
 TWIN = "simulated bristle bundle (twin of 2026-03-02-grid-01)"
 WIDTHS_PX = (390, 800, 1200, 1600)
 MAX_BYTES = 3 * 1024 * 1024
-MADE = "simulated bristle bundle, paper (made to agree with the paper's Table 2: no evidence for the model)"
+MADE = "simulated Table-2 brush (made to agree with the paper's Table 2: no evidence for the model)"
 
 
 def run(*arguments: object) -> str:

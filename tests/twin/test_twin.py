@@ -23,7 +23,7 @@ from brushloop.calibrate.scores import Stat
 from brushloop.calibrate.stats import Summary
 from brushloop.collect.rig.config import QualityConfig
 from brushloop.drivers.sim.brush.brush import Brush
-from brushloop.drivers.sim.brush.spec import ALLOWED, PAPER, BrushSpec, CameraNoise, SoundHead, load_brush
+from brushloop.drivers.sim.brush.spec import ALLOWED, LIKE_TABLE_2, BrushSpec, CameraNoise, SoundHead, load_brush
 from brushloop.model.presses import Grid, Presses
 from brushloop.twin.brush import HERE, SHAPE, SPREAD, Constant, draw, with_values
 from brushloop.twin.run import (
@@ -82,7 +82,7 @@ def test_a_mark_has_the_area_and_the_place_of_the_press_that_it_stands_for() -> 
 
 def test_the_quality_limits_hold_for_other_presses_of_the_brush() -> None:
     grid, conditions = field_grid(), [(11.0, 0.0), (20.0, 10.0)]
-    brush = Brush(load_brush(Path(PAPER)).brush)
+    brush = Brush(load_brush(Path(LIKE_TABLE_2)).brush)
     head = sound_head(brush.spec, conditions, grid)
     assert head is not None
     for depth_mm, tilt_deg in conditions:

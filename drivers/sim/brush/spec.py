@@ -102,10 +102,10 @@ def complaint(error: ValidationError) -> str:
 MAX_BYTES = 256 * 1024
 LOOPBACK = "loopback"
 """Name of the brush whose constants are the defaults of `BrushSpec`."""
-PAPER = "paper"
-"""Name under which the brush of `PAPER_FILE` is chosen."""
-PAPER_FILE = Path(__file__).with_name("paper_brush.toml")
-"""The brush made to agree with the paper's Table 2 (`python -m bench paper-brush`)."""
+LIKE_TABLE_2 = "table2"
+"""Name under which the brush of `TABLE_2_FILE` is chosen."""
+TABLE_2_FILE = Path(__file__).with_name("table2_brush.toml")
+"""The brush made to agree with the paper's Table 2 (`python -m bench table2-brush`)."""
 
 
 class CameraNoise(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
@@ -136,13 +136,13 @@ class BrushFile(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
 
 
 def load_brush(path: Path, seed: int = BrushSpec().seed) -> BrushFile:
-    """Read the file, or take one of the shipped brushes if `path` is just `paper` or `loopback`.
+    """Read the file, or take one of the shipped brushes if `path` is just `table2` or `loopback`.
 
     `seed` is that of the individual for `loopback`; any other brush has its own. Raises `RigRefused`, or OSError.
     """
     if str(path) == LOOPBACK:
         return BrushFile(name=f"simulated bristle bundle, seed {seed}", brush=BrushSpec(seed=seed))
-    path = PAPER_FILE if str(path) == PAPER else path
+    path = TABLE_2_FILE if str(path) == LIKE_TABLE_2 else path
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
@@ -150,7 +150,7 @@ def load_brush(path: Path, seed: int = BrushSpec().seed) -> BrushFile:
             raise RigRefused(f"{path}: is larger than {MAX_BYTES} bytes")
         return BrushFile.model_validate(tomllib.loads(data.decode("utf-8")))
     except FileNotFoundError:
-        shipped = f"{LOOPBACK} and {PAPER} are shipped, any other is a brush.toml"
+        shipped = f"{LOOPBACK} and {LIKE_TABLE_2} are shipped, any other is a brush.toml"
         raise RigRefused(f"{path}: no such file: {shipped}") from None
     except ValidationError as error:
         raise RigRefused(f"{path}: {complaint(error)}") from None

@@ -23,7 +23,7 @@ from brushloop.drivers.geometry import brush_pose, distance, from_wire
 from brushloop.drivers.loopback import RigRefused
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Flaw, Waypoint
 from brushloop.drivers.sim.brush.footprint import PX_PER_MM, Footprint
-from brushloop.drivers.sim.brush.spec import PAPER, load_brush
+from brushloop.drivers.sim.brush.spec import LIKE_TABLE_2, load_brush
 from brushloop.drivers.sim.config import SimConfig, Table
 from brushloop.drivers.sim.kinematics import HOME, LIMITS_DEG, forward, inverse, pose_of
 from brushloop.drivers.sim.motion import MotionQueue
@@ -46,7 +46,7 @@ def test_the_frozen_brushes_and_the_papers_press_and_draw_what_they_always_did()
     # the bytes agreed too; another processor may round the last bit differently
     ink: list[list[float]] = []
     force_n: list[float] = []
-    brushes, flaws = (*FROZEN, load_brush(Path(PAPER)).brush), (*Flaw, Flaw.SPLIT, Flaw.SPLIT)
+    brushes, flaws = (*FROZEN, load_brush(Path(LIKE_TABLE_2)).brush), (*Flaw, Flaw.SPLIT, Flaw.SPLIT)
     for spec, flaw in zip(brushes, flaws, strict=True):
         brush = Brush(spec)
         press = brush.press(12.0, 5.0, ink_load=0.8, press_seed=3)
