@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
 
 from brushloop.__main__ import app
-from brushloop.calibrate.commands import (
-    PROTOCOL,
-    CompareWrittenRequest,
-    FitFootprintRequest,
-    LearnRequest,
-    PlanRequest,
-    PracticeRequest,
-    ValidateRequest,
-)
+from brushloop.calibrate.commands import PROTOCOL, ValidateRequest
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written
 from brushloop.calibrate.validate import command
@@ -224,42 +218,29 @@ POINTS = "points = [[10.0, 24.0, 3.0, 0.0, 0.0], [20.0, 24.0, 3.0, 0.0, 0.0]]\n"
 
 
 class Commands:
-    """Stands in for brushloop's commands: writes what each would leave."""
+    """Stands in for brushloop's commands: notes each, and writes what it would leave."""
 
     def __init__(self, settled_after: int, monkeypatch: pytest.MonkeyPatch) -> None:
         self.ran: list[str] = []
-        self._rounds, self._settled_after = 0, settled_after
+        self._settled_after = settled_after
         for name in ("plan", "compare.compare", "learn.learn", "learn.practice", "learn.fit"):
-            command = getattr(self, name.split(".")[-1])
+            command = functools.partial(self._run, name.split(".")[-1])
             monkeypatch.setattr(f"brushloop.calibrate.writing.{name}", command)
 
-    def plan(self, request: PlanRequest, _: object) -> Written:
-        return self._planned("plan", request.out, request.repeats)
-
-    def practice(self, request: PracticeRequest, _: object) -> Written:
-        return self._planned("practice", request.out, 1)
-
-    def learn(self, request: LearnRequest, _: object) -> Written:
-        self._rounds += 1
-        settled = self._rounds >= self._settled_after
-        return self._planned("learn", request.out, (request.settled_repeats if settled else None) or request.repeats)
-
-    def fit(self, request: FitFootprintRequest, _: object) -> Written:
-        self.ran.append("fit")
-        return Written(request.session / FOOTPRINT / "0123456789abcdef.json", ())
-
-    def compare(self, request: CompareWrittenRequest, _: object) -> Written:
-        self.ran.append("compare")
-        return Written(request.out / "written.html", ())
-
-    def _planned(self, name: str, folder: Path, repeats: int) -> Written:
+    def _run(self, name: str, request: Any, _: object) -> Written:
         self.ran.append(name)
-        folder.mkdir(parents=True)
-        (folder / PROTOCOL).write_text(CELL.format(repeats=repeats) + POINTS, encoding="utf-8")
-        figure = Figure(name="子", source="", settled=self._rounds >= self._settled_after)
+        if name == "fit":
+            return Written(request.session / FOOTPRINT / "0123456789abcdef.json", ())
+        if name == "compare":
+            return Written(request.out / "written.html", ())
+        settled = self.ran.count("learn") >= self._settled_after
+        repeats = 1 if name == "practice" else request.settled_repeats if settled else request.repeats
+        request.out.mkdir(parents=True)
+        (request.out / PROTOCOL).write_text(CELL.format(repeats=repeats) + POINTS, encoding="utf-8")
+        figure = Figure(name="子", source="", settled=settled)
         plan = Plan(model="", planned_by=PlannedBy(), cell_mm=48.0, software="", figures=(figure,))
-        (folder / PLAN).write_text(plan.model_dump_json(), encoding="utf-8")
-        return Written(folder / PROTOCOL, ())
+        (request.out / PLAN).write_text(plan.model_dump_json(), encoding="utf-8")
+        return Written(request.out / PROTOCOL, ())
 
 
 @pytest.mark.parametrize(("settled_after", "rounds"), [(1, 1), (9, 3)])
