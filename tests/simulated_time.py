@@ -121,3 +121,8 @@ class MemoryServer:
 
     async def wait_closed(self) -> None:
         pass
+
+
+def pytest_asyncio_loop_factories() -> dict[str, Callable[[], asyncio.AbstractEventLoop]]:
+    """The hook of a `conftest.py` in whose folder time is simulated."""
+    return {"simulated": MemoryLoop}

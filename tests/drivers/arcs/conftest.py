@@ -20,17 +20,14 @@ from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 from brushloop.drivers.sim.rig import HOST
 from brushloop.drivers.sim.world import SimClock, World
-from tests.simulated_time import LoopClock, MemoryLoop
+from tests.simulated_time import LoopClock
+from tests.simulated_time import pytest_asyncio_loop_factories as pytest_asyncio_loop_factories
 
 RATE = 20.0
 LIMITS = Limits(x_mm=(-2000.0, 2000.0), y_mm=(-260.0, 260.0), z_mm=(95.0, 400.0))
 MakeArm = Callable[..., AuboArcs]
 NEAR = brush_pose(260.0, -220.0, 250.0)
 QUICK = {"speed_mm_s": 200.0, "acc_mm_s2": 800.0}
-
-
-def pytest_asyncio_loop_factories() -> dict[str, Callable[[], asyncio.AbstractEventLoop]]:
-    return {"simulated": MemoryLoop}
 
 
 Ends = pytest.RaisesExc[Exception]

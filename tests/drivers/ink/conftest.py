@@ -12,13 +12,9 @@ import pytest
 from brushloop.drivers.ink import port, pump
 from brushloop.drivers.ink.simulator import GARBAGE
 from tests.rigs import MemoryLine
-from tests.simulated_time import MemoryLoop
+from tests.simulated_time import pytest_asyncio_loop_factories as pytest_asyncio_loop_factories
 
 PORT = "/dev/ttyUSB0"
-
-
-def pytest_asyncio_loop_factories() -> dict[str, Callable[[], asyncio.AbstractEventLoop]]:
-    return {"simulated": MemoryLoop}
 
 
 def loop() -> Any:
