@@ -29,7 +29,7 @@ from brushloop.collect.operator import Choice, OperatorRequest, Prompt
 from brushloop.collect.photograph.checks import Verdict
 from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.commission_app import CommissionApp
-from brushloop.collect.tui.review_screen import Review, ReviewCapture, ReviewScreen
+from brushloop.collect.tui.review_screen import Review, ReviewCapture
 from brushloop.collect.tui.start_screen import SessionBrowser
 from brushloop.drivers.host import Clock
 from brushloop.model.fitted import FittedPress
@@ -275,15 +275,6 @@ def app_of(engine: Any = None, browser: FakeBrowser | None = None) -> OperatorAp
     return OperatorApp(pytest.fail, engine, browser=browser)
 
 
-def a_review(folder: Path, app: OperatorApp) -> ReviewScreen:
-    return ReviewScreen(FakeReview(folder), lambda: app.at_work)
-
-
-def has_picture(text: str) -> bool:
-    """Whether a picture is among it: braille with dots."""
-    return any("\u2801" <= sign <= "\u28ff" for sign in text)
-
-
 def shown(app: App[None]) -> str:
     """The lines of the screen, without blanks at their ends; fewer of them while a new screen has no layout yet.
 
@@ -339,14 +330,10 @@ async def watched(now: Snapshot, size: tuple[int, int] = (80, 24)) -> AsyncGener
 # A first day
 
 
-def board() -> np.ndarray:
-    squares = cv2.aruco.CharucoBoard((7, 5), 20.0, 15.0, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100))
-    return squares.generateImage((560, 400), marginSize=20)
-
-
 async def brings(visit: Visit) -> bool:
     """Ask for the tip at a pin, with a picture of the board."""
-    visit.say("the board as the camera sees it", picture=board())
+    board = cv2.aruco.CharucoBoard((7, 5), 20.0, 15.0, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100))
+    visit.say("the board as the camera sees it", picture=board.generateImage((560, 400), marginSize=20))
     how = "Guide the tip to the pin by hand, the brush leaning toward the window, then press Enter."
     return await visit.brought("pin 2", how, may_skip=True)
 

@@ -10,6 +10,7 @@ from textual.pilot import Pilot
 
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.snapshot import Snapshot
+from brushloop.collect.tui.review_screen import ReviewScreen
 from tests.collect.tui.fake import (
     FAILED,
     SPLIT,
@@ -17,7 +18,7 @@ from tests.collect.tui.fake import (
     Asking,
     FakeBrowser,
     FakeEngine,
-    a_review,
+    FakeReview,
     app_of,
     brings,
     capture,
@@ -76,7 +77,7 @@ def test_review(snap_compare: Callable[..., bool], monkeypatch: pytest.MonkeyPat
 
     async def review(pilot: Pilot[None]) -> None:
         await settled(pilot)
-        app.push_screen(a_review(Path(), app))
+        app.push_screen(ReviewScreen(FakeReview(Path()), lambda: app.at_work))
         await settled(pilot)
         await pilot.pause(0.2)
 
