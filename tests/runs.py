@@ -105,9 +105,13 @@ def ended_by(engine: SteppedEngine, error: type[_E], says: str | None = None) ->
     return caught.value
 
 
-def question(engine: SteppedEngine, words: str = "") -> Prompt:
-    """The next open question that holds these words."""
-    prompt = until(engine, lambda now: now.prompt is not None and words in now.prompt.question).prompt
+def question(engine: SteppedEngine, words: str = "", after: int = 0) -> Prompt:
+    """The next open question that holds these words, and comes after the one of that number."""
+
+    def is_asked(prompt: Prompt | None) -> bool:
+        return prompt is not None and prompt.number > after and words in prompt.question
+
+    prompt = until(engine, lambda now: is_asked(now.prompt)).prompt
     assert prompt is not None
     return prompt
 

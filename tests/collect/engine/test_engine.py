@@ -195,9 +195,7 @@ def test_a_safety_stop_holds_the_session_until_a_person_has_released_it(lab: Lab
     assert engine.snapshot().state is State.ASKING
     where = lab.rig.world.tool()
     assert engine.answer(first.number, "g")
-    again = until(engine, lambda now: now.prompt is not None and now.prompt.number != first.number).prompt
-    assert again is not None
-    assert mode in again.question
+    again = question(engine, mode, after=first.number)
     assert lab.rig.world.tool() == where
     assert power.safety == mode, "nothing is ever cleared automatically"
 
@@ -309,12 +307,10 @@ def test_an_arm_that_was_moved_at_a_question_first_goes_up_along_its_tool(lab: L
     second_client(lab, engine, UNDER)
     sent = lines_sent(lab)
     engine.answer(jog.number, "3")
-    moved = until(engine, lambda now: now.prompt is not None and now.prompt.number != jog.number).prompt
-    assert moved is not None
-    assert "from where it was left" in moved.question
+    moved = question(engine, "from where it was left", after=jog.number)
     assert not sent, "nothing moves before a person has looked"
     engine.answer(moved.number, "g")
-    until(engine, lambda now: now.prompt is not None and now.prompt.number not in (jog.number, moved.number))
+    question(engine, after=moved.number)
     assert_up_along_the_tool_first(sent)
     engine.stop()
     ended_by(engine, CollectAborted)
