@@ -8,13 +8,13 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock, PropertyMock
 
 import pytest
 
 from brushloop.collect import start
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.engine import Engine
-from brushloop.collect.engine.snapshot import Snapshot
 from brushloop.collect.errors import CollectAborted, ConfigError
 from brushloop.collect.rig.devices import sole_driver
 from brushloop.collect.start import ending
@@ -178,16 +178,8 @@ def test_without_a_screen_it_is_one_line_when_it_begins_and_one_when_it_ends(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shots = [picture(messages=(), no_pose_s=s) for s in (None, None, 1.04, 1.1, 2.0, None)]
-
-    class Scripted:
-        @property
-        def finished(self) -> bool:
-            return len(shots) == 1
-
-        def snapshot(self) -> Snapshot:
-            return shots.pop(0)
-
-    scripted: Any = Scripted()
+    scripted = Mock(snapshot=lambda: shots.pop(0))
+    type(scripted).finished = PropertyMock(side_effect=lambda: len(shots) == 1)
     monkeypatch.setattr(start, "REFRESH_S", 0.0)
     start.show_progress(scripted)
     printed = [line for line in capsys.readouterr().err.splitlines() if "pose" in line]
