@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import AsyncIterator, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -53,9 +53,8 @@ RIG = rig_toml(SimConfig())
 PUMP = rig_toml(SimConfig(ink_device="pump"))
 
 
-def rig(folder: Path, old: str = "", new: str = "", text: str = RIG) -> RigConfig:
-    assert old in text
-    (folder / "rig.toml").write_text(text.replace(old, new) if old else text)
+def rig(folder: Path, text: str = RIG) -> RigConfig:
+    (folder / "rig.toml").write_text(text)
     return load_rig(folder / "rig.toml")
 
 
@@ -132,7 +131,7 @@ def test_what_cannot_be_done_is_named_before_anything_is_connected(
     for old, new in changes:
         assert old in changed
         changed = changed.replace(old, new)
-    config = rig(tmp_path, text=changed)
+    config = rig(tmp_path, changed)
     with pytest.raises(ConfigError, match=message):
         check_protocol(tmp_path / "rig.toml", tmp_path / "protocol.toml", config, protocol(tmp_path, text))
 
@@ -172,12 +171,12 @@ def test_a_path_has_one_ramp_and_the_ink_of_a_plan_is_what_a_pump_doses(tmp_path
     start, *poses = (brush_pose(x_mm, 0.0, 200.0) for x_mm in (300.0, 310.0, 320.0))
     assert path_s(start, MotionPath(poses, 20.0), 800.0, limits_of(rig(tmp_path))) == pytest.approx(1.025)
     wanted = protocol(tmp_path, 'kind = "grid"\ndepths_mm = [11.0]\ntilts_deg = [0.0]\nrepeats = 12\n')
-    assert make_plan(rig(tmp_path, text=PUMP), wanted).ink_ml == pytest.approx(2 * 0.3)
+    assert make_plan(rig(tmp_path, PUMP), wanted).ink_ml == pytest.approx(2 * 0.3)
     assert make_plan(rig(tmp_path), wanted).ink_ml is None
 
 
 def test_a_self_check_takes_a_patch_before_the_first_stroke(tmp_path: Path) -> None:
-    config = rig(tmp_path, "[motion]", "[self_check]\nenabled = true\n\n[motion]")
+    config = rig(tmp_path, f"{RIG}\n[self_check]\nenabled = true\n")
     check_protocol(tmp_path / "rig.toml", EXAMPLES / "protocol.toml", config, example("protocol.toml"))
     plan = make_plan(config, example("protocol.toml"))
     first = [str(walked.step.kind) for walked in walk(config, example("protocol.toml"))][:4]
@@ -185,8 +184,7 @@ def test_a_self_check_takes_a_patch_before_the_first_stroke(tmp_path: Path) -> N
     assert (len(plan.placed), plan.placed[0].patch, plan.placed[41].sheet, plan.dips) == (150, 1, 1, 153)
     used = {placed.patch for placed in plan.placed if placed.sheet == 0}
     assert used == set(range(42)) - {0, 5, 36}, "the self-check lies over three corners"
-    small = rig(tmp_path, "[motion]", "[self_check]\nenabled = true\n\n[motion]")
-    small = small.model_copy(update={"paper": small.paper.model_copy(update={"cell_mm": (20.0, 24.0)})})
+    small = config.model_copy(update={"paper": config.paper.model_copy(update={"cell_mm": (20.0, 24.0)})})
     with pytest.raises(ConfigError, match=r"rig.toml: paper.cell_mm: a triangle of 24 by 15 mm does not fit"):
         check_protocol(tmp_path / "rig.toml", EXAMPLES / "protocol.toml", small, example("protocol.toml"))
 
@@ -367,56 +365,36 @@ KINDS = {
 """The other kinds press as a grid does."""
 
 
-@dataclass
-class Made:
-    """A step that was done, and the targets that reached the arm's queue meanwhile."""
-
-    step: Step
-    context: StepContext
-    plane: PaperPlane
-    dips: int
-    sent: list[Pose] = field(default_factory=list)
-
-
-def noted_steps(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> list[Made]:
-    """Every step from here on."""
-    steps, sent = list[Made](), list[Pose]()
-    do = Run._do
-
-    async def noted(self: Run, step: Step, context: StepContext) -> StepResult:
-        procedures, before = context.run.procedures, len(sent)
-        steps.append(one := Made(step, context, procedures.plane, procedures._dips))
-        try:
-            return await do(self, step, context)
-        finally:
-            one.sent = sent[before:]
-
-    monkeypatch.setattr(Run, "_do", noted)
-    noting(lab.rig.world.motion, sent.append)
-    return steps
-
-
 def rounded(poses: Iterable[tuple[Pose, ...]]) -> set[tuple[float, ...]]:
     return {tuple(round(v, 6) for v in (*pose.position_mm, *pose.quaternion)) for pose, *_ in poses}
 
 
 @pytest.mark.parametrize("text", KINDS.values(), ids=KINDS)
 def test_what_a_run_sends_the_plan_has_checked(lab: Lab, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
-    rig_path, path, made = lab.folder / "rig.toml", lab.folder / "protocol.toml", noted_steps(lab, monkeypatch)
     lab.edit_rig("", WIPE + WASH)
-    wanted, config = protocol(lab.folder, text), load_rig(rig_path)
-    check_protocol(rig_path, path, config, wanted)
-    answered_alike(lab.engine(on_screen=True), "t")  # whoever jogs says at once that the tip touches
-    last = [one for one in made if one.step.kind is StepKind.CAPTURE][-1:]
-    for one in made:
-        planned = moves_of(config, one.plane, one.step, one.context.patches, dips=one.dips)
+    wanted, config = protocol(lab.folder, text), load_rig(lab.folder / "rig.toml")
+    check_protocol(lab.folder / "rig.toml", lab.folder / "protocol.toml", config, wanted)
+    sent, left_out, do = list[Pose](), list[tuple[StepKind, list[Pose]]](), Run._do
+    noting(lab.rig.world.motion, sent.append)
+
+    async def checked(self: Run, step: Step, context: StepContext) -> StepResult:
+        plane, dips = context.run.procedures.plane, context.run.procedures._dips
+        planned = moves_of(config, plane, step, context.patches, dips=dips)
+        assert rounded(planned.poses) <= rounded(all_poses(config, wanted, plane)), step
         # Where the ink had to wait, a press dips again.
-        again = inking_moves(config, one.dips) if one.step.kind in MARKING else []
-        assert not not_checked(config, one.sent, [*planned.segments, *again]), one.step
-        if one not in last:  # after the last capture the arm does not set out for a dip
-            assert not not_sent(config, planned, one.sent), one.step
-        assert rounded(planned.poses) <= rounded(all_poses(config, wanted, one.plane)), one.step
-    assert {one.step.kind for one in made} >= {StepKind.ZERO_TOUCH, StepKind.BOARD}
+        again = inking_moves(config, dips) if step.kind in MARKING else []
+        sent.clear()
+        result = await do(self, step, context)
+        assert not not_checked(config, sent, [*planned.segments, *again]), step
+        left_out.append((step.kind, not_sent(config, planned, sent)))
+        return result
+
+    monkeypatch.setattr(Run, "_do", checked)
+    answered_alike(lab.engine(on_screen=True), "t")  # whoever jogs says at once that the tip touches
+    assert not lab.state.cut
+    assert {kind for kind, _ in left_out} >= {StepKind.ZERO_TOUCH, StepKind.BOARD}
+    assert left_out.pop()[0] is StepKind.CAPTURE, "after the last one the arm does not set out for a dip"
+    assert not [step for step in left_out if step[1]]
     if wanted.kind == "write":
         [drawn] = lab.state.results(PressResult)
         assert drawn.depths_mm == pytest.approx((8.0, 1.0), abs=0.1)
