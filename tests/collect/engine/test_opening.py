@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -21,7 +22,6 @@ from brushloop.drivers.sim.rig import rig_toml
 from brushloop.sessions.events import CaptureResult, Condition, Press, PressResult
 from brushloop.sessions.records import Header, Source
 from brushloop.sessions.store import SessionStore
-from tests.collect.tui.fake import FakeEngine, picture
 
 RIG = rig_toml(SimConfig())
 GRID = 'kind = "grid"\ndepths_mm = [11.0, 20.0]\ntilts_deg = [0.0]\nrepeats = 2\n'
@@ -141,18 +141,13 @@ def test_the_start_screen_resumes_each_session_with_its_own_protocol(
     """Another protocol lies in the folder, and a newer session is open."""
     begin("grid-02")
     edit("protocol.toml", "repeats = 2", "repeats = 3")
-    openings: list[Opening] = []
-
-    def engine_for(opening: Opening) -> FakeEngine:
-        openings.append(opening)
-        return FakeEngine(picture())
-
-    monkeypatch.setattr(engine, "engine_for", engine_for)
+    monkeypatch.setattr(engine, "engine_for", engine_for := Mock())
     browser = SessionBrowser()
     for session_id in ("grid-01", "grid-02"):
         browser.engine(session_id)
-        assert find_resumable(openings[-1]) == Path("sessions") / session_id
-        assert openings[-1].protocol.kind == "grid"
+        [resumed] = engine_for.call_args.args
+        assert find_resumable(resumed) == Path("sessions") / session_id
+        assert resumed.protocol.kind == "grid"
 
 
 def test_a_sheet_stays_in_until_each_stroke_on_it_is_photographed() -> None:

@@ -13,6 +13,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -301,20 +302,17 @@ async def test_other_files_can_be_typed_and_letters_of_stop_keys_too() -> None:
 
 
 async def test_a_session_is_analysed_and_the_rig_asked_in_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    ran: list[list[str]] = []
-
-    def run(command: list[str], *, check: bool) -> subprocess.CompletedProcess[str]:
-        ran.append(command[3:])
-        return subprocess.CompletedProcess(command, 0)
-
     app = app_of(browser=FakeBrowser())
     monkeypatch.setattr(app, "suspend", nullcontext)
-    monkeypatch.setattr("subprocess.run", run)
+    monkeypatch.setattr("subprocess.run", run := Mock(return_value=subprocess.CompletedProcess([], 0)))
     monkeypatch.setattr("sys.stdin", io.StringIO())
     async with app.run_test(size=(120, 40)) as pilot:
         await settled(pilot)
         await pilot.press("down", "a", "d")
-    assert ran == [["analyse", "sessions/2026-11-21-grid-01"], ["doctor", "--config", "rig.toml"]]
+    assert [call.args[0][3:] for call in run.call_args_list] == [
+        ["analyse", "sessions/2026-11-21-grid-01"],
+        ["doctor", "--config", "rig.toml"],
+    ]
 
 
 def test_pictures_work_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -396,14 +394,8 @@ def test_a_screen_that_breaks_stops_the_arm(
 
 
 def test_a_lost_terminal_hurts_nobody_and_does_not_start_the_driver_twice(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Gone(io.StringIO):
-        def write(self, _text: str) -> int:
-            raise OSError(5, "Input/output error")
-
-        def flush(self) -> None:
-            raise OSError(5, "Input/output error")
-
-    file = _LostWrites(Gone())
+    gone = OSError(5, "Input/output error")
+    file = _LostWrites(Mock(write=Mock(side_effect=gone), flush=Mock(side_effect=gone)))
     assert file.write("abc") == 3
     file.flush()
     started: list[str] = []
