@@ -127,13 +127,7 @@ async def test_killed_again_and_again_it_asks_nothing_twice_and_a_step_taught_ag
     assert rig.with_name("rig.toml.bak-1").read_text(encoding="utf-8") == text
     assert any("Changed with it, because it depends on this step:" in text for _, text in person.shown)
 
-    await _proven(person, rig, monkeypatch)
-    assert "NOT PROVEN" not in rig.read_text(encoding="utf-8")
-    assert load_rig(rig).camera.latency_ms == DELAY_MS
-
-
-async def _proven(person: InLab, rig: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Devices are examined and values kept as ever; the two runs, which take minutes, are left out."""
+    # The proof examines devices and keeps values as ever; its two runs, which take minutes, are left out.
     brought, asked = len(person.brought), len(person.asked)
 
     async def run(_step: ProofStep, _visit: Visit, folder: Path, _protocol: str, *, dry: bool) -> Path:
@@ -145,6 +139,8 @@ async def _proven(person: InLab, rig: Path, monkeypatch: pytest.MonkeyPatch) -> 
         assert await first_day(person, rig) == rig
     assert len(person.brought) == brought, "something was brought again"
     assert all("The arm moves by itself" in question for question in person.asked[asked:])
+    assert "NOT PROVEN" not in rig.read_text(encoding="utf-8")
+    assert load_rig(rig).camera.latency_ms == DELAY_MS
 
 
 async def test_a_trap_is_named_with_the_way_out_and_the_first_day_goes_on_once_it_is_mended(tmp_path: Path) -> None:

@@ -179,13 +179,7 @@ def test_the_edge_of_a_sheet_is_no_ink_in_the_patches_along_it() -> None:
 @pytest.mark.parametrize("photo_px_per_mm", [6.25, 3.3, 2.5])
 def test_an_even_mark_is_even_at_any_resolution(photo_px_per_mm: float) -> None:
     """A coarse photograph blurs the edge of a mark over more of it: a sound mark is not called dry for that."""
-    mark = measure_mark(photographed(photo_px_per_mm), (20.0, 7.0))
-    assert mark is not None
-    assert mark.uneven < 0.25 * LIMITS.uneven
-
-
-def photographed(photo_px_per_mm: float) -> Ink:
-    """An even ellipse of 24 x 8 mm in a window of 30 x 14 mm."""
+    # An ellipse of 24 x 8 mm in a window of 30 x 14 mm.
     sharp = np.zeros((round(14 * PX_PER_MM), round(30 * PX_PER_MM)), np.float32)
     half = round(12 * PX_PER_MM), round(4 * PX_PER_MM)
     cv2.ellipse(sharp, (sharp.shape[1] // 2, sharp.shape[0] // 2), half, 0.0, 0.0, 360.0, 0.85, cv2.FILLED)
@@ -193,7 +187,9 @@ def photographed(photo_px_per_mm: float) -> Ink:
     photo = cv2.GaussianBlur(cv2.resize(sharp, None, fx=share, fy=share, interpolation=cv2.INTER_AREA), (0, 0), 0.7)
     dark = np.asarray(cv2.resize(photo, sharp.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
     window = Window((0.0, 0.0, 30.0, 14.0), dark, np.ones(dark.shape, np.bool_), 1.0 / photo_px_per_mm)
-    return Ink(window, dark > 0.2, 0.0, 0.0)
+    mark = measure_mark(Ink(window, dark > 0.2, 0.0, 0.0), (20.0, 7.0))
+    assert mark is not None
+    assert mark.uneven < 0.25 * LIMITS.uneven
 
 
 # Captures of the loopback brush, each with what it is; drawn once

@@ -211,11 +211,7 @@ def test_a_rig_in_order_is_reported_with_all_that_was_answered_and_left_as_it_wa
     assert "PowerOff, safety Normal, simulated" in robot["notes"]
     assert camera["notes"].startswith("board: ")
     assert "rounds/s" in force["notes"]
-    assert [ink[name] for name in ("identity", "firmware", "notes")] == [
-        "ink-station",
-        "1.0.0",
-        "well 71% full, simulated",
-    ]
+    assert (ink["identity"], ink["firmware"], ink["notes"]) == ("ink-station", "1.0.0", "well 71% full, simulated")
     assert document["versions"]["brushloop"]
     assert document["versions"]["numpy"]
     assert document["platform"]["python"]
