@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import time
+import tty
 from collections.abc import AsyncIterator
 from pathlib import Path
 
@@ -73,6 +74,31 @@ async def test_a_pulled_cable_is_a_lost_connection_at_once(line: InstrumentServe
     assert lost.value.op == "dose"
     with pytest.raises(ConnectionLost, match="cannot open"):
         await station_at(f"socket://{HOST}:{line.port}").connect()
+
+
+async def test_over_the_terminal_of_a_serial_line_a_device_answers_until_its_cable_is_pulled() -> None:
+    """As in a lab: the loopback rig's lines are carried by a network, which pyserial opens by other code."""
+    device, end = os.openpty()
+    tty.setraw(end)  # or the terminal would echo, and translate line ends
+    firmware, buffer, loop = StationFirmware(), bytearray(), asyncio.get_running_loop()
+
+    def answer() -> None:
+        buffer.extend(os.read(device, 4096))
+        while (request := firmware.take(buffer)) is not None:
+            os.write(device, firmware.answer(request) or b"")
+
+    loop.add_reader(device, answer)
+    station = station_at(os.ttyname(end))
+    assert (await station.connect()).simulated
+    before_ml = firmware.well.ml
+    await station.dose(0.5)
+    assert firmware.well.ml - before_ml == pytest.approx(0.5)
+    loop.remove_reader(device)
+    os.close(device)
+    with pytest.raises(ConnectionLost):
+        await station.level()
+    await station.close()
+    os.close(end)
 
 
 async def test_a_port_that_is_missing_or_held_by_somebody_else_is_not_opened(tmp_path: Path):

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import os
-import tty
 from collections.abc import AsyncIterator
 from typing import TypeVar
 
@@ -19,7 +17,6 @@ from brushloop.drivers.errors import (
     NotConnected,
     ProtocolViolation,
 )
-from brushloop.drivers.host import Clock
 from brushloop.drivers.ink.port import InkRefused
 from brushloop.drivers.ink.pump import ModbusPump, ModbusPumpConfig
 from brushloop.drivers.ink.simulator import PumpFirmware, StationFirmware
@@ -34,36 +31,6 @@ AnyDevice = TypeVar("AnyDevice", InkStation, ModbusPump)
 async def connected(device: AnyDevice) -> AnyDevice:
     await device.connect()
     return device
-
-
-def test_over_the_terminal_of_a_serial_line_a_device_answers_until_its_cable_is_pulled() -> None:
-    """As in a lab: the loopback rig's lines are carried by a network, which pyserial opens by other code."""
-    device, end = os.openpty()
-    tty.setraw(end)  # or the terminal would echo, and translate line ends
-    firmware, buffer = StationFirmware(), bytearray()
-
-    def answer() -> None:
-        buffer.extend(os.read(device, 4096))
-        while (request := firmware.take(buffer)) is not None:
-            os.write(device, firmware.answer(request) or b"")
-
-    async def talk() -> None:
-        asyncio.get_running_loop().add_reader(device, answer)
-        station = InkStation(
-            InkStationConfig(kind="ink-station", port=os.ttyname(end), dose_ml=2.0, light=0.5), Clock()
-        )
-        assert (await station.connect()).simulated
-        before_ml = firmware.well.ml
-        await station.dose(0.5)
-        assert firmware.well.ml - before_ml == pytest.approx(0.5)
-        asyncio.get_running_loop().remove_reader(device)
-        os.close(device)
-        with pytest.raises(ConnectionLost):
-            await station.level()
-        await station.close()
-
-    asyncio.run(talk())
-    os.close(end)
 
 
 # ---------------------------------------------------------------- the station
