@@ -70,7 +70,6 @@ class Answering(Person):
 
 # In an unknown lab
 
-
 KEYS = {"station": "i", "pump": "p", "none": "n"}
 
 

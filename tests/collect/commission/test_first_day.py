@@ -8,13 +8,14 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import AsyncMock
 
 import pytest
 
 from brushloop.collect.commission import camera, proof
 from brushloop.collect.commission.places import AWAY
 from brushloop.collect.commission.proof import ProofStep, read_proof
-from brushloop.collect.commission.visit import Notebook, Visit
+from brushloop.collect.commission.visit import Notebook
 from brushloop.collect.commission.wizard import Wizard
 from brushloop.collect.rig.config import load_rig
 from brushloop.drivers.sim.lab_facts import Trap
@@ -129,12 +130,8 @@ async def test_killed_again_and_again_it_asks_nothing_twice_and_a_step_taught_ag
 
     # The proof examines devices and keeps values as ever; its two runs, which take minutes, are left out.
     brought, asked = len(person.brought), len(person.asked)
-
-    async def run(_step: ProofStep, _visit: Visit, folder: Path, _protocol: str, *, dry: bool) -> Path:
-        return folder
-
     with monkeypatch.context() as proving:
-        proving.setattr(ProofStep, "_run", run)
+        proving.setattr(ProofStep, "_run", AsyncMock())
         proving.setattr(proof, "read_proof", lambda _session: PROVEN)
         assert await first_day(person, rig) == rig
     assert len(person.brought) == brought, "something was brought again"

@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from unittest.mock import AsyncMock
+from unittest.mock import AsyncMock, Mock
 
 import numpy as np
 import pytest
@@ -96,14 +96,8 @@ def test_a_corner_that_the_arm_does_not_reach_is_named_with_where_the_board_has_
 async def test_the_proof_runs_nothing_without_the_command_line_and_the_operators_key(
     armed: bool, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def no_run(*_: object, **__: object) -> Path:
-        raise AssertionError("the arm would have moved")
-
-    async def answered(*_: object) -> None:
-        pass
-
-    monkeypatch.setattr(ProofStep, "_run", no_run)
-    monkeypatch.setattr(ProofStep, "_doctor", answered)
+    monkeypatch.setattr(ProofStep, "_run", AsyncMock(side_effect=AssertionError("the arm would have moved")))
+    monkeypatch.setattr(ProofStep, "_doctor", AsyncMock())
     monkeypatch.setattr(proof, "rig_of", lambda *_: SimpleNamespace(brush=SimpleNamespace(max_depth_mm=22.0)))
     person = Answering("")
     with pytest.raises(NotAccepted, match=said):
@@ -115,13 +109,10 @@ async def test_the_proof_runs_nothing_without_the_command_line_and_the_operators
 async def test_every_pose_of_the_proof_is_checked_before_the_arm_is_connected(
     dry: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def no_engine(*_: object, **__: object) -> None:
-        raise AssertionError("the arm would have moved")
-
     text = rig_toml(SimConfig())
     low = re.sub(r"(?m)^z_mm = \[.*", "z_mm = [98.0, 170.0]", text, count=1)  # travel height is 180
     (tmp_path / "rig.toml").write_text(low)
-    monkeypatch.setattr(proof, "Engine", no_engine)
+    monkeypatch.setattr(proof, "Engine", Mock(side_effect=AssertionError("the arm would have moved")))
     visit = Person().visit(tmp_path / "rig.toml", armed=True)
     protocol = 'kind = "grid"\ndepths_mm = [11.0]\ntilts_deg = [0.0]\nrepeats = 2\n'
     with pytest.raises(ConfigError, match=r"robot\.limits: a planned pose is outside the limits: z = "):
@@ -244,7 +235,6 @@ async def test_pictures_that_say_nothing_are_taken_again_at_both_places(
 
 
 # Going back, teaching a step again, leaving off
-
 
 HOW, GIVE, LINE = "How do you want to go on?", "Give 0.5 ml", "Its serial line"
 R, L, DEEPEST, NAME = "R", "L", "Deepest press that this brush can take; 45% of L is cautious", "Name of the brush"
