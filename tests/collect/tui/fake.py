@@ -248,12 +248,8 @@ def captured(stroke_id: str, still: int, waited_s: float | None = None, verdict:
 class FakeReview(Review):
     """Three captures of one condition, one of them marked bad."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder / "2026-11-21-grid-01"
-        self.folder.mkdir(exist_ok=True)
-        self.read()
-
-    def read(self) -> None:
+    def __init__(self) -> None:
+        self.folder = Path("2026-11-21-grid-01")
         self.open = False
         self.captures = (
             ReviewCapture(captured("H13-a0-r01", 4, 1.24), "0004-capture-a.mcap"),

@@ -34,11 +34,11 @@ def colours(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NO_COLOR", raising=False)
 
 
-def pressing(*keys: str) -> Callable[[Pilot[None]], Awaitable[None]]:
+def pressing(keys: str = "") -> Callable[[Pilot[None]], Awaitable[None]]:
     async def press(pilot: Pilot[None]) -> None:
         await settled(pilot)
         if keys:
-            await pilot.press(*keys)
+            await pilot.press(keys)
             await settled(pilot)
 
     return press
@@ -58,8 +58,7 @@ def pressing(*keys: str) -> Callable[[Pilot[None]], Awaitable[None]]:
     ],
 )
 def test_run(snap_compare: Callable[..., bool], now: Snapshot, size: tuple[int, int], keys: str) -> None:
-    run = pressing(*([keys] if keys else []))
-    assert snap_compare(app_of(FakeEngine(now)), terminal_size=size, run_before=run)
+    assert snap_compare(app_of(FakeEngine(now)), terminal_size=size, run_before=pressing(keys))
 
 
 def test_no_colour(snap_compare: Callable[..., bool], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -77,7 +76,7 @@ def test_review(snap_compare: Callable[..., bool], monkeypatch: pytest.MonkeyPat
 
     async def review(pilot: Pilot[None]) -> None:
         await settled(pilot)
-        app.push_screen(ReviewScreen(FakeReview(Path()), lambda: app.at_work))
+        app.push_screen(ReviewScreen(FakeReview(), lambda: app.at_work))
         await settled(pilot)
         await pilot.pause(0.2)
 
