@@ -23,6 +23,7 @@ from brushloop.drivers.sim.faults import ALWAYS, Device, Fault, Phase
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.store import SessionStore
 from tests.collect.tui.fake import picture
+from tests.command import refused
 from tests.rigs import Lab
 from tests.runs import ended_by, until
 from tests.waiting import wait_until
@@ -139,15 +140,12 @@ def test_where_the_kernel_keeps_no_names_a_lock_that_all_may_open_does(monkeypat
 def test_a_folder_that_may_not_be_written_is_refused_before_anything_is_connected(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refused() -> tuple[int, str]:
-        ran = lab.command()
-        return ran.returncode, ran.stderr.splitlines()[-1].removeprefix("brushloop: ")
-
+    command = ("collect", "--no-tui", *lab.options)
     with monkeypatch.context() as patch:
         patch.setattr("brushloop.sessions.disk.os.access", lambda path, _mode: path != lab.folder)
-        assert refused() == (2, f"{lab.folder}: may not be written: it is read-only, or another user's")
+        assert refused(*command) == f"{lab.folder}: may not be written: it is read-only, or another user's"
     lab.sessions.write_text("not a folder", encoding="utf-8")
-    assert refused() == (2, f"{lab.sessions}: is a file; a folder is needed")
+    assert refused(*command) == f"{lab.sessions}: is a file; a folder is needed"
     assert lab.rig.arcs.cabinet.power.mode == "PowerOff"
 
 

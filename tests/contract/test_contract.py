@@ -158,9 +158,7 @@ async def test_a_move_that_is_cancelled_stops_the_arm(enabled: Enabled):
 
 
 @pytest.mark.moves
-async def test_an_idle_arm_is_at_once_where_it_stands_and_a_stop_is_harmless_also_twice(
-    enabled: Enabled,
-):
+async def test_an_idle_arm_is_at_once_where_it_stands_and_a_stop_is_harmless_also_twice(enabled: Enabled):
     async with asyncio.timeout(1.0):
         await enabled.robot.move(enabled.start, **GENTLY)
     await enabled.robot.stop()

@@ -27,7 +27,6 @@ TRIES = 4
 """The client's own library can die of a race: it holds the interpreter while it waits for RTDE, whose callback needs
 it. Only a death by signal is tried again, never a wrong answer."""
 
-
 ANSWERS: dict[str, Any] = {
     "connect": 0,
     "login": [0, True],

@@ -39,7 +39,6 @@ from tests.sessions.conftest import Make
 
 # The demo
 
-
 RIG = rig_toml(SimConfig())
 GRID = 'kind = "grid"\ndepths_mm = [11.0]\ntilts_deg = [0.0]\nrepeats = 1\nseed = 1\n'
 
@@ -148,7 +147,6 @@ def test_a_demo_that_ended_after_its_collection_goes_on_there_and_begins_no_new_
 
 # The loop
 
-
 SETTINGS = Settings(
     original="grid-01",
     original_sha256="ab",
@@ -211,7 +209,6 @@ def test_a_session_of_another_ink_is_not_the_one_that_a_chain_asks_for(tmp_path:
 
 
 # Writing
-
 
 CELL = 'kind = "write"\ncell_mm = [48.0, 48.0]\nrepeats = {repeats}\n[[figures]]\nname = "子"\n[[figures.strokes]]\n'
 POINTS = "points = [[10.0, 24.0, 3.0, 0.0, 0.0], [20.0, 24.0, 3.0, 0.0, 0.0]]\n"

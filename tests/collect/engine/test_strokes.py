@@ -4,6 +4,7 @@ photograph is judged, a bad stroke is made again elsewhere, then a person decide
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -286,13 +287,10 @@ def test_the_mark_is_the_one_of_the_closed_form(depth_mm: float, tilt_deg: float
 
 
 def test_likeness_is_a_cosine_and_needs_ink_on_both() -> None:
-    mark = mark_of(BRUSH, Condition(11.0, 0.0))
-
-    def capture(binary: np.ndarray | None) -> LastCapture:
-        press = Press(stroke_id="H11-a0-r00", condition=Condition(11.0, 0.0))
-        return LastCapture(press, 1, True, None, None, binary, mark)
-
-    assert capture(mark).likeness == pytest.approx(1.0)
-    assert capture(np.roll(mark, 60, axis=0)).likeness == pytest.approx(0.0)
-    assert capture(None).likeness is None
-    assert capture(np.zeros_like(mark)).likeness is None
+    press = Press(stroke_id="H11-a0-r00", condition=Condition(11.0, 0.0))
+    mark = mark_of(BRUSH, press.condition)
+    seen = LastCapture(press, 1, True, None, None, mark, mark)
+    assert seen.likeness == pytest.approx(1.0)
+    assert replace(seen, binary=np.roll(mark, 60, axis=0)).likeness == pytest.approx(0.0)
+    for nothing in (None, np.zeros_like(mark)):
+        assert replace(seen, binary=nothing).likeness is None

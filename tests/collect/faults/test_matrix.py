@@ -263,7 +263,6 @@ def assert_the_session_is_whole(lab: Lab, name: str, phase: str) -> None:
 
 
 DOWN = "The brush may be down"
-DEEP_RATE = 2.0
 ENDS: dict[str, Callable[[Lab, SteppedEngine], object]] = {
     "a stop": lambda _, engine: engine.stop(),
     "a safety stop": lambda lab, _: lab.rig.arcs.cabinet.safety_stop(),
@@ -285,7 +284,7 @@ def test_an_end_with_the_brush_in_the_paper_says_so_and_what_to_do(lab: Lab, end
     engine, paper_z_mm = lab.engine(), lab.rig.config.table.paper_z_mm
     engine.start()
     until(engine, lambda now: now.step.startswith("press"))
-    lab.rig.clock.shift(DEEP_RATE)
+    lab.rig.clock.shift(2.0)
     until(engine, lambda _: lab.rig.world.tool().z_mm < paper_z_mm - 10.0)
     ENDS[end](lab, engine)
     said = said_at_the_end(engine)

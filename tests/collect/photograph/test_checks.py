@@ -254,8 +254,6 @@ WHITENED = QualityConfig(bright_level=256.0, glare_mm2=1e6)
 """For paper that whoever published it has set to 255: neither exposure nor glare can be judged."""
 INK = (Failure.NEIGHBOUR, Failure.BLANK, Failure.DRY, Failure.FAINT)
 """What can be asked of a drag: its place and its shape are not those of a press."""
-DEPTH_MM = 9.0
-"""For rows of the table without a depth."""
 BLANK = "png/120.png"
 
 
@@ -277,7 +275,7 @@ def judge(row: dict[str, str], limits: QualityConfig = WHITENED) -> Verdict:
     x_mm, y_mm = 1.0 / float(row["px_per_mm_x"]), 1.0 / float(row["px_per_mm_y"])
     size_mm = image.shape[1] * x_mm, image.shape[0] * y_mm
     photograph = Photograph(image.astype(np.uint8), flat_plane(image.shape[::-1], (x_mm, y_mm)), limits, size_mm)
-    depth_mm = max(float(row.get("depth_mid_mm_nominal") or DEPTH_MM), 1.0)
+    depth_mm = max(float(row.get("depth_mid_mm_nominal") or 9.0), 1.0)  # 9 mm where the table has none
     start_mm = float(row["start_x_px"]) * x_mm, size_mm[1] - float(row["start_y_px"]) * y_mm
     return photograph.check_press(Page(0, 0.0, 0.0, *size_mm, start_mm), depth_mm)
 

@@ -144,7 +144,8 @@ async def test_no_photograph_shows_the_arm_or_the_sheet_of_before(delay: Callabl
         theatre.ink += 1
         inked_s = theatre.clock.now_ns() / 1e9
         frame = await photographer.photograph()
-        assert (after_s := age_s(theatre, frame, inked_s)) >= 0.0
+        after_s = age_s(theatre, frame, inked_s)
+        assert after_s >= 0.0
         assert theatre.way(inked_s + after_s) * OVER_MM[0] <= OUT_MM, "the arm is in the picture"
 
 
@@ -196,7 +197,6 @@ async def test_a_delay_that_was_measured_wrongly_is_measured_again():
 
 
 # The delay by one trip, from when the camera saw the arm and when it was where
-
 
 ENTERS = 0.4
 """The share of its way at which the arm comes into the picture; nothing below knows it."""

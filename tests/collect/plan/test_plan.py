@@ -50,7 +50,6 @@ from tests.runs import answered_alike
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 RIG = rig_toml(SimConfig())
-PUMP = rig_toml(SimConfig(ink_device="pump"))
 
 
 def rig(folder: Path, text: str = RIG) -> RigConfig:
@@ -145,15 +144,14 @@ def test_a_sheet_that_leans_is_checked_as_it_lies(tmp_path: Path, config: RigCon
 
 def test_a_drawn_stroke_goes_through_its_points_at_its_depths(config: RigConfig) -> None:
     wanted = example("protocol-write.toml")
-    draw, again = [w for w in walk(config, wanted) if isinstance(w.step, PressStep)]
-    assert isinstance(draw.step, PressStep)
-    assert isinstance(again.step, PressStep)
-    assert (draw.step.press.stroke_id, again.step.press.stroke_id) == ("shi-r01", "shi-r02")
-    assert draw.step.press.condition.depth_mm == 9.0, "the deepest of its points"
+    steps = [(w.step, w.patches) for w in walk(config, wanted) if isinstance(w.step, PressStep)]
+    assert [step.press.stroke_id for step, _ in steps] == ["shi-r01", "shi-r02"]
+    draw, patches = steps[0]
+    assert draw.press.condition.depth_mm == 9.0, "the deepest of its points"
     plane = PaperPlane(config.paper.touch_z_mm)
-    moves = moves_of(config, plane, draw.step, draw.patches)
+    moves = moves_of(config, plane, draw, patches)
     ways = [part for part in moves.segments if isinstance(part, MotionPath)]
-    drawn = draw.step.drawn
+    drawn = draw.drawn
     assert drawn is not None
     assert [len(way.poses) for way in ways] == [len(stroke) - 1 for stroke in drawn.strokes]
     patch = sheet_of(config, wanted).patch(0)
@@ -171,7 +169,7 @@ def test_a_path_has_one_ramp_and_the_ink_of_a_plan_is_what_a_pump_doses(tmp_path
     start, *poses = (brush_pose(x_mm, 0.0, 200.0) for x_mm in (300.0, 310.0, 320.0))
     assert path_s(start, MotionPath(poses, 20.0), 800.0, limits_of(rig(tmp_path))) == pytest.approx(1.025)
     wanted = protocol(tmp_path, 'kind = "grid"\ndepths_mm = [11.0]\ntilts_deg = [0.0]\nrepeats = 12\n')
-    assert make_plan(rig(tmp_path, PUMP), wanted).ink_ml == pytest.approx(2 * 0.3)
+    assert make_plan(rig(tmp_path, rig_toml(SimConfig(ink_device="pump"))), wanted).ink_ml == pytest.approx(2 * 0.3)
     assert make_plan(rig(tmp_path), wanted).ink_ml is None
 
 
@@ -340,14 +338,12 @@ async def test_a_press_that_was_not_seen_at_its_depth_is_void(config: RigConfig,
 
 # Drawn strokes
 
-PLANE = PaperPlane(120.0)
-
 
 def test_a_stroke_may_come_down_on_its_way(config: RigConfig) -> None:
     """Points above the paper: the brush is as far above it as asked when the way begins."""
     patch = sheet_of(config, example("protocol-write.toml")).patch(0)
     points = [(10.0, 10.0, -4.0, 3.0, 0.0), (20.0, 10.0, 5.0, 3.0, 0.0), (30.0, 10.0, -4.0, 3.0, 0.0)]
-    *down, path, _, _ = (StepMoves([each]) for each in stroke_moves(config, PLANE, patch, points, 15.0))
+    *down, path, _, _ = (StepMoves([each]) for each in stroke_moves(config, PaperPlane(120.0), patch, points, 15.0))
     assert [move.poses[0][0].z_mm for move in down] == pytest.approx([180.0, 132.0, 132.0, 124.0])
     assert [pose.z_mm for pose, _ in path.poses] == pytest.approx([115.0, 124.0])
 

@@ -164,7 +164,6 @@ async def test_a_contact_in_the_air_is_not_believed(reaction: Push) -> None:
 
 # The plane of the paper
 
-
 CORNERS = [(5.0, 5.0), (235.0, 5.0), (5.0, 165.0), (235.0, 165.0)]
 slopes = st.floats(-0.017, 0.017)  # 1 deg
 
@@ -200,10 +199,7 @@ STEEP = touches(PaperPlane(120.0, math.tan(math.radians(5.0))), CORNERS[:3])
 
 @pytest.mark.parametrize(
     ("points_mm", "why"),
-    [
-        ([(5.0, 5.0, 120.0), (120.0, 10.0, 120.0), (235.0, 5.0, 120.0)], "of a line"),
-        (STEEP, r"lean by 5\.0 deg"),
-    ],
+    [([(5.0, 5.0, 120.0), (120.0, 10.0, 120.0), (235.0, 5.0, 120.0)], "of a line"), (STEEP, r"lean by 5\.0 deg")],
 )
 def test_points_on_a_line_or_on_no_sheet_give_no_plane(points_mm: list[tuple[float, float, float]], why: str) -> None:
     with pytest.raises(StepError, match=why):

@@ -39,8 +39,6 @@ from tests.collect.touch.bench import Bench
 CORNERS = [(0.0, 0.0), (110.0, 0.0), (0.0, 80.0), (110.0, 80.0)]
 THREE: dict[str, Any] = {"points_mm": [(6.0, 4.0), (104.0, 4.0), (50.0, 76.0)]}
 PATCHES: dict[str, Any] = {"points_mm": [(4.0, 4.0), (70.0, 4.0), (36.0, 40.0)]}
-
-
 NOBODY = Asker(watched=False)
 
 
@@ -196,19 +194,16 @@ def test_touches_may_span_the_limit_or_five_of_their_standard_errors(
             at_one_point(touches, TouchConfig(repeatability_mm=0.15))
 
 
-PAPER = PaperConfig(origin_mm=(0.0, 0.0), touch_z_mm=120.0, size_mm=(244.0, 172.0), touch_point_mm=(2.0, 2.0))
-SHEET = Sheet(PAPER)
-
-
 def test_patches_that_may_be_inked_are_used_up_and_those_beside_touches_in_the_margin_are_not() -> None:
+    config = paper(244.0, 172.0).model_copy(update={"touch_point_mm": (2.0, 2.0)})
+    sheet, corner = Sheet(config), Sheet(config).patch(36)
     margin = TouchConfig(method="force", points_mm=[(2.0, 2.0), (242.0, 2.0), (122.0, 170.0)])
-    for config in (TouchConfig(), margin):
-        assert used_patches(SHEET, PAPER, config) == set()
-    corner = SHEET.patch(36)
+    for touch in (TouchConfig(), margin):
+        assert used_patches(sheet, config, touch) == set()
     points = [(corner.x_mm + 4.0, corner.y_mm + 9.0), (124.0, 6.0), (6.0, 100.0)]
-    patches = used_patches(SHEET, PAPER, TouchConfig(method="camera", points_mm=points))
+    patches = used_patches(sheet, config, TouchConfig(method="camera", points_mm=points))
     assert {30, 36} <= patches, "its rows grow into the patch above"
-    assert len(patches) < SHEET.capacity / 3
+    assert len(patches) < sheet.capacity / 3
 
 
 TOUCH, CHECK = ZeroTouchStep(0), SelfCheckStep(0)

@@ -139,8 +139,6 @@ async def test_the_same_questions_get_the_same_answers(path: Path) -> None:
 # ---------------------------------------------------------------- what is pushed, and what is polled
 
 GREETING = b'{"protocol":"rtde","version":1,"output":{"R1_actual_TCP_pose":1021,"R1_actual_q":1006}}\n\n'
-
-
 MAKERS_TOPIC = (
     b"\x82\x18d\xa5fchanel\x00ifrequency\xfaBH\x00\x00hsegments\x82kR1_actual_qrR1_actual_TCP_pose"
     b"ito_server\xf4gtrigger\x1aAAAA"

@@ -34,20 +34,17 @@ from tests.drivers.arcs.conftest import LIMITS, Act, Cabinet, Ends, MakeArm, cut
 
 WAY = {"speed_mm_s": 40.0, "acc_mm_s2": 800.0}
 SLOW = {**WAY, "speed_mm_s": 3.0}
-
-
-def arc(points: int = 40, radius_mm: float = 40.0) -> list[Pose]:
-    """Half a circle from home, the tool leaning and turning as it goes."""
-    return [
-        brush_pose(
-            250.0 + radius_mm * math.sin(math.pi * k / points),
-            -230.0 + radius_mm * (1.0 - math.cos(math.pi * k / points)),
-            260.0,
-            heading_deg=90.0 * k / points,
-            tilt_deg=5.0 * k / points,
-        )
-        for k in range(1, points + 1)
-    ]
+ARC = [
+    brush_pose(
+        250.0 + 40.0 * math.sin(math.pi * share),
+        -230.0 + 40.0 * (1.0 - math.cos(math.pi * share)),
+        260.0,
+        heading_deg=90.0 * share,
+        tilt_deg=5.0 * share,
+    )
+    for share in (k / 40 for k in range(1, 41))
+]
+"""Half a circle from home, the tool leaning and turning as it goes."""
 
 
 def line(points: int, step_mm: float = 5.0) -> list[Pose]:
@@ -81,11 +78,11 @@ async def test_the_arm_halts_nowhere_but_at_the_last_pose_having_passed_near_all
     arm: AuboArcs, cabinet: Cabinet
 ):
     passed = cabinet.passed()
-    await arm.follow(arc(), **WAY)
-    off_mm, off_deg = distance(cabinet.tool, arc()[-1])
+    await arm.follow(ARC, **WAY)
+    off_mm, off_deg = distance(cabinet.tool, ARC[-1])
     assert off_mm <= 0.05
     assert off_deg <= 0.1
-    for pose in arc():
+    for pose in ARC:
         # a corner is cut by less than half its blend
         assert min(math.dist(pose.position_mm, seen.position_mm) for seen in passed) < 0.6
     assert len(cabinet.cabinet.world.motion.rests) == 1
