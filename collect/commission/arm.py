@@ -162,8 +162,8 @@ class ArmStep(Step):
                 tone="warning",
             )
         as_set, (payload_kg, *cog_mm) = "as set on the pendant", settings.payload
-        weightless = "Payload is 0 kg on the pendant, but a brush has weight: the guided arm drifts. Go on with 0 kg?"
-        if not payload_kg and not await visit.yes(weightless):
+        question = "The payload is 0 kg, but holder and brush have weight: the guided arm drifts. Go on with 0 kg?"
+        if not payload_kg and not await visit.yes(question):
             raise NotAccepted("the payload is 0 kg.", "Weigh holder, sensor and brush, and set it on the pendant.")
         values = {
             "robot.kind": Taught("aubo-arcs", f"{name} answered"),

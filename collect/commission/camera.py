@@ -113,7 +113,7 @@ class CameraStep(Step):
             label, (height, width) = devices.get(source, source), picture.shape
             visit.say(f"{label}: {width} x {height} px", picture=picture)
             probably = NO if await _board_in(visit, picture, source, lying=False) is None else YES
-            question = f"Is this, by {label}, the picture of the camera over the sheet?"
+            question = f"Is {label} the camera over the sheet? Look at its picture."
             over_sheet = await visit.ask(choice_of(question, (YES, NO), probably.key))
         # What a device chose by itself; the settings of a stream only its own set-up can change.
         locked = await asyncio.to_thread(found_settings, int(source), SETTLE_S) if source.isdecimal() else {}
@@ -166,7 +166,7 @@ class CameraStep(Step):
         """Take one photograph of the held board, so that a resumed session does not; False if the person skips it."""
         where = HOLD[index] if index < len(HOLD) else "where it is still missing"
         how = f"View {index + 1}: cover the board on the table, hold the second print {where}, all sharp; keep still."
-        why = "Slanted views show how the lens bends the picture."
+        why = "The lens is computed from these views."
         async with shown_live(visit, camera):
             if not await visit.brought(f"hold-board {index}", f"{how} {why}", may_skip=True):
                 return False
