@@ -31,7 +31,7 @@ from brushloop.collect.errors import (
     describe,
     rest_is_unknown,
 )
-from brushloop.collect.operator import Asker, Choice, OperatorRequest, Prompt
+from brushloop.collect.operator import Asker, Choice, Prompt
 from brushloop.collect.photograph.frames import each_frame
 from brushloop.collect.rig.devices import Rig, connected
 from brushloop.collect.walk import check_protocol, sheet_of
@@ -52,9 +52,6 @@ UNCHECKED = (
     "whether arm, camera and configuration agree"
 )
 
-BEGUN_DRY = "dry run: nothing is pressed, dipped or kept"
-OVER_DRY = "dry run: every move was made"
-
 ARM = Choice("a", "arm it: I am looking at the robot cell, my hand is at the emergency stop")
 LEAVE = Choice("x", "do not arm it")
 
@@ -72,6 +69,8 @@ class Engine:
         self._resumes = resumes
         progress = Progress(opening.protocol, clock, sheet_of(opening.rig, opening.protocol), resumes)
         self._run = Run(opening, progress, Asker(watched=bool(self._request.on_screen), waiting=self._waiting))
+        self.control = self._run.control
+        """State of the run, and what is asked of it: to pause and resume, and the operator's requests."""
         self._clock = clock
         self._task: asyncio.Task[None] | None = None
         self._stopper: asyncio.Task[None] | None = None
@@ -99,7 +98,7 @@ class Engine:
     def snapshot(self) -> Snapshot:
         """The state of the run; from any thread."""
         tip_mm = force_n = no_pose_s = None
-        state = self._run.control.state
+        state = self.control.state
         if (rig := self._rig) is not None:
             try:
                 tip_mm = self._see_tip(rig)
@@ -112,15 +111,16 @@ class Engine:
                 with contextlib.suppress(DeviceError):
                     self._run.progress.force(sample := rig.force.latest())
                     force_n = math.hypot(*sample.force_n)
+        seen_mm, park_mm = self._run.progress.tip_mm, self._rig_config.motion.park_mm
         return self._run.progress.snapshot(
             state=state,
             tip_mm=tip_mm,
             force_n=force_n,
             prompt=self._run.asker.prompt,
             target_mm=None if rig is None else self._run.procedures.target_mm,
-            parked=self._parked(),
+            parked=not self._rest_unknown and seen_mm is not None and math.dist(seen_mm, park_mm) < PARKED_MM,
             rest_unknown=self._rest_unknown,
-            requests=self._run.control.requests,
+            requests=self.control.requests,
             no_pose_s=no_pose_s,
         )
 
@@ -131,17 +131,9 @@ class Engine:
     def _show_frame(self, frame: Frame) -> None:
         self._run.progress.picture = picture_of(frame)
 
-    def _parked(self) -> bool:
-        tip_mm, motion = self._run.progress.tip_mm, self._rig_config.motion
-        return not self._rest_unknown and tip_mm is not None and math.dist(tip_mm, motion.park_mm) < PARKED_MM
-
-    def request(self, request: OperatorRequest) -> None:
-        """Make or withdraw a request; requests are carried out between steps. From any thread."""
-        self._run.control.toggle(request)
-
     def park(self) -> None:
         """End the run after this step with the arm lifted and parked; no more questions are asked. From any thread."""
-        self._run.control.park()
+        self.control.park()
         self._run.asker.abandon()
 
     def answer(self, number: int, key: str) -> bool:
@@ -153,23 +145,15 @@ class Engine:
         any other signal stop at once, also while the arm is being parked."""
         (self.park if signal_number == signal.SIGHUP else self.stop)()
 
-    def pause(self) -> None:
-        """Pause before the next step."""
-        self._run.control.pause()
-
-    def resume(self) -> None:
-        """Go on after a pause, or cancel one that has not begun."""
-        self._run.control.resume()
-
     def stop(self) -> None:
         """Stop the arm now and end the run; from any thread, in any state, any number of times."""
-        self._run.control.stop(self._stop_now)
+        self.control.stop(self._stop_now)
 
     def _stop_now(self) -> None:
         if self._stopper is None or self._stopper.done():
             self._stopper = asyncio.create_task(self._stop_arm(), name="stop")
         # Once everything is collected the arm is parked, and the merge must not be cut short.
-        if self._task is not None and not self._run.control.closing and not self._task.cancelling():
+        if self._task is not None and not self.control.closing and not self._task.cancelling():
             self._task.cancel()
 
     async def _stop_arm(self) -> None:
@@ -192,7 +176,7 @@ class Engine:
 
     async def _main(self) -> None:
         self._task = asyncio.create_task(self._session(), name="session")
-        self._run.control.entered(self._task)
+        self.control.entered(self._task)
         try:
             await self._until_stopped(self._task)
         except CollectAborted as error:
@@ -232,7 +216,7 @@ class Engine:
             try:
                 strokes = run.progress.opened(store)
                 begun = f"resumed with {strokes} strokes" if strokes else "session"
-                run.progress.log(BEGUN_DRY if dry else f"{begun}: {store.folder}")
+                run.progress.log("dry run: nothing is pressed, dipped or kept" if dry else f"{begun}: {store.folder}")
                 if (self._request.armed or not rig.simulated) and not dry and not self._rig_config.self_check.enabled:
                     run.progress.log(UNCHECKED, warning=True)
                 if live is not None:
@@ -243,7 +227,7 @@ class Engine:
                 run.control.begin_closing()
                 run.progress.doing("merge and verify")
                 final = await uninterrupted(store.close)
-                run.progress.log(OVER_DRY if dry else f"closed: {final}")
+                run.progress.log("dry run: every move was made" if dry else f"closed: {final}")
                 run.progress.over()
             finally:
                 with contextlib.suppress(DeviceError):
@@ -276,12 +260,12 @@ class Engine:
     @contextlib.contextmanager
     def _waiting(self) -> Generator[None]:
         """While a question waits, the run is asking."""
-        self._run.control.move_to(State.ASKING)
+        self.control.move_to(State.ASKING)
         try:
             with self._run.progress.meanwhile("wait for an answer"):
                 yield
         finally:
-            self._run.control.move_to(State.RUNNING)
+            self.control.move_to(State.RUNNING)
 
     def _end(self, state: State, error: Exception) -> None:
         """End with `error`, whose message says so if the arm may move or the brush may be down. The session keeps it
@@ -291,7 +275,7 @@ class Engine:
             error.add_note(NOT_AT_REST)
         if tip_mm is not None and (self._rest_unknown or tip_mm[2] < config.motion.safe_z_mm - PARKED_MM):
             error.add_note(brush_may_be_down(tip_mm[2] - config.paper.touch_z_mm))
-        self._run.control.end(state)
+        self.control.end(state)
         self._run.progress.over(describe(error))
         if self._store is not None:
             with contextlib.suppress(SessionError):

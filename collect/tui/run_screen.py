@@ -218,16 +218,16 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
 
     def action_pause(self) -> None:
         """Pause before the next step."""
-        self.engine.pause()
+        self.engine.control.pause()
 
     def action_go_on(self) -> None:
         """Go on after a pause."""
-        self.engine.resume()
+        self.engine.control.resume()
 
     def action_request(self, name: str) -> None:
         """Send the engine a request, or withdraw it."""
         if time.monotonic() >= self._deaf_until_s:
-            self.engine.request(OperatorRequest[name])
+            self.engine.control.toggle(OperatorRequest[name])
 
     def action_mark_last(self) -> None:
         """Mark the newest capture bad, or good again; the mark is on disk at once."""

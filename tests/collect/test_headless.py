@@ -155,7 +155,7 @@ def test_a_folder_that_may_not_be_written_is_refused_before_anything_is_connecte
 def test_the_snapshot_says_for_how_long_no_pose_has_come(bare_lab: Lab) -> None:
     engine, faults = bare_lab.engine(), bare_lab.rig.faults
     assert engine.snapshot().no_pose_s is None, "not connected yet"
-    engine.pause()
+    engine.control.pause()
     engine.start()
     until(engine, lambda now: now.state is State.PAUSED and now.tip_mm is not None)
     faults.hang(Fault(device=Device.TELEMETRY, kind="mute", count=ALWAYS))

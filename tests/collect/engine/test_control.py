@@ -112,8 +112,8 @@ def test_a_request_made_twice_is_withdrawn_and_retake_and_skip_exclude_each_othe
 def test_the_operator_asks_for_a_new_sheet_and_for_another_take_of_the_first_stroke_on_it(lab: Lab) -> None:
     lab.write_protocol("[11.0]")
     engine = lab.engine(on_screen=True)
-    engine.request(OperatorRequest.RETAKE)
-    engine.request(OperatorRequest.NEW_SHEET)
+    engine.control.toggle(OperatorRequest.RETAKE)
+    engine.control.toggle(OperatorRequest.NEW_SHEET)
     engine.start()
     answer(engine, "Replace sheet 1 by a blank one", "g")
     wait_for_end(engine)
@@ -129,7 +129,7 @@ def test_the_operator_asks_for_a_new_sheet_and_for_another_take_of_the_first_str
 def test_what_is_left_out_stays_so_and_what_is_marked_bad_is_pressed_again_at_the_end_exactly_once(lab: Lab) -> None:
     lab.write_protocol("[11.0, 13.0, 15.0]", "[0.0]")
     first = lab.engine(on_screen=True)
-    first.request(OperatorRequest.SKIP)
+    first.control.toggle(OperatorRequest.SKIP)
     first.start()
     last = until(first, lambda now: now.strokes_done == 1 and now.last is not None).last
     assert last is not None
@@ -158,7 +158,7 @@ def test_the_paper_is_found_again_by_jog_and_a_jog_that_is_given_up_or_not_taken
     lab.write_protocol("[11.0, 13.0, 15.0]", "[0.0]")
     lab.edit_rig("[paper]", '[touch]\nmethod = "jog"\ntouches = 1\n\n[paper]')
     engine = lab.engine(on_screen=True)
-    engine.request(OperatorRequest.JOG)
+    engine.control.toggle(OperatorRequest.JOG)
     engine.start()
     answer(engine, "Touch 1 of 1.", "x")
     answer(engine, "the operator gave up at touch 1 of 1", "g")  # the set-up cannot do without
@@ -168,10 +168,10 @@ def test_the_paper_is_found_again_by_jog_and_a_jog_that_is_given_up_or_not_taken
     answer(engine, "+2.00 mm", "1")  # as it was requested
     answer(engine, "+1.00 mm", "t")
     answer(engine, "found +1.", "g")
-    engine.request(OperatorRequest.JOG)
+    engine.control.toggle(OperatorRequest.JOG)
     answer(engine, "Touch 1 of 1.", "t")
     answer(engine, "found +1.", "k")
-    engine.request(OperatorRequest.JOG)
+    engine.control.toggle(OperatorRequest.JOG)
     answer(engine, "Touch 1 of 1.", "x")
     wait_for_end(engine)
     now = engine.snapshot()
@@ -194,10 +194,10 @@ def test_a_jog_between_strokes_that_fails_leaves_the_paper_where_it_was(
 
     monkeypatch.setattr(Run, "perform", performed)
     engine = lab.engine(on_screen=True)
-    engine.request(OperatorRequest.JOG)
+    engine.control.toggle(OperatorRequest.JOG)
     engine.start()
     answer(engine, "the force reached 6.00 N", "g")  # looked at before the arm moves
-    engine.request(OperatorRequest.JOG)
+    engine.control.toggle(OperatorRequest.JOG)
     wait_for_end(engine)
     assert (engine.snapshot().strokes_done, errors) == (2, [])
     assert [result.method for result in lab.state.results(ZeroTouchResult)] == ["taught"]

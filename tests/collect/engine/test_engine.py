@@ -234,7 +234,7 @@ UNDER = brush_pose(480.0, 40.0, PAPER_Z_MM - 20.0, tilt_deg=10.0)
 
 def pause_after(engine: Engine, strokes: int = 1) -> None:
     until(engine, lambda now: now.strokes_done == strokes)
-    engine.pause()
+    engine.control.pause()
     until(engine, lambda now: now.state is State.PAUSED)
 
 
@@ -279,7 +279,7 @@ def test_an_arm_that_was_moved_in_a_pause_first_goes_up_along_its_tool_once_it_i
     pause_after(engine)
     second_client(lab, engine, UNDER)
     sent.clear()
-    engine.resume()
+    engine.control.resume()
     pause_after(engine, 2)
     assert_up_along_the_tool_first(sent)
     [warning] = [line for line in engine.snapshot().messages if "from where it was left" in line]
@@ -287,7 +287,7 @@ def test_an_arm_that_was_moved_in_a_pause_first_goes_up_along_its_tool_once_it_i
 
     second_client(lab, engine, brush_pose(480.0, 40.0, 250.0, tilt_deg=60.0))
     sent.clear()
-    engine.resume()
+    engine.control.resume()
     prompt = question(engine, "the arm stands where tilt = 60.000 deg")
     assert "Jog the arm up" in prompt.question
     assert not sent
@@ -338,7 +338,7 @@ def test_what_a_second_client_did_in_a_pause_is_asked_about_before_anything_move
         pause_after(engine, done)
         second_client(lab, engine, **calls(lab))
         sent = lines_sent(lab)
-        engine.resume()
+        engine.control.resume()
         prompt = question(engine, asks)
         assert prompt.default == "x"
         assert not sent

@@ -298,7 +298,7 @@ def test_a_pause_lasts_until_it_is_ended_and_an_end_at_travel_height_does_not_sp
     lab: Lab, ends: str
 ) -> None:
     engine = lab.started()
-    engine.pause()
+    engine.control.pause()
     until(engine, lambda now: now.state is State.PAUSED)
     later_s = lab.rig.time.now_s + 10.0
     until(engine, lambda _: lab.rig.time.now_s > later_s)

@@ -168,6 +168,7 @@ class FakeEngine:
         self.calls: list[str] = []
         self.looks = 0
         self.finished = False
+        self.control = self
 
     def snapshot(self) -> Snapshot:
         self.looks += 1
@@ -183,7 +184,7 @@ class FakeEngine:
         self.calls.append(f"answer {number} {key}")
         return True
 
-    def request(self, request: OperatorRequest) -> None:
+    def toggle(self, request: OperatorRequest) -> None:
         self.calls.append(f"request {request.name}")
         self.now = replace(self.now, requests=(*self.now.requests, request))
 
