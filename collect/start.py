@@ -23,13 +23,11 @@ from brushloop.collect.engine.snapshot import REFRESH_S, Snapshot, eta_text, no_
 from brushloop.collect.errors import StrokesLeftOut
 from brushloop.collect.operator import stop_signals
 from brushloop.collect.protocols.config import load_protocol
+from brushloop.collect.protocols.kinds import WriteConfig
 from brushloop.collect.rig.config import load_rig
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.terminal import plain_console, say
-
-PRESSES = frozenset({"grid", "few-strokes", "list"})
-"""Protocols whose recording can be analysed by itself; after others, no single next command exists."""
 
 
 def run(request: CollectRequest) -> None:
@@ -58,12 +56,12 @@ def collect(request: CollectRequest) -> Snapshot:
     Raises the error that ended the run.
     """
     opening = Opening.load(_settled(request))
-    with contextlib.ExitStack() as stack:
-        if request.live:
-            live = stack.enter_context(contextlib.closing(LiveView(request.live_port)))
-            opening = replace(opening, live=live)
-        now = _run(opening).snapshot()
-    say(*ending(Path(now.folder), opening.protocol.kind))
+    with contextlib.closing(LiveView(request.live_port)) if request.live else contextlib.nullcontext() as live:
+        now = _run(replace(opening, live=live)).snapshot()
+    folder = Path(now.folder)
+    say(f"recorded: {folder / folder.name}.mcap")
+    if not isinstance(opening.protocol, WriteConfig):  # characters are analysed together with their plan
+        say(f"next:     brushloop analyse {folder}")
     return now
 
 
@@ -77,14 +75,6 @@ def collect_session(
     """
     request = CollectRequest(Path(config), Path(protocol), Path(out), sheet=sheet, armed=armed, on_screen=False)
     return Path(collect(request).folder)
-
-
-def ending(folder: Path, kind: str) -> list[str]:
-    """Lines that name the recording of a finished session and the next command; `kind` is its protocol's kind."""
-    lines = [f"recorded: {folder / folder.name}.mcap"]
-    if kind in PRESSES:
-        lines.append(f"next:     brushloop analyse {folder}")
-    return lines
 
 
 def _run(opening: Opening) -> Engine:
