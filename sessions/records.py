@@ -119,9 +119,9 @@ class Check(Event):
     """One quality check of a capture."""
 
     name: str
-    score: float | None = None
-    """Measured value; None if it could not be measured."""
-    threshold: float | None = None
+    score: float
+    """Measured value."""
+    threshold: float
     unit: str = ""
     passed: bool
     reason: str = ""

@@ -63,16 +63,12 @@ def checks_content(checks: Sequence[Check]) -> Content:
     return Content("\n").join(lines or [Content.styled("not judged", "dim")])
 
 
-def _number(value: float | None) -> str:
-    if value is None:
-        return "-"
+def _number(value: float) -> str:
     return f"{value:.2f}" if abs(value) < 10.0 else f"{value:.0f}"
 
 
 def _limit(check: Check) -> str:
-    """`≤ 0.25 mm`, or nothing for a check without a limit."""
-    if check.score is None or check.threshold is None:
-        return ""
+    """`≤ 0.25 mm`."""
     sign = "≤" if (check.score <= check.threshold) == check.passed else "≥"
     return f"{sign} {_number(check.threshold)} {check.unit}".rstrip()
 

@@ -76,7 +76,8 @@ def test_force_and_quality_are_exported_with_each_stroke(make, tmp_path, to):
         for n in range(2)
     ]
     make.take(store, "a press", [*pushes, make.pose(0)], PressResult(press=make.press()), 0)
-    checks = (Check(name="dry", passed=False, reason="is dry"), Check(name="faint", passed=True))
+    dry = Check(name="dry", score=0.2, threshold=0.1, passed=False, reason="is dry")
+    checks = (dry, Check(name="faint", score=0.9, threshold=0.8, passed=True))
     judged = Outgoing(Topic.QUALITY, 30, 30, 0, Quality(stroke_id="H13-a05-r00", checks=checks))
     make.take(store, "a capture", [make.still(0), judged, make.stroke(0)], make.captured("H13-a05-r00", 0))
     store.close()
