@@ -259,7 +259,7 @@ class _Person:
         deadline = time.monotonic() + DAY_WAIT_S
         while time.monotonic() < deadline:
             await self._pilot.pause(0.2)
-            if self._app.steps.finished:
+            if self._app.steps.outcome.done():
                 return None
             prompt = self._app.first_day.prompt
             if prompt is not None and prompt.number > self._number:
@@ -327,7 +327,7 @@ async def _day(lab: UnknownLab, loop: asyncio.AbstractEventLoop) -> None:
                 _save(app, f"first-day-{name}", f"brushloop rig new, loopback rig: {name}")
             sys.stdout.write(f"{prompt.question}\n")
             await person.answer(prompt)
-    app.steps.join()
+    app.steps.outcome.result()
 
 
 def session_picture() -> str:

@@ -66,27 +66,14 @@ class Steps:
         self._runner = asyncio.Runner(loop_factory=asyncio.new_event_loop)
         self._loop = self._runner.get_loop()
         self._task = self._loop.create_task(work())
-        self._outcome = ThreadPoolExecutor(1, "first day").submit(self._run)
-
-    @property
-    def finished(self) -> bool:
-        """Whether it is over."""
-        return self._outcome.done()
-
-    @property
-    def failed(self) -> bool:
-        """Whether it is over because of an error or a stop."""
-        return self.finished and self._outcome.exception() is not None
+        self.outcome = ThreadPoolExecutor(1, "first day").submit(self._run)
+        """The `rig.toml` that was written, or what ended the steps, once they are over."""
 
     def stop(self) -> None:
         """Cancel what is under way: a driver stops its arm before it lets a cancelled move end. From any thread."""
         self._stop_sent = True
         with contextlib.suppress(RuntimeError):  # the loop has just ended
             self._loop.call_soon_threadsafe(self._task.cancel)
-
-    def join(self) -> Path | None:
-        """Wait for the end; return the `rig.toml` that was written, or raise what ended the steps."""
-        return self._outcome.result()
 
     def _run(self) -> Path | None:
         try:
@@ -251,7 +238,7 @@ class CommissionApp(PlainApp):
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
         """Whether there is something to stop."""
-        return not self.steps.finished if action == "stop" else super().check_action(action, parameters)
+        return not self.steps.outcome.done() if action == "stop" else super().check_action(action, parameters)
 
     def action_stop(self) -> None:
         """Stop whatever is under way, and say so at once."""
@@ -262,7 +249,7 @@ class CommissionApp(PlainApp):
         """Leave; where something is at work, ask first."""
         if isinstance(self.screen, AskScreen):
             return
-        if self.steps.finished:
+        if self.steps.outcome.done():
             self.exit()
         elif self.first_day.prompt is not None:
             self._visit.asker.abandon(LeftOff)
@@ -278,10 +265,11 @@ class CommissionApp(PlainApp):
         """Draw; a step that was stopped or failed ends the app, and is reported in the terminal."""
         if not self.is_running or not self.first_day.is_mounted:
             return
-        if self.steps.failed or (self._leaving and self.steps.finished):
+        over = self.steps.outcome.done()
+        if over and (self._leaving or self.steps.outcome.exception() is not None):
             self.exit()
         else:
-            self.first_day.show(over=self.steps.finished)
+            self.first_day.show(over=over)
 
 
 def run_commission(visit: Visit, work: Work) -> Path | None:
@@ -295,6 +283,6 @@ def run_commission(visit: Visit, work: Work) -> Path | None:
             app.run()
         finally:
             visit.asker.abandon(LeftOff)
-            if not app.steps.finished:
+            if not app.steps.outcome.done():
                 app.steps.stop()
-    return app.steps.join()
+    return app.steps.outcome.result()

@@ -360,4 +360,4 @@ class Asking:
     def end(self) -> None:
         """Stop what a test has left."""
         self.app.steps.stop()
-        wait([self.app.steps._outcome])
+        wait([self.app.steps.outcome])

@@ -80,9 +80,9 @@ async def test_a_number_out_of_range_is_refused_with_the_range() -> None:
 async def test_escape_goes_back_and_q_leaves(keys: list[str], raised: type[Exception]) -> None:
     async with running(Asking(brings)) as (app, pilot):
         await pilot.press(*keys)
-        await until(lambda: app.steps.finished, "the end of the steps")
+        await until(lambda: app.steps.outcome.done(), "the end of the steps")
     with pytest.raises(raised):
-        app.steps.join()
+        app.steps.outcome.result()
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ async def test_a_stop_key_stops_what_is_at_work_and_ends_the_screen(
         await until(lambda: not app.is_running, "the end of the screen")
     assert moves == ["at work", "stopped"]
     with pytest.raises(CollectAborted, match=r"look at the arm\. The same command resumes"):
-        app.steps.join()
+        app.steps.outcome.result()
 
 
 def test_a_second_stop_key_works_at_once() -> None:
@@ -139,4 +139,4 @@ def test_a_second_stop_key_works_at_once() -> None:
     assert moving.wait(PATIENCE_S)
     steps.stop()
     with pytest.raises(CollectAborted):
-        steps.join()
+        steps.outcome.result()
