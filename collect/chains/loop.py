@@ -30,7 +30,6 @@ from brushloop.sessions.terminal import say
 
 SETTINGS, RECOVERED, PROTOCOL, PAGE = "settings.json", "recovered.csv", "protocol-replay.toml", "loop.html"
 LEAST_DEPTH_MM = 2.0
-MAX_CSV_BYTES = 8 * 1024 * 1024
 
 
 def run_loop(request: LoopRequest) -> Path:
@@ -78,7 +77,7 @@ def run_loop(request: LoopRequest) -> Path:
 
 def check_recovered(path: Path) -> None:
     """Refuse presses recovered with a model that does not fit this brush."""
-    rows = list(csv.DictReader(io.StringIO(read_text(path, MAX_CSV_BYTES))))
+    rows = list(csv.DictReader(io.StringIO(read_text(path))))
     bound = sum("at_bound" in (row.get("flags") or "") for row in rows)
     if 2 * bound > len(rows):
         share = f"{bound} of {len(rows)} presses were recovered at a bound of the range"

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.errors import CaptureRefused
+from brushloop.calibrate.stroke.preprocess import Gray
 from brushloop.collect.errors import StepError
 from brushloop.collect.rig.config import CameraConfig
 from brushloop.drivers.devices import Camera, Frame, Stamp
 from brushloop.drivers.errors import DeviceError
 from brushloop.drivers.host import alongside, finished
 
-Gray = NDArray[np.uint8]
 Thumbnail = NDArray[np.float32]
 WIDTH_PX = 160
 """Width of a thumbnail. A pixel averages about 2 mm of a sheet: noise is gone, and an arm is tens of pixels wide."""

@@ -181,7 +181,6 @@ def _pieces(ink: Mask) -> tuple[NDArray[np.uint16], int]:
     return np.asarray(cv2.resize(labels, (width, height), interpolation=cv2.INTER_NEAREST), np.uint16), int(count)
 
 
-Floats32 = NDArray[np.float32]
 FINE_PX, WIDE_PX = 1.0, 2.0
 """Two blurs that are added; the ratio of an edge's slopes after each gives the edge's own blur."""
 TILES = 4
@@ -231,7 +230,7 @@ def blur_px(image: Gray) -> float | None:
     return max(blurs_px) if blurs_px else None
 
 
-def _blur_along(fine_smooth: Floats32, wide_smooth: Floats32, kernel: Floats32) -> float | None:
+def _blur_along(fine_smooth: Soft, wide_smooth: Soft, kernel: Soft) -> float | None:
     fine = _slope(fine_smooth, kernel)
     # At the crest of an edge only its blur matters, not the thickness of the line.
     crest = fine == cv2.dilate(fine, np.ones((1, 7) if len(kernel) == 1 else (7, 1), np.uint8))
@@ -247,7 +246,7 @@ def _blur_along(fine_smooth: Floats32, wide_smooth: Floats32, kernel: Floats32) 
     return float(np.sqrt(np.median(np.maximum(own2, 0.0))))
 
 
-def _slope(smooth: Floats32, kernel: Floats32) -> Floats32:
+def _slope(smooth: Soft, kernel: Soft) -> Soft:
     return np.abs(cv2.filter2D(smooth, cv2.CV_32F, kernel)).astype(np.float32)
 
 
@@ -281,7 +280,6 @@ def _morph(image: NDArray[np.uint8], operation: int, width_mm: float) -> NDArray
     return np.asarray(changed[side:-side, side:-side], np.uint8)
 
 
-Bits = NDArray[np.uint8]
 OUTLINE_MM = 1.5
 """Bare streaks narrower than this lie inside a stroke."""
 CLEFT_MM = 0.5
@@ -390,6 +388,6 @@ def _unevenness(own: Mask, dark: Soft, tone: float, rim_mm: float) -> float:
     return float(values.std() / max(float(values.mean()), 1e-3))
 
 
-def _disc(diameter_mm: float) -> Bits:
+def _disc(diameter_mm: float) -> Gray:
     side = round(diameter_mm * PX_PER_MM) | 1
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)), np.uint8)

@@ -20,8 +20,6 @@ from brushloop.collect.protocols.kinds import MAX_STROKES, FewStrokesConfig, Gri
 from brushloop.collect.rig.config_file import read_text, read_toml, refusal
 from brushloop.sessions.disk import MAX_SNAPSHOT_BYTES, as_text, number
 
-MAX_PROTOCOL_BYTES = 4 * 1024 * 1024
-MAX_TABLE_BYTES = 4 * 1024 * 1024
 ProtocolConfig = GridConfig | FewStrokesConfig | ListConfig | WriteConfig
 TaggedProtocol = Annotated[ProtocolConfig, Field(discriminator="kind")]
 _PROTOCOL: TypeAdapter[ProtocolConfig] = TypeAdapter(TaggedProtocol)
@@ -35,7 +33,7 @@ def load_protocol(path: Path) -> ProtocolConfig:
     try:
         if path.suffix == ".json":
             return _PROTOCOL.validate_json(read_text(path, MAX_SNAPSHOT_BYTES))
-        values = read_toml(path, MAX_PROTOCOL_BYTES)
+        values = read_toml(path)
         if "robot" in values and "kind" not in values:
             raise ConfigError(path, "", "is a rig, not a protocol: give it to --config, and the protocol to --protocol")
         return _PROTOCOL.validate_python(values, context=partial(read_rows, path.parent))
@@ -52,7 +50,7 @@ def read_rows(folder: Path, name: object, row: type[_R]) -> list[_R]:
     if not isinstance(name, str) or not name or Path(name).name != name or not name.isprintable() or "\\" in name:
         raise ValueError(f"file: must be the plain name of a file next to it (given: {name!r:.80})")
     path = folder / name
-    lines = csv.reader(io.StringIO(read_text(path, MAX_TABLE_BYTES, "utf-8-sig"), newline=""), strict=True)
+    lines = csv.reader(io.StringIO(read_text(path, encoding="utf-8-sig"), newline=""), strict=True)
     rows: list[_R] = []
     try:
         columns = [cell.strip() for cell in next(lines, list[str]())]

@@ -25,7 +25,6 @@ from brushloop.drivers.limits import Finite, Limits
 from brushloop.sessions.errors import InputError
 
 PREFIX, DELIMITER = "BRUSHLOOP_", "__"
-MAX_CONFIG_BYTES = 1024 * 1024
 TRAVEL_CLEARANCE_MM = 15.0
 """Minimum travel height above the paper: more than the length of a drop hanging from the tip."""
 Method = Literal["taught", "force", "camera", "jog"]
@@ -332,7 +331,7 @@ def load_rig(path: Path) -> RigConfig:
     """Read `rig.toml` and its lens file, with overrides from the environment. Raises `ConfigError`."""
     if not path.exists():
         raise ConfigError(path, "", "no such file: `brushloop rig new` and `brushloop sim --write-rig` make one")
-    values, environment = read_toml(path, MAX_CONFIG_BYTES), overrides()
+    values, environment = read_toml(path), overrides()
     if "kind" in values and "robot" not in values:
         raise ConfigError(path, "", "is a protocol, not a rig: give it to --protocol, and the rig to --config")
     for field, name in environment.items():

@@ -30,7 +30,11 @@ class Config(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
 
-def read_text(path: Path, max_bytes: int, encoding: str = "utf-8") -> str:
+MAX_BYTES = 8 * 1024 * 1024
+"""Most that a file of a person may hold: far more than the longest protocol."""
+
+
+def read_text(path: Path, max_bytes: int = MAX_BYTES, encoding: str = "utf-8") -> str:
     """The text of a plain file. Raises `ConfigError` that names the file."""
     try:
         # Line ends of any system, as in a file opened as text.
@@ -41,10 +45,10 @@ def read_text(path: Path, max_bytes: int, encoding: str = "utf-8") -> str:
         raise ConfigError(path, "", f"is not UTF-8 at byte {error.start}") from None
 
 
-def read_toml(path: Path, max_bytes: int) -> dict[str, Any]:
+def read_toml(path: Path) -> dict[str, Any]:
     """The tables of a TOML file. Raises `ConfigError` that names the file."""
     try:
-        return tomllib.loads(read_text(path, max_bytes))
+        return tomllib.loads(read_text(path))
     except ValueError as error:  # also for a number of thousands of digits
         raise ConfigError(path, "", f"is not TOML: {error}") from None
     except RecursionError:

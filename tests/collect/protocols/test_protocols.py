@@ -14,7 +14,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from brushloop.collect.errors import ConfigError
-from brushloop.collect.protocols import config as protocol_config
 from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
 from brushloop.collect.protocols.kinds import (
     DrawnStroke,
@@ -237,17 +236,13 @@ def test_rows_become_part_of_the_protocol_and_an_empty_cell_is_left_out(tmp_path
     assert load(tmp_path, LIST, "depth_mm\n13\n").model_dump_json() != listed.model_dump_json()
 
 
-def test_rows_and_bytes_are_bounded_and_what_is_no_file_is_not_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rows_and_bytes_are_bounded_and_what_is_no_file_is_not_read(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"p.csv: line 10002: more than 10000 rows"):
         load(tmp_path, LIST, "depth_mm\n" + "11\n" * 10_001)
-    monkeypatch.setattr(protocol_config, "MAX_TABLE_BYTES", 1000)
-    with pytest.raises(ConfigError, match=r"p.csv: is larger than 1000 bytes"):
-        load(tmp_path, LIST, "depth_mm\n" + "11\n" * 1000)
-    monkeypatch.setattr(protocol_config, "MAX_PROTOCOL_BYTES", 100)
-    with pytest.raises(ConfigError, match=r"protocol.toml: is larger than 100 bytes"):
-        load(tmp_path, LIST + "#" * 200, "depth_mm\n11\n")
+    with pytest.raises(ConfigError, match=r"p.csv: is larger than 8388608 bytes"):
+        load(tmp_path, LIST, "depth_mm\n" + "11\n" * 3_000_000)
+    with pytest.raises(ConfigError, match=r"protocol.toml: is larger than 8388608 bytes"):
+        load(tmp_path, LIST + "#" * 9_000_000, "depth_mm\n11\n")
     (tmp_path / "p.csv").unlink()
     os.mkfifo(tmp_path / "p.csv")
     with pytest.raises(ConfigError, match=r"p.csv: is not a file"):
