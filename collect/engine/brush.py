@@ -90,7 +90,8 @@ async def mark(context: StepContext, step: PressStep) -> PressResult:
 
 async def zero_touch(context: StepContext, step: ZeroTouchStep) -> ZeroTouchResult:
     """The ZERO_TOUCH step: set the light, measure the force sensor's bias and the paper's plane, and check that every
-    planned pose still lies within the limits."""
+    planned pose still lies within the limits. Between strokes a person is asked before they are pressed from the new
+    height. Raises `StepError` if the answer is no."""
     run = context.run
     rig = run.rig
     if rig.ink is not None:
@@ -102,10 +103,8 @@ async def zero_touch(context: StepContext, step: ZeroTouchStep) -> ZeroTouchResu
         await within_limits("", rig.config, step_poses(rig.config, run.procedures.plane, step))
     touch = touch_of(rig.config, step)
 
-    def tell(doing: str) -> None:
-        run.progress.doing(f"zero touch by {touch.method}: {doing}")
-
     dip, push = partial(fill_brush, context), partial(average, context.guard.listeners)
+    tell = run.progress.doing
     measuring = measure_plane(run.procedures, touch, dip=dip, average=push, asker=run.asker, tell=tell)
     measured = await context.guard.guarded(measuring)
     plane = plane_of(measured)
@@ -120,20 +119,15 @@ async def zero_touch(context: StepContext, step: ZeroTouchStep) -> ZeroTouchResu
             f"{moved_mm:+.2f} mm from the plane known before"
         )
     if step.between_strokes:
-        await _accepted(context, moved_mm)
+        text = f"The paper was found {moved_mm:+.2f} mm from where it was. From now on, H is counted from there."
+        choices = (Choice("g", "good, use the new height"), Choice("k", "keep the old height"))
+        if await run.asker.ask(Prompt(text, choices, "k")) != "g":
+            raise StepError("the new height was not accepted.")
     run.procedures.plane = plane
     context.recorder.paper(*plane.frame(rig.config.paper))
     if (optics := rig.config.camera.optics) is not None:
         context.recorder.optics(optics)
     return measured.model_copy(update={"moved_mm": moved_mm})
-
-
-async def _accepted(context: StepContext, moved_mm: float) -> None:
-    """Ask a person before strokes are pressed from a new height. Raises `StepError` if the answer is no."""
-    text = f"The paper was found {moved_mm:+.2f} mm from where it was. From now on, H is counted from there."
-    choices = (Choice("g", "good, use the new height"), Choice("k", "keep the old height"))
-    if await context.run.asker.ask(Prompt(text, choices, "k")) != "g":
-        raise StepError("the new height was not accepted.")
 
 
 async def check_rig(context: StepContext) -> SelfCheckResult:

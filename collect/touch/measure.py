@@ -69,7 +69,7 @@ async def _by_force_or_jog(
             if config.method == "jog":
                 touches.append(Touch(*point, await _jogged(procedures, config, asker, name, point, reach)))
                 continue
-            tell(f"{name}: down until the force shows the paper")
+            tell(f"zero touch by force: {name}: down until the force shows the paper")
             near_z_mm = touches[-1].z_mm if touches else None
             contact = await touch_by_force(rest, reach, config.force, spring, near_z_mm)
             touches.append(Touch(*point, contact.z_mm, contact.sigma_mm))
