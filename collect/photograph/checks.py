@@ -107,7 +107,21 @@ class Photograph:
 
     def check_frame(self) -> Verdict:
         """Check exposure and blur, as before any press or for the board's picture."""
-        return Verdict(tuple(judge_frame(self.image, self.plane, self.limits)))
+        # The paper is neither dark nor saturated.
+        level, limits, reason = measure.paper_level(self.image), self.limits, ""
+        if level < limits.dark_level:
+            reason = f"The picture is too dark: paper at {level:.0f} of 255. Turn the light on or expose longer."
+        if level >= limits.bright_level:
+            reason = f"The picture is too bright: paper at {level:.0f} of 255. Expose shorter or dim the light."
+        limit = limits.dark_level if level < 0.5 * (limits.dark_level + limits.bright_level) else limits.bright_level
+        checks = [_check(Failure.EXPOSURE, level, "of 255", limit, reason, passed=not reason)]
+        # Edges are sharp where the picture has most contrast; there is none where a bare sheet fills it.
+        if (sigma_px := measure.blur_px(measure.busiest_tile(self.image))) is not None:
+            sigma_mm = sigma_px * self.plane.mm_per_px
+            blurred = f"The picture is blurred by {sigma_mm:.2f} mm."
+            reason = f"{blurred} Focus the lens, clean it, and see that nothing shakes."
+            checks.append(_check(Failure.BLURRED, sigma_mm, "mm", limits.blur_mm, reason))
+        return Verdict(tuple(checks))
 
     def check_press(self, patch: Patch, depth_mm: float) -> Verdict:
         """Judge one press of commanded depth `depth_mm`, by the checks that no earlier failure makes meaningless."""
@@ -191,24 +205,6 @@ def _check(name: Failure, score: float, unit: str, limit: float, reason: str, *,
     """A check whose `reason` counts only if it failed; unless `passed` is given, the score must be below the limit."""
     passed = score < limit if passed is None else passed
     return Check(name=name, score=score, threshold=limit, unit=unit, passed=passed, reason="" if passed else reason)
-
-
-def judge_frame(image: Gray, plane: Plane, limits: QualityConfig) -> Iterator[Check]:
-    """The checks of a photograph, whatever it shows."""
-    # The paper is neither dark nor saturated.
-    level = measure.paper_level(image)
-    reason = ""
-    if level < limits.dark_level:
-        reason = f"The picture is too dark: paper at {level:.0f} of 255. Turn the light on or expose longer."
-    if level >= limits.bright_level:
-        reason = f"The picture is too bright: paper at {level:.0f} of 255. Expose shorter or dim the light."
-    limit = limits.dark_level if level < 0.5 * (limits.dark_level + limits.bright_level) else limits.bright_level
-    yield _check(Failure.EXPOSURE, level, "of 255", limit, reason, passed=not reason)
-    # Edges are sharp where the picture has most contrast; there is none where a bare sheet fills it.
-    if (sigma_px := measure.blur_px(measure.busiest_tile(image))) is not None:
-        sigma_mm = sigma_px * plane.mm_per_px
-        reason = f"The picture is blurred by {sigma_mm:.2f} mm. Focus the lens, clean it, and see that nothing shakes."
-        yield _check(Failure.BLURRED, sigma_mm, "mm", limits.blur_mm, reason)
 
 
 def cut(ink: Ink, plane: Plane, shape: tuple[int, ...], anchor_mm: Point, limits: QualityConfig) -> Check:
