@@ -123,15 +123,6 @@ def rest_is_unknown(error: BaseException | None) -> bool:
     return isinstance(error, DeviceError) and error.device == "robot" and not isinstance(error, known)
 
 
-def brush_may_be_down(above_mm: float) -> str:
-    """What a run says that ends with the tip below travel height, last seen `above_mm` above the paper."""
-    where = f"{abs(above_mm):.1f} mm {'above' if above_mm > 0.0 else 'below'} the height of the paper"
-    return (
-        f"The brush may be down: its tip was last seen {where}. Clear the way above it, then start the same command "
-        "again, which first lifts the brush along its axis; or lift it with the pendant."
-    )
-
-
 def describe(error: BaseException) -> str:
     """The message of an error with its notes: one of them may say that the arm still moves."""
     message, notes = str(error) or type(error).__name__, getattr(error, "__notes__", [])

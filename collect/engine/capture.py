@@ -65,10 +65,7 @@ async def decide(
 def marked_bad(run: RunContext) -> list[str]:
     """Strokes that count, are marked bad, and were not listed by a REVIEW step yet, in the order in which they were
     made. Raises `SessionDamaged`."""
-    bad = bad_stills(run.store.folder)
-    if not bad:
-        return []
-    state = run.store.state
+    bad, state = bad_stills(run.store.folder), run.store.state
     listed = {again.stroke_id for review in state.results(ReviewResult) for again in review.again}
     captures = state.results(CaptureResult)
     counted = [capture.press.stroke_id for capture in captures if capture.kept and capture.still in bad]

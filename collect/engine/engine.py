@@ -23,14 +23,7 @@ from brushloop.collect.engine.policy import resume_question
 from brushloop.collect.engine.recorder import uninterrupted
 from brushloop.collect.engine.run import Run
 from brushloop.collect.engine.snapshot import Progress, Snapshot
-from brushloop.collect.errors import (
-    NOT_AT_REST,
-    CollectAborted,
-    ConfigError,
-    brush_may_be_down,
-    describe,
-    rest_is_unknown,
-)
+from brushloop.collect.errors import NOT_AT_REST, CollectAborted, ConfigError, describe, rest_is_unknown
 from brushloop.collect.operator import Asker, Choice, Prompt
 from brushloop.collect.photograph.frames import each_frame
 from brushloop.collect.rig.devices import Rig, connected
@@ -274,7 +267,12 @@ class Engine:
         if self._rest_unknown:
             error.add_note(NOT_AT_REST)
         if tip_mm is not None and (self._rest_unknown or tip_mm[2] < config.motion.safe_z_mm - PARKED_MM):
-            error.add_note(brush_may_be_down(tip_mm[2] - config.paper.touch_z_mm))
+            above_mm = tip_mm[2] - config.paper.touch_z_mm
+            where = f"{abs(above_mm):.1f} mm {'above' if above_mm > 0.0 else 'below'} the height of the paper"
+            error.add_note(
+                f"The brush may be down: its tip was last seen {where}. Clear the way above it, then start the same "
+                "command again, which first lifts the brush along its axis; or lift it with the pendant."
+            )
         self.control.end(state)
         self._run.progress.over(describe(error))
         if self._store is not None:

@@ -165,7 +165,8 @@ Page up and down turn the pages of what was found.
         visit, prompt = self._visit, self._visit.asker.prompt
         self._title.show(f"First day   {one_line(str(visit.rig_path))}   {plain(visit.step)}")
         self._picture.show(visit.picture if visit.live is None else visit.live)
-        self._found.show(Content("\n").join(_finding(*finding) for finding in tuple(visit.findings)))
+        found = [(text, *TONES[tone]) for tone, text in tuple(visit.findings)]
+        self._found.show(Content("\n").join(Content.styled(sign + plain(text), style) for text, sign, style in found))
         if prompt is not self.prompt or over != self._over:
             self._over = over
             self._ask(prompt)
@@ -209,11 +210,6 @@ Page up and down turn the pages of what was found.
                 self._settle(self.prompt.read(event.value.strip() or self.prompt.default))
             except ValueError as error:
                 self._asked.show(Content("\n").join([question_content(self.prompt), trouble(error)]))
-
-
-def _finding(tone: Tone, text: str) -> Content:
-    sign, style = TONES[tone]
-    return Content.styled(sign + plain(text), style)
 
 
 class CommissionApp(PlainApp):
