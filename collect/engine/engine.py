@@ -17,15 +17,16 @@ from collections.abc import Callable, Generator
 from pathlib import Path
 
 from brushloop.collect.engine.control import FINAL, State
-from brushloop.collect.engine.live import picture_of
+from brushloop.collect.engine.live import no_wider
 from brushloop.collect.engine.open_or_resume import Opening, find_resumable, open_store
 from brushloop.collect.engine.policy import resume_question
 from brushloop.collect.engine.recorder import uninterrupted
 from brushloop.collect.engine.run import Run
-from brushloop.collect.engine.snapshot import Progress, Snapshot
+from brushloop.collect.engine.snapshot import Picture, Progress, Snapshot
 from brushloop.collect.errors import NOT_AT_REST, CollectAborted, ConfigError, describe, rest_is_unknown
 from brushloop.collect.operator import Asker, Choice, Prompt
 from brushloop.collect.photograph.frames import each_frame
+from brushloop.collect.photograph.measure import blur_px, busiest_tile
 from brushloop.collect.rig.devices import Rig, connected
 from brushloop.collect.walk import check_protocol, sheet_of
 from brushloop.drivers.devices import Frame
@@ -38,6 +39,8 @@ from brushloop.sessions.store import SessionStore
 
 PARKED_MM = 2.0
 """Distance from the park position, in mm, within which the arm counts as parked."""
+PICTURE_PX = 320
+"""Largest width of the camera's picture on a screen."""
 SILENT_MS = 1000.0
 """Time without a pose after which the snapshot says so: the arm or the connection to it has failed."""
 UNCHECKED = (
@@ -94,7 +97,7 @@ class Engine:
         state = self.control.state
         if (rig := self._rig) is not None:
             try:
-                tip_mm = self._see_tip(rig)
+                tip_mm = self._run.progress.tip_mm = rig.robot.latest().pose.position_mm
             except Stale as stale:
                 if stale.age_ms >= SILENT_MS and state not in FINAL:
                     no_pose_s = stale.age_ms / 1e3
@@ -117,12 +120,9 @@ class Engine:
             no_pose_s=no_pose_s,
         )
 
-    def _see_tip(self, rig: Rig) -> tuple[float, float, float]:
-        self._run.progress.tip_mm = rig.robot.latest().pose.position_mm
-        return self._run.progress.tip_mm
-
     def _show_frame(self, frame: Frame) -> None:
-        self._run.progress.picture = picture_of(frame)
+        blur = blur_px(busiest_tile(frame.image))
+        self._run.progress.picture = Picture(no_wider(frame.image, PICTURE_PX), blur)
 
     def park(self) -> None:
         """End the run after this step with the arm lifted and parked; no more questions are asked. From any thread."""
@@ -223,8 +223,7 @@ class Engine:
                 run.progress.log("dry run: every move was made" if dry else f"closed: {final}")
                 run.progress.over()
             finally:
-                with contextlib.suppress(DeviceError):
-                    self._see_tip(rig)
+                self.snapshot()  # the last look at the tip
         run.control.end(State.DONE)
 
     async def _permitted(self, rig: Rig) -> None:

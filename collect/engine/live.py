@@ -1,4 +1,4 @@
-"""The camera's picture while a run goes on, for a screen; and `--live`, which shows the run in a Foxglove viewer."""
+"""`--live`, which shows a run in a Foxglove viewer while it goes on."""
 
 from __future__ import annotations
 
@@ -10,9 +10,7 @@ import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from numpy.typing import NDArray
 
-from brushloop.collect.engine.snapshot import Picture
 from brushloop.collect.errors import ConfigError
-from brushloop.collect.photograph.measure import blur_px, busiest_tile
 from brushloop.drivers.devices import Frame
 from brushloop.sessions.mcap_writer import Outgoing, channel_of, encoded
 from brushloop.sessions.messages import image_message
@@ -22,18 +20,11 @@ if TYPE_CHECKING:
     from foxglove import Channel
     from google.protobuf.message import Message
 
-WIDTH_PX = 320
 
-
-def _no_wider(image: NDArray[np.uint8], width_px: int) -> NDArray[np.uint8]:
+def no_wider(image: NDArray[np.uint8], width_px: int) -> NDArray[np.uint8]:
     """The image, reduced if it is wider."""
     scale = min(1.0, width_px / image.shape[1])
     return np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def picture_of(frame: Frame) -> Picture:
-    """What a screen shows of a frame of the camera."""
-    return Picture(_no_wider(frame.image, WIDTH_PX), blur_px(busiest_tile(frame.image)))
 
 
 HOST = "127.0.0.1"
@@ -84,7 +75,7 @@ class LiveView:
         """Show a camera frame as a small JPEG."""
         stamp_ns = frame.stamp.host_ns
         if self._channel(Topic.PREVIEW, CompressedImage).has_sinks():
-            small = _no_wider(frame.image, PREVIEW_PX)
+            small = no_wider(frame.image, PREVIEW_PX)
             _, jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
             message = image_message(stamp_ns, jpeg.tobytes(), "jpeg")
             self.offer(Outgoing(Topic.PREVIEW, stamp_ns, stamp_ns, 0, message))
