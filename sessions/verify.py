@@ -164,12 +164,14 @@ def _rebuild_steps(evidence: Evidence) -> None:
             evidence.rebuilt.append(begin)
     latest: dict[str, int] = {}
     for begin in begun.values():
-        latest[begin.key] = max(latest.get(begin.key, 0), begin.attempt)
+        # A set-up step is done again for another sheet: an attempt that only a file proves does not end an earlier one.
+        if begin.kind in (StepKind.PRESS, StepKind.CAPTURE) or begin in known:
+            latest[begin.key] = max(latest.get(begin.key, 0), begin.attempt)
     over = _over(known)
     for name, step in steps:
         if isinstance(step, Begin) or name.endswith(".part"):
             continue
-        if step.attempt == latest[step.key] and over.isdisjoint((step.file, (step.key, step.attempt))):
+        if step.attempt >= latest.get(step.key, 0) and over.isdisjoint((step.file, (step.key, step.attempt))):
             over.add(step.file)
             # An empty digest matches no file, so a damaged file is found and repaired like any other.
             file = evidence.files[name]

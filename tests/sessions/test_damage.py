@@ -17,7 +17,7 @@ from brushloop.sessions.show import Summary, details, summaries
 from brushloop.sessions.verify import verify_session
 from tests.command import brushloop
 from tests.journal_lines import read_lines
-from tests.sessions.conftest import no_space
+from tests.sessions.conftest import BOARD, no_space
 
 ID, OTHER = "2026-01-02-grid-01", "2026-01-03-grid-01"
 BOTH = ("H13-a05-r00", "H13-a05-r01")
@@ -260,6 +260,16 @@ def test_a_rebuilt_journal_is_the_one_that_was(make, opened, repair, resume):
     assert sorted(lines(), key=str) == sorted(before, key=str)
     store = resume(opened)
     assert (store.header, store.state.used_patches) == (make.header, {(0, 0), (0, 1), (0, 2)})
+
+
+def test_the_set_up_of_a_sheet_is_rebuilt_though_it_was_done_again_for_the_next(make, opened, repair, resume):
+    store = resume(opened)
+    store.fresh_sheet()
+    make.take(store, "board", [make.still(1001)], BOARD)
+    store.release()
+    (opened / JOURNAL_NAME).unlink()
+    repair(opened)
+    assert [step.attempt for step in resume(opened).state.files.values() if step.key == "board"] == [1, 2]
 
 
 def test_a_stroke_that_stands_twice_in_a_lone_recording_comes_back_once(make, tmp_path, repair):
