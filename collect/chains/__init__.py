@@ -56,3 +56,5 @@ class DemoRequest:
     out: Annotated[Path, Option(help="Folder for everything that the demo makes.")] = Path("demo-run")
     full: Annotated[bool, Option("--full", help="More presses, and a written character: all three tables.")] = False
     brush: Annotated[Path, Option(help="The rig's brush: `table2`, `loopback`, or a brush.toml.")] = Path("table2")
+    show: Annotated[bool, Option("--open", help="Open the report in the browser at the end.")] = False
+    verbose: Annotated[bool, Option("--verbose", help="Show all that the steps print, instead of in demo.log.")] = False

@@ -7,8 +7,9 @@ blank sheet: what a step has finished is on disk.
 from __future__ import annotations
 
 import time
+import webbrowser
 from collections.abc import Generator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -75,7 +76,8 @@ class Demo:
         self._validated: ValidationOutput
 
     def run(self) -> None:
-        """Run every step, print how well the models predict the strokes and where report and recording lie.
+        """Run every step, print how well the models predict the strokes and where report and recording lie, and
+        open the report if that is asked.
 
         A session without a report is continued; a new one is started only when the last one has its report. Raises
         `ConfigError`, `SessionError`, `CollectAborted`, and at the end `StrokesLeftOut` if some were left out.
@@ -100,7 +102,7 @@ class Demo:
             for number, (title, run) in enumerate(steps, 1):
                 say(f"[{number}/{len(steps)}] {title} ...")
                 step_began_s = time.monotonic()
-                with _logged(asked.out / LOG):
+                with nullcontext() if asked.verbose else _logged(asked.out / LOG):
                     run()
                 say(f"  ✓   {time.monotonic() - step_began_s:.0f} s")
         finally:
@@ -110,6 +112,8 @@ class Demo:
         session = self._session
         say("", f"Done in {time.monotonic() - began_s:.0f} s, simulated: nothing here is a result on paper.")
         say(f"Report: {_report(session)}", f"MCAP:   {session / f'{session.name}.mcap'}")
+        if asked.show:
+            webbrowser.open(_report(session).resolve().as_uri())
         if self._left_out:
             raise StrokesLeftOut(self._left_out)
 

@@ -113,10 +113,15 @@ def run(folder: Path, *more: str) -> None:
     CliRunner().invoke(app, ["demo", "--out", str(folder), *more], catch_exceptions=False)
 
 
-def test_strokes_that_were_left_out_end_in_a_report_and_exit_code_3(chain: Chain, tmp_path: Path) -> None:
+def test_strokes_that_were_left_out_end_in_a_report_that_can_be_opened_and_exit_code_3(
+    chain: Chain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
     chain.left_out = 2
     with pytest.raises(StrokesLeftOut, match="2 strokes failed") as left_out:
-        run(tmp_path, "--full")
+        run(tmp_path, "--open", "--full")
+    assert [url.endswith("grid-1/validation/report.html") for url in opened] == [True]
     assert left_out.value.exit_code == 3
     again = ["calibrate", "fit", "fresh sheet", "loop 15"]
     assert chain.ran == ["rig", "collect", *again, "fresh sheet", "write 字 4", "validate"], "the full demo also writes"
