@@ -29,9 +29,7 @@ rig_app = typer.Typer(
 PICTURES = (".png", ".svg", ".pdf", ".jpg")
 """Endings of a picture's file, which determine its format."""
 RigFile = Annotated[Path, typer.Argument(help="The rig: addresses, frames, limits.")]
-StepArm = Annotated[
-    bool, typer.Option("--arm", help="Let the arm move where a step needs it; a key confirms each time.")
-]
+StepArm = Annotated[bool, typer.Option("--arm", help="Let the arm move where a step needs it; a key asks first.")]
 
 
 app.command("strokes")(command(CollectRequest, "collect.start:run", lambda run, request: run(request)))
@@ -51,12 +49,8 @@ def plan(
     config: Rig = RIG_FILE,
     protocol: Annotated[Path, typer.Option(help="The protocol to plan.")] = PROTOCOL_FILE,
     picture: Annotated[Path | None, typer.Option(help="Draw the sheets: a .png, .svg, .pdf or .jpg.")] = None,
-    arm: Annotated[
-        bool, typer.Option("--arm", help="Plan for a run with --arm, which includes the self-check; moves nothing.")
-    ] = False,
-    ask: Annotated[
-        bool, typer.Option("--ask", help="Ask the arm's controller whether it reaches every pose; moves nothing.")
-    ] = False,
+    arm: Annotated[bool, typer.Option("--arm", help="Plan for a run with --arm, self-check included.")] = False,
+    ask: Annotated[bool, typer.Option("--ask", help="Ask the controller whether it reaches every pose.")] = False,
 ) -> None:
     """Walk through a protocol without moving the arm: limits, sheets, dips, ink, time, and a picture of the sheets."""
     import asyncio
@@ -83,9 +77,7 @@ def plan(
 
 def doctor(
     config: Rig = RIG_FILE,
-    report: Annotated[
-        Path | None, typer.Option(help="Write an archive for a bug report, without secrets: FILE.zip.")
-    ] = None,
+    report: Annotated[Path | None, typer.Option(help="Write a bug report, without secrets: FILE.zip.")] = None,
 ) -> None:
     """Ask every configured device for its identity and its faults. Powers nothing and moves nothing."""
     import asyncio

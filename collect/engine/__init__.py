@@ -37,9 +37,7 @@ class CollectRequest:
     ] = None
     on_screen: Tui = None
     """A screen shows run and camera, and can answer questions."""
-    guided: Annotated[
-        bool, Option("--set-up", help="On the screen: accept what each set-up step measured, or measure again.")
-    ] = False
+    guided: Annotated[bool, Option("--set-up", help="On the screen: accept or repeat each step of the set-up.")] = False
     live: Annotated[bool, Option("--live", help="Let a Foxglove viewer on this machine watch the run.")] = False
     live_port: Annotated[int, Option(min=0, max=65535, help="Port of --live; 0: any.")] = 8765
     resume: str | None = None

@@ -118,7 +118,7 @@ async def zero_touch(context: StepContext, step: ZeroTouchStep) -> ZeroTouchResu
             f"zero touch by {measured.method}: the paper leans by {measured.slope_deg:.2f} deg, and lies at most "
             f"{moved_mm:+.2f} mm from the plane known before"
         )
-    if step.between_strokes:
+    if step.index > 0:
         text = f"The paper was found {moved_mm:+.2f} mm from where it was. From now on, H is counted from there."
         choices = (Choice("g", "good, use the new height"), Choice("k", "keep the old height"))
         if await run.asker.ask(Prompt(text, choices, "k")) != "g":

@@ -144,7 +144,7 @@ class Run(RunContext):
 
     async def _touch_again(self, step: Step) -> None:
         """Zero touch by jog between two strokes; if it fails, the plane stays as it was."""
-        touch = steps.ZeroTouchStep(step.index + 1, method="jog", between_strokes=True)
+        touch = steps.ZeroTouchStep(step.index + 1, method="jog")
         try:
             await self.perform(touch)
         except (StepError, DeviceError) as error:

@@ -18,8 +18,8 @@ from collections.abc import AsyncGenerator, Awaitable, Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from brushloop.calibrate.board.lens import Floats
 from brushloop.collect.errors import BadPicture, CameraLate
 from brushloop.collect.photograph.frames import ARM_SHARE, Frames, Series, Thumbnail, View, watching
 from brushloop.collect.rig.devices import Rig
@@ -28,7 +28,6 @@ from brushloop.drivers.devices import Frame, QueuedLine
 from brushloop.drivers.errors import DeviceError
 from brushloop.drivers.host import alongside
 
-Floats = NDArray[np.float64]
 GOOD_SHARE, GOOD_S = 0.1, 0.03
 """The delay is known well enough within a tenth of its value, or within 30 ms."""
 MOST_GAP_S = 1.0
@@ -251,15 +250,13 @@ class Photographer:
                 if len(looks) >= FEWEST_LOOKS and CameraDelay(tuple(looks)).known:
                     break
             if len(looks) >= FEWEST_LOOKS:
-                return self._accepted(CameraDelay(tuple(looks))), view
+                delay = CameraDelay(tuple(looks))
+                if 1e3 * delay.delay_s > self._config.max_delay_ms:
+                    raise self._too_late(str(delay))
+                if 1e3 * delay.spread_s > self._config.max_jitter_ms:
+                    raise self._uneven(str(delay))
+                return delay, view
         raise self._uneven() if shown else self._not_shown()
-
-    def _accepted(self, delay: CameraDelay) -> CameraDelay:
-        if 1e3 * delay.delay_s > self._config.max_delay_ms:
-            raise self._too_late(str(delay))
-        if 1e3 * delay.spread_s > self._config.max_jitter_ms:
-            raise self._uneven(str(delay))
-        return delay
 
     async def _trip(self, without_arm: Thumbnail, *, stay_s: float) -> tuple[Thumbnail, Look | None] | None:
         """Go over the sheet and back; return the view afterwards, and the delay (None if the camera was silent then).

@@ -57,13 +57,11 @@ class StepBase:
 
 @dataclass(frozen=True, slots=True)
 class ZeroTouchStep(StepBase):
-    """Find the paper."""
+    """Find the paper: first with index 0, then between strokes where a person asks for it."""
 
     kind: ClassVar[StepKind] = StepKind.ZERO_TOUCH
     method: str | None = None
     """`jog` or `force`; None for the rig's method."""
-    between_strokes: bool = False
-    """A person asked for it between two strokes, and accepts the new height."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,8 +11,8 @@ import math
 from collections.abc import Sequence, Set
 
 import numpy as np
-from numpy.typing import NDArray
 
+from brushloop.calibrate.board.lens import Floats
 from brushloop.collect.errors import StepError
 from brushloop.collect.motion import Dip, Procedures, mark_moves
 from brushloop.collect.rig.config import SelfCheckConfig
@@ -22,7 +22,6 @@ from brushloop.collect.touch.camera import new_marks
 from brushloop.drivers.devices import Frame
 from brushloop.sessions.events import SelfCheckResult
 
-Floats = NDArray[np.float64]
 Triangle = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
 
 UNEVEN = 0.2
