@@ -57,7 +57,9 @@ def checks_content(checks: Sequence[Check]) -> Content:
         sign, style = ("✓", "") if check.passed else ("!", "bold $text-warning")
         name = if_passed.get(check.name, check.name) if check.passed else check.name
         value = f"{sign} {name:<10}{_number(check.score):>6}"
-        lines.append(Content.assemble((value, style), (f"  {_limit(check)}", "dim")))
+        within = "≤" if (check.score <= check.threshold) == check.passed else "≥"
+        limit = f"{within} {_number(check.threshold)} {check.unit}".rstrip()
+        lines.append(Content.assemble((value, style), (f"  {limit}", "dim")))
         if check.reason:
             lines.append(Content(plain(check.reason)))
     return Content("\n").join(lines or [Content.styled("not judged", "dim")])
@@ -65,12 +67,6 @@ def checks_content(checks: Sequence[Check]) -> Content:
 
 def _number(value: float) -> str:
     return f"{value:.2f}" if abs(value) < 10.0 else f"{value:.0f}"
-
-
-def _limit(check: Check) -> str:
-    """`≤ 0.25 mm`."""
-    sign = "≤" if (check.score <= check.threshold) == check.passed else "≥"
-    return f"{sign} {_number(check.threshold)} {check.unit}".rstrip()
 
 
 class CaptureScreen(Screen[None], inherit_bindings=False):

@@ -20,6 +20,7 @@ from textual.content import Content
 from textual.screen import Screen
 from textual.widgets import Footer, OptionList
 
+from brushloop.collect.engine import PROTOCOL_FILE, RIG_FILE, CollectRequest
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.operator import Prompt
 from brushloop.collect.tui.widgets import (
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
     from brushloop.sessions.show import Details, Summary
 
 RECENT = 50
-PROTOCOL = Path("protocol.toml")
 BESIDE_COLUMNS = 6
 """Columns beside the text about a session: its border, its padding and its scroll bar."""
 SIGNS = {"open": ("▶", "bold $text-warning"), "damaged": ("!", "bold $text-error")}
@@ -57,8 +57,8 @@ class SessionBrowser:
 
     root: Path = Path("sessions")
     """Folder that holds sessions."""
-    config: Path = Path("rig.toml")
-    protocol: Path = PROTOCOL
+    config: Path = RIG_FILE
+    protocol: Path = PROTOCOL_FILE
     """What to press; where there is no such file, the protocol of the newest session."""
 
     def recent(self) -> list[Summary]:
@@ -90,7 +90,6 @@ class SessionBrowser:
 
         A session goes on with its own protocol. Connects nothing yet. Raises `ConfigError`.
         """
-        from brushloop.collect.engine import CollectRequest
         from brushloop.collect.engine.engine import engine_for
         from brushloop.collect.engine.open_or_resume import Opening
 
@@ -158,9 +157,9 @@ class StartScreen(Screen[None]):
         except (SessionError, OSError) as error:
             self.show_trouble(str(error))
             return
-        if self._rows and browser.protocol == PROTOCOL and not PROTOCOL.is_file():
+        if self._rows and browser.protocol == PROTOCOL_FILE and not PROTOCOL_FILE.is_file():
             last = browser.root / self._rows[0].session_id / PROTOCOL_EFFECTIVE
-            browser.protocol = last if last.is_file() else PROTOCOL
+            browser.protocol = last if last.is_file() else PROTOCOL_FILE
         self._files.show(f"rig {one_line(str(browser.config))}   protocol {one_line(str(browser.protocol))}")
         self._options.fill(_row_content(row) for row in self._rows)
         self.set_class(not self._rows, "-empty")
