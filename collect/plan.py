@@ -160,14 +160,7 @@ def draw_plan(config: RigConfig, protocol: ProtocolConfig, plan: Plan, path: Pat
     picture.savefig(path)
 
 
-def _sheet(
-    axes: Axes,
-    config: RigConfig,
-    sheet: Sheet,
-    number: int,
-    plan: Plan,
-    drawn: dict[str, Drawn],
-) -> None:
+def _sheet(axes: Axes, config: RigConfig, sheet: Sheet, number: int, plan: Plan, drawn: dict[str, Drawn]) -> None:
     from matplotlib import colormaps
 
     depths_mm = [press.condition.depth_mm for press in plan.placed]

@@ -77,12 +77,7 @@ class StepMoves:
 
 
 def moves_of(
-    config: RigConfig,
-    plane: PaperPlane,
-    step: Step,
-    patches: Sequence[Patch] = (),
-    *,
-    dips: int = 0,
+    config: RigConfig, plane: PaperPlane, step: Step, patches: Sequence[Patch] = (), *, dips: int = 0
 ) -> StepMoves:
     """The moves of a step, as the run makes them, on the patches that it marks.
 

@@ -135,12 +135,7 @@ class Writing:
         if self._sheet is not None and finished_session(request.sessions, request.config, protocol) is None:
             sheet, self._sheet = self._sheet, None  # used up: the next session asks again
         wanted = CollectRequest(
-            request.config,
-            protocol,
-            request.sessions,
-            sheet=sheet,
-            armed=request.armed,
-            on_screen=request.tui,
+            request.config, protocol, request.sessions, sheet=sheet, armed=request.armed, on_screen=request.tui
         )
         return collected_session(wanted)
 
