@@ -26,21 +26,21 @@ STALE_INK_S = 5.0
 async def dip(context: StepContext) -> DipResult:
     """The DIP step. Looks at the sheet first, so that the filled brush does not wait for it."""
     await look_at_sheet(context)
-    ink = await fill_brush(context)
-    return DipResult() if ink is None else DipResult(ink_level=ink.level, dosed_ml=ink.dosed_ml)
+    return await fill_brush(context)
 
 
-async def fill_brush(context: StepContext) -> InkState | None:
-    """Fill up the well if needed, then dip. Return how the well was; None without an ink device."""
-    run, device, state = context.run, context.run.rig.ink, None
+async def fill_brush(context: StepContext) -> DipResult:
+    """Fill up the well if needed, then dip. The result says how the well was, if there is an ink device."""
+    run, device, dipped = context.run, context.run.rig.ink, DipResult()
     with run.progress.meanwhile("dip"):
         if device is not None:
             level = await device.replenish()
-            state = InkState(level=level, dosed_ml=device.dosed_ml, light=run.light)
-            context.recorder.event(Topic.INK, state)
+            ink = InkState(level=level, dosed_ml=device.dosed_ml, light=run.light)
+            context.recorder.event(Topic.INK, ink)
+            dipped = DipResult(ink_level=ink.level, dosed_ml=ink.dosed_ml)
         await context.guard.guarded(run.procedures.dip())
         run.left_ink_ns = run.rig.clock.now_ns()
-    return state
+    return dipped
 
 
 async def mark(context: StepContext, step: PressStep) -> PressResult:

@@ -19,7 +19,6 @@ from pathlib import Path
 from brushloop.collect.engine.control import FINAL, State
 from brushloop.collect.engine.live import no_wider
 from brushloop.collect.engine.open_or_resume import Opening, find_resumable, open_store
-from brushloop.collect.engine.policy import resume_question
 from brushloop.collect.engine.recorder import uninterrupted
 from brushloop.collect.engine.run import Run
 from brushloop.collect.engine.snapshot import Picture, Progress, Snapshot
@@ -50,6 +49,13 @@ UNCHECKED = (
 
 ARM = Choice("a", "arm it: I am looking at the robot cell, my hand is at the emergency stop")
 LEAVE = Choice("x", "do not arm it")
+CUT_OFF = "The last run was cut off: look where it left the arm."
+RESUMED = (
+    "The arm first lifts the brush slowly and parks; the board and the paper are found again, and the plan goes on. "
+    "No stroke is made twice."
+)
+RESUME = Choice("g", "resume: the arm is at rest, nobody is within its reach, my hand is at the emergency stop")
+NOT_NOW = Choice("x", "do not resume")
 
 
 class Engine:
@@ -237,7 +243,9 @@ class Engine:
         if self._resumes is not None and self._request.on_screen:
             state = replay(self._resumes / JOURNAL_NAME)
             self._run.progress.count(state)
-            prompt = resume_question(self._resumes.name, state.ended, f"{hardware}. " if real else "")
+            before = f"The last run ended with: {state.ended}" if state.ended else CUT_OFF
+            text = f"Resume {self._resumes.name}? {before}\n{f'{hardware}. ' if real else ''}{RESUMED}"
+            prompt = Prompt(text, (RESUME, NOT_NOW), NOT_NOW.key)
         elif self._request.armed or not real:
             return
         elif self._request.on_screen:

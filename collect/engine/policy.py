@@ -66,18 +66,6 @@ def decide(step: Step, error: StepError | DeviceError, failures: int) -> Action:
             return Action.ABORT
 
 
-def resume_question(session_id: str, ended: str, hardware: str) -> Prompt:
-    """Ask whether the arm may move for a session that goes on. `ended`: how its last run ended; empty if it was cut
-    off. `hardware` names a real arm."""
-    before = f"The last run ended with: {ended}" if ended else "The last run was cut off: look where it left the arm."
-    text = (
-        f"Resume {session_id}? {before}\n{hardware}The arm first lifts the brush slowly and parks; the board and the "
-        "paper are found again, and the plan goes on. No stroke is made twice."
-    )
-    resume = "resume: the arm is at rest, nobody is within its reach, my hand is at the emergency stop"
-    return Prompt(text, (Choice(GO_ON, resume), Choice(STOP.key, "do not resume")), STOP.key)
-
-
 def question(error: StepError | DeviceError, sheet: int) -> Prompt:
     """The question that `error` leads to, while sheet `sheet` (from 0) is in. The default is always to stop: nothing
     moves without an answer."""
