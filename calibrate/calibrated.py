@@ -79,7 +79,7 @@ def calibrate_session(
     recording = opened or Recording(request.session)
     where = str(recording.path)
     if recording.header.source.imported:
-        raise CalibrationError(where, "is an import and has its own scale: continue with `validate`")
+        raise CalibrationError(where, "is an import and has its own scale: continue with `brushloop analyse`")
     rig = rig_of(recording)
     known = rig.lens if request.lens is None else read_lens(request.lens)
     stills = list(recording.stills_of("board"))

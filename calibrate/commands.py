@@ -151,7 +151,7 @@ class ValidateRequest:
 
     places: Annotated[tuple[Path, ...], Argument(metavar="SESSION", help="Sessions: folders or .mcap files.")]
     models: Annotated[tuple[str, ...], Option("--model", help="Only these models; all by default.")] = ()
-    generators: Annotated[tuple[Path, ...], Option("--generator", help="A trained generator.safetensors.")] = ()
+    generators: Annotated[tuple[Path, ...], Option("--generator", help="Instead of the shipped generator.")] = ()
     fit: Annotated[Path | None, Option(help="Brush fit, the one in use by default; of drags, a dragfit.")] = None
     out: Annotated[Path | None, Option(help="Folder of the report; <session>/validation by default.")] = None
     gates: Annotated[tuple[str, ...], Option("--gate", help="As 'csim_avg>=0.90', quoted; exit code 5 if missed.")] = ()

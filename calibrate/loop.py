@@ -115,11 +115,12 @@ class LoopRecord(Sealed):
             return Point(None, f"{self.again}: no condition was pressed twice, so its repeatability is unknown.")
         points, *_, measure, row = max(self.lost, key=lambda lost: lost[0])
         good = min((near for _, _, near, *_ in self.lost), key=(False, None, True).index)
-        sure = " More strokes have to be pressed again to be certain." if good is None else ""
+        sure = " Whether this goal is met will be certain only with more repeated presses." if good is None else ""
         return Point(
             good,
-            f"Strokes pressed again ({self.again}) lose up to {max(0.0, points):.1f} points of {measure.upper()} "
-            f"against other such presses ({row.alignment}, {row.tone}); the goal is {self.goal_points:g}.{sure}",
+            f"Compared with their originals, the presses repeated in {self.again} score up to {max(0.0, points):.1f} "
+            f"points of {measure.upper()} lower than other presses of the same depth and tilt do ({row.alignment}, "
+            f"{row.tone}). The goal is at most {self.goal_points:g} point of CSIM and of SSIM.{sure}",
         )
 
 
@@ -268,8 +269,6 @@ def _trust(record: LoopRecord) -> Iterator[Point]:
     yield source_point(record.source)
     if record.in_sample:
         words = "The model that recovered them was fitted to these same presses, with their commanded depths and tilts"
-        yield Point(
-            None, f"{words}: recovered numbers near the commanded ones prove nothing about it. Compare the marks."
-        )
+        yield Point(None, f"{words}: recovered numbers near the commanded ones prove nothing. Compare the marks.")
     if record.refused:
         yield Point(False, f"{len(record.refused)} strokes are not compared; each is named below, with the reason.")

@@ -25,7 +25,6 @@ from brushloop.calibrate.presses import Refused, read_presses, rectified
 from brushloop.calibrate.session import Calibration, OpenSession, open_session
 from brushloop.calibrate.stroke.preprocess import Gray, Prepared
 from brushloop.model.ccdbsm import Brush
-from brushloop.model.generator import SHIPPED_GENERATOR
 from brushloop.model.strokes import Prediction
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.events import Begin, StepEvent, StepKind
@@ -274,8 +273,7 @@ def analyse(request: AnalyseRequest, progress: Progress = unseen) -> Written:
     if not recording.header.source.imported:
         said += calibrated.calibrate_session(CalibrateRequest(session), progress, recording).lines()
     said += fit_strokes(FitRequest(session), progress, recording).lines()
-    wanted = ValidateRequest((session,), generators=(SHIPPED_GENERATOR,))
-    validated = compare_models(wanted, progress, [recording])
+    validated = compare_models(ValidateRequest((session,)), progress, [recording])
     return Written(validated.page, (*said, *validated.lines()))
 
 

@@ -118,11 +118,11 @@ def source_point(source: Source) -> Point:
 
 
 def brush_and_size(header: Header) -> str:
-    """The brush and its size, where a header names them."""
-    size = ""
-    if header.brush_radius_mm is not None and header.brush_length_mm is not None:
-        size = f"R = {header.brush_radius_mm:g} mm, L = {header.brush_length_mm:g} mm"
-    return ", ".join(filter(None, (header.brush, size)))
+    """The brush, and its size where a header gives it."""
+    name = header.brush or "a brush that is not named"
+    if header.brush_radius_mm is None or header.brush_length_mm is None:
+        return name
+    return f"{name}, R = {header.brush_radius_mm:g} mm, L = {header.brush_length_mm:g} mm"
 
 
 def data_uri(data: bytes, kind: str = "png") -> str:

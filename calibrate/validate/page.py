@@ -244,7 +244,7 @@ def losses(curves: Sequence[Curve]) -> str:
 def measured(report: Report) -> str:
     """Summary of the strokes and models that were compared."""
     compared, strokes = (sum(getattr(s, name) for s in report.sessions) for name in ("compared", "strokes"))
-    brush = next(filter(None, (brush_and_size(s.header) for s in report.sessions)), "a brush that is not named")
+    brush = brush_and_size(report.sessions[0].header)
     at = f" at {len(report.conditions)} combinations of press depth H and brush tilt α" if report.conditions else ""
     left = f", {strokes - compared} more could not be used" if strokes > compared else ""
     models = sum(model.basis != PRESSES for model in report.models)

@@ -26,8 +26,9 @@ from brushloop.calibrate.scores import Scores, similarities
 from brushloop.calibrate.session import OpenSession
 from brushloop.calibrate.stats import CEILING, others_of
 from brushloop.calibrate.work import Arrays, Scheduler, key_of
-from brushloop.model.ccdbsm import DomainError
+from brushloop.model.ccdbsm import Brush, DomainError
 from brushloop.model.fitted import NAME as FITTED
+from brushloop.model.generator import SHIPPED_GENERATOR
 from brushloop.model.outline import Outline
 from brushloop.model.presses import DepthTilt, Draw, refit_bezier
 from brushloop.sessions.disk import file_sha256
@@ -206,7 +207,8 @@ def in_order(models: Sequence[Model]) -> list[Model]:
 def known_models(session: FittedSession, request: ValidateRequest) -> Sequence[Model]:
     """The models that need no held-out fit: generators, the registered models of the brush, and its fit.
 
-    Raises what `load_generator` does, and `CalibrationError` for two generators of one name.
+    Where no generator is given, the shipped one is used for brushes of its size. Raises what `load_generator` does, and
+    `CalibrationError` for two generators of one name.
     """
     from brushloop.model.fitted import fitted_model
     from brushloop.model.generator.stroke import load_generator
@@ -220,7 +222,7 @@ def known_models(session: FittedSession, request: ValidateRequest) -> Sequence[M
     for name, lam in LAMBDAS.items() if request.ablations else ():
         label = f"CCD-BSM, λ = {name.rpartition('-')[2].replace('pi', 'π')}"
         models.append(_of_model(stroke_model("ccd-bsm", brush, lam), PUBLISHED, name=name, label=label))
-    for file in request.generators:
+    for file in request.generators or ([SHIPPED_GENERATOR] if brush == Brush() else []):
         model = load_generator(file, brush)
         if model.name in [known.name for known in models]:
             raise CalibrationError(str(file), f"is a second {model.name}")

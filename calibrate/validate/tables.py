@@ -61,7 +61,7 @@ STRICT: Key = (Alignment.MM, Tone.BINARY)
 NORMAL: Key = (Alignment.SIZE_NORMALISED, Tone.BINARY)
 """The comparison where size and place count, and that of the paper."""
 MISSING = {
-    "ccd-bsmg": "not in this run: give a trained one with --generator",
+    "ccd-bsmg": "not in this run: give a generator trained for a brush of this size with --generator",
     ROBOT_WRITING: "not in this run: “brushloop repress SESSION” presses recovered strokes again; then validate again",
 }
 WRITTEN_ROWS = {

@@ -27,7 +27,6 @@ from brushloop.collect.engine.open_or_resume import open_sessions
 from brushloop.collect.errors import StrokesLeftOut
 from brushloop.collect.start import calibrated, collect, finished_session, fitted
 from brushloop.drivers.loopback import LoopbackRig, start
-from brushloop.model.generator import SHIPPED_GENERATOR
 from brushloop.sessions.terminal import say
 
 if TYPE_CHECKING:
@@ -183,10 +182,9 @@ class Demo:
     def _validate(self) -> None:
         from brushloop.calibrate.validate.command import validate  # slow to import
 
-        command = f"brushloop validate {self._session} --generator {SHIPPED_GENERATOR}"
+        command = f"brushloop validate {self._session}"
         say(f"$ {command}")
-        request = ValidateRequest((self._session,), command=command, generators=(SHIPPED_GENERATOR,))
-        self._validated = show_work(validate, request)
+        self._validated = show_work(validate, ValidateRequest((self._session,), command=command))
 
     def _blank_sheet(self, protocol: Path) -> None:
         """Put a blank sheet in for the session of this protocol, unless that is finished."""

@@ -58,7 +58,7 @@ def characters(folder: Path, **fields: Any) -> Path:
 
 def test_a_loop_in_the_session_is_the_third_row_of_table_1(place: Path) -> None:
     put(place / "loop", loop_text(place))
-    assert "against other such presses" in said("validate", place, *FAST)
+    assert "than other presses of the same depth and tilt" in said("validate", place, *FAST)
     report, page = report_of(place)
     [row] = [row for row in table_1(report) if row.label == "robot writing"]
     assert row.scores is not None
