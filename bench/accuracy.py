@@ -70,7 +70,7 @@ def fit(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     """Points below the ceiling of the fitted brush, each condition predicted from all others: `n` brushes (seven)."""
     results: list[Result] = []
     for name, presses, prior in _pressed(n, seed):
-        rows = leave_condition_out(presses, fit_presses(presses, prior=prior), prior)
+        rows, _ = leave_condition_out(presses, fit_presses(presses, prior=prior), prior)
         csim = {row.model: row.csim.avg for row in rows}
         where = f"simulated; ceiling {csim[CEILING]:.2f}, Bezier refitted {csim[BEZIER]:.2f} %; {machine()}"
         gap = csim[CEILING] - csim[FITTED]

@@ -19,8 +19,12 @@ from unittest.mock import AsyncMock
 
 import pytest
 
+from brushloop.calibrate.artefact import FITS, current
+from brushloop.calibrate.fit.command import BrushFit
+from brushloop.calibrate.fit.heldout import FITTED
 from brushloop.calibrate.validate.tables import Report, table_1
 from brushloop.collect.chains import DemoRequest, demo
+from brushloop.collect.tui.so_far import fit_so_far
 from brushloop.drivers.sim import rig
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.sessions.recording import Recording
@@ -107,6 +111,10 @@ def test_killed_in_mid_collection_the_same_command_ends_with_every_stroke_exactl
     assert Path(paths[2]).is_file()
     assert "pix2len" in (out / "demo.log").read_text()  # what the steps print does not drown the answer
     assert "pix2len" not in printed
+    # What a screen says of the model while a session is open is what the fit says once it is closed.
+    fit, so_far = BrushFit.read(current(session, FITS) or Path()), fit_so_far(session)
+    assert so_far is not None
+    assert so_far[0] == pytest.approx(fit.csim_percent[FITTED], abs=0.5)
     rows = {row.label: row.scores for row in table_1(Report.read(Path(paths[1]).with_name("report.json")))}
     assert rows.pop("another press") is rows.pop("ceiling") is None  # no condition was pressed twice
     assert set(rows) == {"CCD-BSM", "CCD-BSMG", "robot writing", "CCD-BSM calibrated"}

@@ -203,7 +203,7 @@ def fit_press_session(request: FitRequest, progress: Progress = unseen, opened: 
         raise CalibrationError("--prior", "adapts a fit of drags, and this session holds presses")
     session, presses, refused = read_for_fit(opened or request.session, progress)
     press = fit_presses(presses)
-    held_out = leave_condition_out(presses, press, progress=progress, store=session.store)
+    held_out, _ = leave_condition_out(presses, press, progress=progress, store=session.store)
     fit = BrushFit(
         **session.provenance,
         radius_mm=presses.radius_mm,

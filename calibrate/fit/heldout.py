@@ -84,8 +84,8 @@ def leave_condition_out(
     prior: Prior | None = None,
     progress: Progress = unseen,
     store: Store | None = None,
-) -> list[Stat]:
-    """Score each condition as predicted by fits to other conditions; empty for a single condition.
+) -> tuple[list[Stat], dict[DepthTilt, Predicted]]:
+    """Score each condition as predicted by fits to other conditions, and what was compared; empty for a single one.
 
     The fits descend from `press`, the fit to all conditions. `brushloop validate` uses the same fits, which the store
     keeps. Models without enough data are left out: the ceiling needs two strokes of a condition, a regressed Bezier two
@@ -97,7 +97,7 @@ def leave_condition_out(
     jobs = [Refit(others, prior, press.values) for _, others in left_out]
     with threads(1) as scheduler:  # a fit holds Python's lock nearly all the time: two at once take half as long again
         brushes = refits(jobs, store, scheduler, "conditions left out in turn", progress)
-    predicted: list[Predicted] = []
+    predicted: dict[DepthTilt, Predicted] = {}
     for (fold, others), refitted in zip(left_out, brushes, strict=True):
         outlines: dict[str, Draw] = {FITTED: refitted.outline, UNCALIBRATED: published.outline}
         if (of_others := refit_bezier(others)) is not None:
@@ -107,8 +107,8 @@ def leave_condition_out(
             for name, outline in outlines.items():
                 with contextlib.suppress(DomainError):  # so light that the brush leaves no mark
                     images[name] = image_of(outline(*condition), presses.grid)
-            predicted.append((presses.ink[conditions[condition]], images))
-    return held_out_scores(predicted, (FITTED, BEZIER, UNCALIBRATED))
+            predicted[condition] = presses.ink[conditions[condition]], images
+    return held_out_scores(list(predicted.values()), (FITTED, BEZIER, UNCALIBRATED)), predicted
 
 
 def held_out_scores(predicted: Sequence[Predicted], models: Sequence[str]) -> list[Stat]:

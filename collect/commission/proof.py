@@ -46,7 +46,12 @@ class ProofStep(Step):
     async def carry_out(self, visit: Visit) -> None:
         """Prove what was taught, and measure height and delay by it. Raises `NotAccepted` and what the run raises."""
         rig = rig_of(visit.notebook, visit.rig_path)
-        await self._doctor(visit, rig)
+        visit.working("asking every device")
+        findings = await examine(rig, visit.clock)
+        for finding in findings:
+            visit.say(f"{finding.device}: {finding.identity or finding.address}; {finding.notes}")
+        if ill := [finding for finding in findings if not finding.well]:
+            raise NotAccepted(f"{ill[0].device}: {ill[0].problem}.", ill[0].remedy)
         depth_mm = min(PRESS_SHARE * rig.brush.max_depth_mm, DEEPEST_DRY_MM)
         protocol = f'kind = "grid"\ndepths_mm = [{depth_mm:g}]\ntilts_deg = [0.0]\nrepeats = {PRESSES}\n'
         await visit.may_move(f"Dry run, {ABOVE_MM:g} mm above the sheet")
@@ -60,14 +65,6 @@ class ProofStep(Step):
         session = await self._run(visit, Path(folder), protocol, dry=False)
         visit.say(f"Recorded in {session}.")
         self._keep(visit, rig, session)
-
-    async def _doctor(self, visit: Visit, rig: RigConfig) -> None:
-        visit.working("asking every device")
-        findings = await examine(rig, visit.clock)
-        for finding in findings:
-            visit.say(f"{finding.device}: {finding.identity or finding.address}; {finding.notes}")
-        if ill := [finding for finding in findings if not finding.well]:
-            raise NotAccepted(f"{ill[0].device}: {ill[0].problem}.", ill[0].remedy)
 
     async def _run(self, visit: Visit, folder: Path, protocol: str, *, dry: bool) -> Path:
         """Run the protocol slowly on what was taught; returns the session's folder.

@@ -204,9 +204,6 @@ def toml_value(value: Value) -> str:
             return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-# The person
-
-
 Picture = NDArray[np.uint8]
 """(h, w) gray."""
 ARM = Choice("a", "let it move: I look at the cell, my hand is at the emergency stop")

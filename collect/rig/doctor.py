@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import asyncio
-import getpass
 import importlib.metadata
 import json
 import math
@@ -226,7 +225,8 @@ class Scrubber:
         names |= {
             socket.gethostname(): "<host>",
             socket.getfqdn(): "<host>",
-            _user(): "<user>",
+            os.environ.get("LOGNAME", ""): "<user>",
+            Path.home().name: "<user>",
             str(Path.home()): "<path>",
             str(Path.cwd()): "<path>",
         }
@@ -257,13 +257,6 @@ def _with_texts(value: Any, changed: Callable[[str, str], str], field: str = "")
             return [_with_texts(inner, changed, field) for inner in cast("list[Any]", value)]
         case _:
             return value
-
-
-def _user() -> str:
-    try:
-        return getpass.getuser()
-    except (KeyError, OSError):  # a process whose user has no name
-        return ""
 
 
 # ---------------------------------------------------------------- a transcript of questions that change nothing

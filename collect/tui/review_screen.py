@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
+from numpy.typing import NDArray
 from textual import work
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
@@ -21,6 +23,7 @@ from textual.widgets import Footer, OptionList
 
 from brushloop.calibrate.artefact import FITS, current
 from brushloop.calibrate.board.pix2len import SeenBoard, see_board
+from brushloop.calibrate.compare import SHOWN_ROWS
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.command import BrushFit
 from brushloop.calibrate.session import rig_of
@@ -51,11 +54,13 @@ from brushloop.model.similarity import csim
 from brushloop.sessions.disk import check_folder
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError
 from brushloop.sessions.events import CaptureResult, Press, Remark
-from brushloop.sessions.journal import JOURNAL_NAME, replay
+from brushloop.sessions.journal import JOURNAL_NAME, read_header, replay
 from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.messages import decode_gray, decode_still
 from brushloop.sessions.recording import add_remark, merged_file, remarks_of
 from brushloop.sessions.records import Condition, Quality, Stroke, Topic
+
+MARKS_PER_ROW = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +106,7 @@ class Review:
     def read(self) -> None:
         """Read the journal and the remarks again."""
         state, remarks = replay(self.folder / JOURNAL_NAME), remarks_of(self.folder)
-        self.open = state.is_open
+        self.open, self.header = state.is_open, read_header(self.folder, state)
         odd, captures = odd_waits(waits_of(state)), list[ReviewCapture]()
         for step in state.files.values():
             if isinstance(result := step.result, CaptureResult):
@@ -119,6 +124,18 @@ class Review:
         if still not in self._pictures:
             self._pictures[still] = self._make_pictures(capture)
         return self._pictures[still]
+
+    def marks(self) -> NDArray[np.bool_] | None:
+        """One mark of each condition as ink, `MARKS_PER_ROW` beside each other; None where no board was seen.
+
+        Takes seconds: call it off a screen's loop. Raises `SessionDamaged` as `pictures` does.
+        """
+        shown = {capture.press.condition: capture for capture in self.captures if capture.counts}
+        inks = [ink[SHOWN_ROWS] for at in sorted(shown) if (ink := self.pictures(shown[at]).binary) is not None]
+        if not inks:
+            return None
+        inks += [np.zeros_like(inks[0])] * (-len(inks) % MARKS_PER_ROW)
+        return np.vstack([np.hstack(inks[k : k + MARKS_PER_ROW]) for k in range(0, len(inks), MARKS_PER_ROW)])
 
     def repeatability(self, condition: Condition) -> str:
         """How alike the counted presses of one condition are, in words.

@@ -30,6 +30,7 @@ from brushloop.collect.engine.snapshot import (
 from brushloop.collect.operator import OperatorRequest
 from brushloop.collect.tui.capture_screen import CaptureScreen, checks_content
 from brushloop.collect.tui.pictures import binary_picture, picture_widget
+from brushloop.collect.tui.so_far import ModelByNow
 from brushloop.collect.tui.widgets import (
     HELP_KEY,
     SHORT_STOP,
@@ -155,6 +156,7 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
         self._why_pane.border_title = "Why it ended"
         self._sheet = Line("sheet", classes="pane")
         self._sheet.show(Content.styled("no sheet yet", "dim"))
+        self._model = ModelByNow()
         self._log, self._log_pane = Line("log"), Newest(id="log-pane", classes="pane")
         self._log_pane.border_title = "Log"
         self._capture, self._words = Vertical(id="capture", classes="pane"), Line("capture-words")
@@ -182,6 +184,7 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
                 with Horizontal(id="top"):
                     yield self._grid
                     yield self._sheet
+                yield self._model
                 with self._log_pane:
                     yield self._log
             with Vertical(id="right"):
@@ -281,6 +284,8 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
             pictures = (last.photo, binary_picture(last.binary), binary_picture(last.model))
             for widget, picture in zip(self._pictures, pictures, strict=True):
                 widget.show(picture)
+        if now.state is State.RUNNING:
+            self._model.follow(now.folder, now.strokes_done)
         self._note.show(_note_content(now))
 
     def _show_state(self, now: Snapshot) -> None:

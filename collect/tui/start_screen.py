@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,6 +24,7 @@ from textual.widgets import Footer, OptionList
 from brushloop.collect.engine import PROTOCOL_FILE, RIG_FILE, CollectRequest
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.operator import Prompt
+from brushloop.collect.tui.pictures import binary_picture, picture_widget
 from brushloop.collect.tui.widgets import (
     HELP_KEY,
     YES,
@@ -45,6 +47,8 @@ if TYPE_CHECKING:
     from brushloop.sessions.show import Details, Summary
 
 RECENT = 50
+RESTS_S = 0.3
+"""How long the cursor is on a session before its photographs are read."""
 BESIDE_COLUMNS = 6
 """Columns beside the text about a session: its border, its padding and its scroll bar."""
 SIGNS = {"open": ("▶", "bold $text-warning"), "damaged": ("!", "bold $text-error")}
@@ -109,6 +113,7 @@ class StartScreen(Screen[None]):
     StartScreen #sessions { width: 42%; height: 100%; border: none; padding: 0; }
     StartScreen.-empty #sessions { display: none; }
     StartScreen #standing { width: 1fr; height: 100%; padding: 0 1; border-left: solid $foreground 40%; }
+    StartScreen #marks { height: 9; display: none; }
     StartScreen #files { height: 1; padding: 0 1; }
     StartScreen #trouble { height: auto; max-height: 10; padding: 0 1; }
     """
@@ -134,6 +139,7 @@ class StartScreen(Screen[None]):
         self._begin, self._review, self._run_command = begin, review, run_command
         self._rows: list[Summary] = []
         self._title, self._standing = Bar("title"), Line("standing-text")
+        self._marks = picture_widget("marks")
         self._files, self._trouble = Line("files"), Line("trouble")
         self._options = Rows("sessions")
 
@@ -143,6 +149,7 @@ class StartScreen(Screen[None]):
         with Horizontal():
             yield self._options
             with VerticalScroll(id="standing"):
+                yield self._marks
                 yield self._standing
         yield self._files
         yield self._trouble
@@ -183,6 +190,19 @@ class StartScreen(Screen[None]):
         # What the list leaves of the screen, whether that is laid out yet or not.
         columns = app_of(self).size.width * 58 // 100 - BESIDE_COLUMNS
         self._standing.show(text_of([*goes_on, *renderables(details)], columns))
+        self._show_marks(self._browser.root / details.session_id)
+
+    @work(exclusive=True, group="marks")
+    async def _show_marks(self, folder: Path) -> None:
+        """Show the marks of a session, once the cursor rests on it; nothing where there are none to see."""
+        from brushloop.collect.tui.review_screen import Review
+
+        self._marks.display = False
+        await asyncio.sleep(RESTS_S)
+        with suppress(SessionError):  # an import, or a damaged session, which the text says
+            if (ink := await asyncio.to_thread(lambda: Review(folder).marks())) is not None:
+                self._marks.show(binary_picture(ink))
+                self._marks.display = True
 
     def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
         """Resume an open session, or look through a closed one."""

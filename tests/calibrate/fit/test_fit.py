@@ -122,7 +122,7 @@ def test_edges_that_the_profile_does_not_have_are_found() -> None:
 
 def test_held_out_conditions_are_scored_beside_the_ceiling_which_one_press_of_each_does_not_show() -> None:
     strokes = presses(a_brush(), CONDITIONS * 2, noise=0.05)
-    rows = {row.model: row for row in leave_condition_out(strokes, fit_presses(strokes))}
+    rows = {row.model: row for row in leave_condition_out(strokes, fit_presses(strokes))[0]}
     fitted, ceiling = rows[FITTED].csim, rows[CEILING].csim
     assert fitted.n == ceiling.n == 10
     assert rows[UNCALIBRATED].csim.avg + 5.0 < fitted.avg <= 100.0
@@ -132,10 +132,10 @@ def test_held_out_conditions_are_scored_beside_the_ceiling_which_one_press_of_ea
     assert ceiling.below_ceiling is None
 
     once = presses(a_brush(), CONDITIONS[:3], noise=0.05)
-    alone = {row.model: row for row in leave_condition_out(once, fit_presses(once))}
+    alone = {row.model: row for row in leave_condition_out(once, fit_presses(once))[0]}
     assert CEILING not in alone
     assert alone[FITTED].csim.below_ceiling is None
-    assert leave_condition_out(presses(a_brush(), CONDITIONS[:1] * 2), a_brush()) == []
+    assert leave_condition_out(presses(a_brush(), CONDITIONS[:1] * 2), a_brush()) == ([], {})
     with pytest.raises(ValueError, match="at least one press"):
         fit_presses(presses(a_brush(), []))
 

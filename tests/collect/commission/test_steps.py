@@ -97,7 +97,7 @@ async def test_the_proof_runs_nothing_without_the_command_line_and_the_operators
     armed: bool, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ProofStep, "_run", AsyncMock(side_effect=AssertionError("the arm would have moved")))
-    monkeypatch.setattr(ProofStep, "_doctor", AsyncMock())
+    monkeypatch.setattr(proof, "examine", AsyncMock(return_value=[]))
     monkeypatch.setattr(proof, "rig_of", lambda *_: SimpleNamespace(brush=SimpleNamespace(max_depth_mm=22.0)))
     person = Answering("")
     with pytest.raises(NotAccepted, match=said):

@@ -13,7 +13,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
+from unittest.mock import AsyncMock, Mock
 
 import numpy as np
 import pytest
@@ -226,6 +226,19 @@ async def test_what_did_not_change_is_not_drawn_again(monkeypatch: pytest.Monkey
         for _ in range(3):
             await run.look()
         assert drawn == []
+
+
+async def test_the_model_is_fitted_every_few_strokes_and_its_newest_scores_are_shown(model_so_far: AsyncMock) -> None:
+    now = picture(folder="2026-11-21-grid-01", strokes_done=4)
+    async with watched(now, (120, 40)) as run:
+        assert "Model by now" not in await run.look()
+        model_so_far.return_value = 94.51, "from 5 presses"
+        assert "94.5 % from 5 presses" in await run.look(replace(now, strokes_done=5))
+        await run.look(replace(now, strokes_done=9))
+        model_so_far.return_value = 96.13, "from 10 presses; a perfect model: 98.2 %"
+        text = await run.look(replace(now, strokes_done=10))
+        assert "94.5 → 96.1 % from 10 presses; a perfect model: 98.2 %" in text
+        assert model_so_far.await_count == 2
 
 
 async def test_b_marks_the_last_capture_and_takes_it_back_while_the_run_is_on(tmp_path: Path) -> None:

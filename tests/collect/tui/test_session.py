@@ -187,6 +187,8 @@ async def test_a_day_at_the_rig(lab: Lab) -> None:
         await operator.sees(ReviewScreen, "smudge")
         await operator.press("escape", "q")
         await operator.sees(StartScreen, "closed")
+        while not any("\u2801" <= sign <= "\u28ff" for sign in shown(app)):  # a mark of each condition, as braille
+            await pilot.pause(0.02)
         await operator.press("q")
 
     assert verify_session(lab.session).sound
