@@ -28,8 +28,8 @@ EXIT_CODES = {
     3: "finished, but strokes were left out, or a repair lost something",
     4: "stopped or aborted, also by a full disk, too little memory or a closed output; the same command continues",
     5: "finished, but a required score was missed (`validate --gate`), or the rig's settings contradict each other",
-    6: "a recording is damaged: `brushloop sessions repair`",
-    130: "interrupted by Ctrl-C; `collect` and `sim` end in order instead, with a code from above",
+    6: "a recording is damaged: try `brushloop sessions repair`",
+    130: "interrupted by Ctrl-C; `collect` and `sim` then end in order, with one of the codes above",
 }
 """What each exit code of every command means."""
 
@@ -99,10 +99,10 @@ def options(
 EVERY_DAY, SET_UP, RESEARCH, SIMULATOR = "Every day", "Set-up", "Research", "Simulator"
 GROUPS = {
     "validate": (RESEARCH, "Compare every stroke model with every captured stroke (`brushloop validate SESSION...`)."),
-    "repress": (RESEARCH, "Recover the presses of a SESSION, press them again, and compare; or only compare."),
-    "write": (RESEARCH, "Write characters on the rig and compare them; or only plan, compare or learn."),
+    "repress": (RESEARCH, "Recover depth and tilt of a SESSION's presses, repeat and compare them; or only compare."),
+    "write": (RESEARCH, "Write characters on the rig and compare them with the wanted images; or do one step alone."),
     "train": (RESEARCH, "Train the neural stroke generator, or tune it on captures."),
-    "sim": (SIMULATOR, "Serve the loopback rig; break it, or act as the person in an unknown lab."),
+    "sim": (SIMULATOR, "Serve the simulated loopback rig, break it, or act as the person in an unknown lab."),
 }
 """Groups whose first command runs where no other is named: where the help lists them, and its words."""
 COMMANDS: tuple[tuple[str, str, type[Any], str], ...] = (
@@ -149,21 +149,17 @@ for name, panel, request, work in COMMANDS:
 
 @groups["sim"].command("serve")
 def sim(
-    write_rig: Annotated[Path | None, typer.Option(help="Write a rig.toml for this rig, then serve it.")] = None,
+    write_rig: Annotated[Path | None, typer.Option(help="Write the rig.toml of this rig here.")] = None,
     rate: Annotated[float, typer.Option(min=0.01, max=1000, help="Simulated seconds per real second.")] = 1.0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of brush, presses and noise.")] = 1,
     fps: Annotated[float, typer.Option(min=1, max=60, help="Camera pictures per real second.")] = 8.0,
-    idle_exit: Annotated[
-        float, typer.Option(min=0, help="Seconds without clients after which to end; 0: never.")
-    ] = 0.0,
+    idle_exit: Annotated[float, typer.Option(min=0, help="End after so many seconds without clients; 0: never.")] = 0.0,
     brush: Annotated[
         Path, typer.Option(help="A shipped brush, `loopback` or `table2`, or one described in a brush.toml.")
     ] = Path("loopback"),
-    control: Annotated[
-        Path | None, typer.Option(help="Make a control socket here, for `sim fault` and `sim hand`.")
-    ] = None,
+    control: Annotated[Path | None, typer.Option(help="Control socket to make for `sim fault` and `sim hand`.")] = None,
     unknown: Annotated[
-        int | None, typer.Option(min=0, help="Serve a lab that nobody has measured, drawn from this seed.")
+        int | None, typer.Option(min=0, help="Serve a lab of unknown dimensions, drawn from this seed.")
     ] = None,
     trap: Annotated[str | None, typer.Option(help="What is wrong in the unknown lab, such as swapped-corner.")] = None,
 ) -> None:
@@ -203,16 +199,18 @@ def sim(
 @groups["sim"].command()
 def fault(
     control: Annotated[Path, typer.Argument(help="Control socket of a rig: `brushloop sim --control PATH`.")],
-    what: Annotated[str, typer.Argument(help="Device to break, or list, clear, state, release, fresh-sheet.")],
-    kind: Annotated[str | None, typer.Argument(help="How it breaks: mute, late, black, bus-off, ...")] = None,
-    on: Annotated[str | None, typer.Option(help="Only on this method of the robot, such as moveLine.")] = None,
+    what: Annotated[str, typer.Argument(help="Device to break; or list, clear, state, release or fresh-sheet.")],
+    kind: Annotated[
+        str | None, typer.Argument(help="Kind of fault, such as mute, late, black or bus-off (all in docs/faults.md).")
+    ] = None,
+    on: Annotated[str | None, typer.Option(help="Only in calls of this robot method, such as moveLine.")] = None,
     nth: Annotated[int | None, typer.Option(help="Begin at the n-th request, push or frame.")] = None,
     phase: Annotated[str | None, typer.Option(help="Begin while the arm does this, such as descending.")] = None,
     press: Annotated[int | None, typer.Option(help="Begin while this many presses are on the paper.")] = None,
     count: Annotated[int | None, typer.Option(help="Occur this many times.")] = None,
     for_s: Annotated[float | None, typer.Option(help="Last for this many real seconds.")] = None,
     late_s: Annotated[float | None, typer.Option(help="Delay of a late reply, in real seconds.")] = None,
-    ident: Annotated[int | None, typer.Option("--id", help="Fault to clear; all of them by default.")] = None,
+    ident: Annotated[int | None, typer.Option("--id", help="Number of the fault to clear; all by default.")] = None,
 ) -> None:
     """Break a device of a running loopback rig, list its faults, or act as the person at its pendant."""
     from json import dumps
@@ -231,11 +229,11 @@ def fault(
 
 @groups["sim"].command()
 def hand(
-    control: Annotated[Path, typer.Argument(help="The lab's socket, as after `brushloop sim --control`.")],
-    act: Annotated[str, typer.Argument(help="bring, measure or mend.")],
-    to: Annotated[str | None, typer.Argument(help="What, such as pin or square; an unknown word lists all.")] = None,
-    index: Annotated[int, typer.Option(min=1, max=999, help="Which one, from 1, such as a direction at the pin.")] = 1,
-    corner: Annotated[str | None, typer.Option(help="Such as 'lower left' or 'upper right'.")] = None,
+    control: Annotated[Path, typer.Argument(help="Control socket of a lab: `brushloop sim --control PATH`.")],
+    act: Annotated[str, typer.Argument(help="What the person does: bring, measure or mend.")],
+    to: Annotated[str | None, typer.Argument(help="Thing, such as pin or square; an unknown word lists all.")] = None,
+    index: Annotated[int, typer.Option(min=1, max=999, help="Its number, from 1, such as a direction at the pin.")] = 1,
+    corner: Annotated[str | None, typer.Option(help="Its corner, such as 'lower left' or 'upper right'.")] = None,
 ) -> None:
     """Act as the person in an unknown lab: guide the arm by hand, hold the printed board, correct mistakes."""
     from brushloop.drivers.loopback import ask

@@ -29,7 +29,7 @@ rig_app = typer.Typer(
 PICTURES = (".png", ".svg", ".pdf", ".jpg")
 """Endings of a picture's file, which determine its format."""
 RigFile = Annotated[Path, typer.Argument(help="The rig: addresses, frames, limits.")]
-StepArm = Annotated[bool, typer.Option("--arm", help="Let the arm move where a step needs it; a key asks first.")]
+StepArm = Annotated[bool, typer.Option("--arm", help="Let the arm move where a step needs it, after a key press.")]
 
 
 app.command("strokes")(command(CollectRequest, "collect.start:run", lambda run, request: run(request)))
@@ -48,11 +48,11 @@ def browse() -> None:
 def plan(
     config: Rig = RIG_FILE,
     protocol: Annotated[Path, typer.Option(help="The protocol to plan.")] = PROTOCOL_FILE,
-    picture: Annotated[Path | None, typer.Option(help="Draw the sheets: a .png, .svg, .pdf or .jpg.")] = None,
+    picture: Annotated[Path | None, typer.Option(help="Draw the sheets as a .png, .svg, .pdf or .jpg.")] = None,
     arm: Annotated[bool, typer.Option("--arm", help="Plan for a run with --arm, self-check included.")] = False,
-    ask: Annotated[bool, typer.Option("--ask", help="Ask the controller whether it reaches every pose.")] = False,
+    ask: Annotated[bool, typer.Option("--ask", help="Ask the controller if the arm reaches every pose.")] = False,
 ) -> None:
-    """Walk through a protocol without moving the arm: limits, sheets, dips, ink, time, and a picture of the sheets."""
+    """Check a protocol without moving the arm: print limits, sheets, dips, ink and time, and draw the sheets."""
     import asyncio
 
     from brushloop.collect.plan import draw_plan, make_plan, plan_table
@@ -72,12 +72,12 @@ def plan(
         say(f"The sheets are drawn in {picture}")
     if ask:
         poses = all_poses(rig, wanted, PaperPlane(rig.paper.touch_z_mm))
-        say(f"The controller finds joints for all {asyncio.run(ask_reach(config, rig, poses))} poses.")
+        say(f"The controller finds joint angles for all {asyncio.run(ask_reach(config, rig, poses))} poses.")
 
 
 def doctor(
     config: Rig = RIG_FILE,
-    report: Annotated[Path | None, typer.Option(help="Write a bug report, without secrets: FILE.zip.")] = None,
+    report: Annotated[Path | None, typer.Option(help="Write a bug report without secrets, FILE.zip.")] = None,
 ) -> None:
     """Ask every configured device for its identity and its faults. Powers nothing and moves nothing."""
     import asyncio
@@ -94,7 +94,7 @@ def doctor(
             raise ConfigError("--report", "", f"{report} exists and is not overwritten: choose another name")
         if not config.exists() and ADDRESS in (notebook := Notebook.load(config)).values:
             asyncio.run(write_first_report(report, notebook))
-            say(f"There is no {config} yet: {report} holds what was taught and what the arm answered. Read it first.")
+            say(f"There is no {config} yet. {report} holds the values so far and the arm's answers. Read it first.")
             return
     rig = load_rig(config)
 
@@ -105,14 +105,14 @@ def doctor(
     say(doctor_table(findings))
     if report is not None:
         asyncio.run(write_report(report, rig.model_dump(mode="json"), rig.robot, findings))
-        say(f"{report} holds what was asked and answered. Read it before you send it.")
+        say(f"{report} holds every device's answers. Read it before you send it.")
     if not all(finding.well for finding in findings):
         raise typer.Exit(4)
 
 
 @rig_app.command()
 def new(
-    rig: Annotated[Path, typer.Argument(help="The rig.toml to make; what is taught is kept beside it.")] = RIG_FILE,
+    rig: Annotated[Path, typer.Argument(help="The rig.toml to write; values so far are kept beside it.")] = RIG_FILE,
     arm: StepArm = False,
 ) -> None:
     """Guide you through the first day, from an unboxed arm to a rig.toml. Run it again to resume."""
@@ -122,10 +122,10 @@ def new(
 @rig_app.command()
 def teach(
     step: Annotated[str, typer.Argument(help="arm, camera, tip, sheet, places, brush, force, limits or proof.")],
-    rig: Annotated[Path, typer.Option(help="The rig.toml; what was taught is kept beside it.")] = RIG_FILE,
+    rig: Annotated[Path, typer.Option(help="The rig.toml; the values of the first day are kept beside it.")] = RIG_FILE,
     arm: StepArm = False,
 ) -> None:
-    """Teach one step again. Only its values change, and those that depend on them; the changes are listed."""
+    """Repeat one step of the first day. Only its values, and those that depend on them, change; changes are listed."""
     _commission(rig, step, arm=arm)
 
 
@@ -138,7 +138,7 @@ def _commission(rig: Path, step: str | None, *, arm: bool) -> None:
     from brushloop.drivers.host import Clock
 
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
-        raise ConfigError("rig", "", "a rig is taught on a screen: run this command in a terminal")
+        raise ConfigError("rig", "", "the first day needs a screen: run this command in a terminal")
 
     visit = Visit(rig, Clock(), armed=arm)
 
@@ -149,15 +149,15 @@ def _commission(rig: Path, step: str | None, *, arm: bool) -> None:
         return await (wizard.run() if step is None else wizard.again(step))
 
     if (written := run_commission(visit, work)) is not None:
-        say(f"{written} is written, with how each value was obtained. Next: brushloop rig check {written}")
+        say(f"{written} is written; it says how each value was obtained. Next: brushloop rig check {written}")
 
 
 @rig_app.command()
 def show(
     rig: RigFile = RIG_FILE,
-    picture: Annotated[Path | None, typer.Option(help="Draw it from above: .png, .svg, .pdf or .jpg.")] = None,
+    picture: Annotated[Path | None, typer.Option(help="Draw the rig from above as a .png, .svg, .pdf or .jpg.")] = None,
 ) -> None:
-    """Show a rig: its box of limits and every place that the tip goes to. Asks no device."""
+    """Show a rig: the limits of the tip and every place that it goes to. No device is asked."""
     from brushloop.collect.rig.check import draw_rig, rig_table
     from brushloop.collect.rig.config import load_rig
 
@@ -172,7 +172,7 @@ def show(
 
 @rig_app.command()
 def check(rig: RigFile = RIG_FILE) -> None:
-    """Report which values of a rig.toml are plausible, contradict each other, or were not measured. Asks no device.
+    """Report which values of a rig.toml are plausible, contradict each other, or were not measured. No device is asked.
 
     Ends with code 5 if values contradict each other.
     """

@@ -292,7 +292,7 @@ class Procedures:
         await self.go(up)
         off_mm = rests_mm - self._config.paper.touch_z_mm
         if abs(off_mm) > TOUCH_TOLERANCE_MM:
-            raise StepVoid(f"zero touch rests {off_mm:+.3f} mm from the taught height; limit {TOUCH_TOLERANCE_MM} mm")
+            raise StepVoid(f"zero touch is {off_mm:+.3f} mm off the taught height; limit {TOUCH_TOLERANCE_MM} mm")
         return rests_mm
 
     async def lower(self, x_mm: float, y_mm: float, z_mm: float, speed_mm_s: float) -> float:

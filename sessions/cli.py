@@ -42,7 +42,7 @@ def list_(
 @app.command()
 def show(
     session: Session,
-    as_json: Annotated[bool, typer.Option("--json", help="Everything, as one JSON object.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print all details as one JSON object.")] = False,
 ) -> None:
     """Show what is in a session: steps, strokes per condition, sheets, devices."""
     from pydantic import TypeAdapter
@@ -57,7 +57,7 @@ def show(
 def verify(session: Session) -> None:
     """Read every file again, check each against its CRC, its counts and the journal, and decode every image.
 
-    Exit code 0: everything is intact. 6: something is damaged, and is named.
+    Exit code 0: everything is intact. Exit code 6: something is damaged, and is named.
     """
     from brushloop.sessions.verify import verify_session
 
@@ -79,7 +79,7 @@ def repair(session: Session) -> None:
     """Recover every intact finished stroke of a damaged session, mark the rest as lost, and report what was done.
 
     Nothing recorded is overwritten: damaged files are kept as `<name>.damaged-1`. Exit code 0: nothing was lost.
-    3: something was, and is named. 6: nothing could be rebuilt.
+    Exit code 3: something was lost, and is named. Exit code 6: nothing could be rebuilt.
     """
     import time
 
@@ -97,7 +97,7 @@ def repair(session: Session) -> None:
 
 @app.command()
 def close(session: Annotated[Path, typer.Argument(help="The folder of a session that was left open.")]) -> None:
-    """Write the merged MCAP of a session that was left open, and read it back; collecting into it then ends."""
+    """Write the merged MCAP of a session that was left open, and read it back. The session then ends."""
     import time
 
     from brushloop.sessions.store import SessionStore
@@ -116,14 +116,14 @@ def import_(
     csv: Annotated[Path, typer.Option(help="Table with a `file` column, px_per_mm, and one column per parameter.")],
     out: Annotated[Path | None, typer.Option(help="New session folder; sessions/<folder's name> by default.")] = None,
     kind: Annotated[
-        Literal["press", "drag"], typer.Option(help="press (vertical presses) or drag (strokes that travel).")
+        Literal["press", "drag"], typer.Option(help="press (vertical presses) or drag (strokes along the paper).")
     ] = "press",
     px_per_mm: Annotated[float | None, typer.Option(min=0.01, max=1e4, help="Scale, where the table has none.")] = None,
     licence: Annotated[str, typer.Option(help="Licence of the photographs, kept in the recording.")] = "",
-    origin: Annotated[str, typer.Option(help="Where they come from, kept in the recording.")] = "",
+    origin: Annotated[str, typer.Option(help="Source of the photographs, kept in the recording.")] = "",
     brush: Annotated[str, typer.Option(help="Description of the brush.")] = "",
-    brush_radius_mm: Annotated[float | None, typer.Option(min=0.5, max=50.0, help="R in mm; default: 6.")] = None,
-    brush_length_mm: Annotated[float | None, typer.Option(min=5.0, max=500.0, help="L in mm; default: 48.")] = None,
+    brush_radius_mm: Annotated[float | None, typer.Option(min=0.5, max=50.0, help="Radius in mm; default 6.")] = None,
+    brush_length_mm: Annotated[float | None, typer.Option(min=5.0, max=500.0, help="Length in mm; default 48.")] = None,
     simulated: Annotated[bool, typer.Option("--simulated", help="The ink was simulated; reports say so.")] = False,
 ) -> None:
     """Turn a folder of photographs with a parameter table into a session that every later command accepts."""

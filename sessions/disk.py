@@ -196,9 +196,9 @@ def check_file(path: Path) -> bool:
     except OSError:
         return False
     if stat.S_ISLNK(mode):
-        raise InputError(path, "is a link, which nothing in a session's folder may be: put the file itself there")
+        raise InputError(path, "is a link, which is not allowed in a session's folder: put the file itself there")
     if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
-        raise InputError(path, "is neither a file nor a folder; nothing else may be in a session's folder")
+        raise InputError(path, "is neither a file nor a folder; a session's folder may hold nothing else")
     return True
 
 

@@ -33,7 +33,7 @@ MAX_JOURNAL_BYTES = 256 * 1024 * 1024
 Line = dict[str, Any]
 _END = re.compile(rb',"crc":"([0-9a-f]{8})"\}')
 _TAIL = re.compile(_END.pattern + rb"\Z")
-KILLED = "the process ended during it"
+KILLED = "the process ended during the step"
 _R = TypeVar("_R")
 
 
@@ -129,7 +129,7 @@ class RunState:
         if known is not None and (known.attempt >= done.attempt or Topic.STROKE in {**known.counts, **done.counts}):
             earlier = known
         if earlier is not None:
-            raise DoneTwice(f"says that {done.file} is done: its step was done already, in {earlier.file}")
+            raise DoneTwice(f"says that {done.file} is done, but {earlier.file} had done the same step before")
         self.running.pop((done.key, done.attempt), None)
         self.done[done.key] = self.files[done.file] = done
 
@@ -285,7 +285,7 @@ def _in_order(reading: Reading, entries: list[Entry], session: str) -> list[Entr
     for entry in [entry for entry in entries if entry.session != session][:1]:
         reading.faults.append(f"line {entry.number} is of another session, {entry.session[:100]!r}")
     for entry in [entry for entry in own if entry.seq != entry.number][:1]:
-        what = "lines before it are missing, out of place or stand twice"
+        what = "earlier lines are missing, moved or doubled"
         reading.faults.append(f"line {entry.number} is numbered {entry.seq}: {what}")
     by_seq = {entry.seq: entry for entry in own}
     last = max(by_seq, default=0)

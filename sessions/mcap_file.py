@@ -120,7 +120,7 @@ class McapFile:
             for offset, index in self._chunks.items():
                 size = 0 if index is None else index.chunk_length + index.message_index_length
                 if index is None or size > _size(file):
-                    raise McapError("a chunk is not as the index states")
+                    raise McapError("a chunk does not match the index")
                 file.seek(offset)
                 yield file.read(size), index
 
@@ -278,7 +278,7 @@ def _check_data(file: IO[bytes]) -> None:
     while data := file.read(min(end - file.tell(), 1 << 20)):
         crc = zlib.crc32(data, crc)
     if expected not in (0, crc):
-        raise McapError("what is before it does not match its CRC")
+        raise McapError("the data section does not match its CRC")
 
 
 def _size(file: IO[bytes]) -> int:
@@ -294,7 +294,7 @@ def _record(file: IO[bytes], offset: int, opcode: Opcode) -> bytes:
     file.seek(offset)
     actual, length = RECORD_START.unpack(file.read(RECORD_START.size))
     if actual != opcode or length > min(MAX_RECORD_BYTES, _size(file) - file.tell()):
-        raise McapError(f"no {opcode.name.lower()} of at most {MAX_RECORD_BYTES} bytes is at byte {offset}")
+        raise McapError(f"the {opcode.name.lower()} at byte {offset} is missing, or exceeds {MAX_RECORD_BYTES} bytes")
     return file.read(length)
 
 

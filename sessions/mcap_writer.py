@@ -154,7 +154,7 @@ class McapWriter:
             if number not in self.channels:
                 self.add_channel(schema, channel)
             elif self.channels[number].topic != channel.topic:
-                raise SessionDamaged(path, f"has {channel.topic} under the number of {self.channels[number].topic}")
+                raise SessionDamaged(path, f"gives {channel.topic} the channel number of {self.channels[number].topic}")
         self._end_chunk()
         for data, index in source.packed_chunks():
             shift = self._file.tell() - index.chunk_start_offset
@@ -278,7 +278,7 @@ class SegmentWriter:
         """Queue a message. Raises `SessionError` for a disk that failed or is too slow."""
         self._raise_error()
         if self._queue.qsize() >= QUEUE_LIMIT:
-            raise SessionError(self._part, f"{QUEUE_LIMIT} messages wait: the disk does not keep up")
+            raise SessionError(self._part, f"{QUEUE_LIMIT} messages wait to be written: the disk does not keep up")
         self.counts[outgoing.topic] += 1
         self._queue.put(outgoing)
 

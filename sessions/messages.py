@@ -52,7 +52,7 @@ def decode_still(data: bytes, where: Path | str) -> bytes:
     try:
         return CompressedImage.FromString(data).data
     except DecodeError:
-        raise SessionDamaged(where, "a photograph does not fit its schema") from None
+        raise SessionDamaged(where, "the message of a photograph cannot be decoded") from None
 
 
 def encode_png(image: NDArray[np.uint8]) -> bytes:

@@ -79,7 +79,7 @@ class Recording:
         for attachment in self._file.attachments():
             if attachment.name == name and len(attachment.data) <= MAX_ATTACHMENT_BYTES:
                 return attachment.data
-        raise InputError(self.path, f"holds no {name} of at most {MAX_ATTACHMENT_BYTES} bytes")
+        raise InputError(self.path, f"{name} is missing, or larger than {MAX_ATTACHMENT_BYTES} bytes")
 
     def stroke_records(self) -> Iterator[Stroke]:
         """Strokes as they were commanded, without their stills. Raises `SessionDamaged`."""
@@ -100,7 +100,7 @@ class Recording:
                 continue
             stroke = _event(self.path, Stroke, message.data)
             if (still := dict(latest).get(stroke.still)) is None:
-                what = f"stroke {stroke.stroke_id} names still {stroke.still}, which is not there"
+                what = f"stroke {stroke.stroke_id} refers to photograph {stroke.still}, which is missing"
                 raise SessionDamaged(self.path, what)
             yield Capture(stroke, still, f"{self.path} stroke {stroke.stroke_id}", bad.get(stroke.still, ""))
 
@@ -142,7 +142,7 @@ def find_recording(path: Path, state: RunState | None = None) -> Path:
         raise InputError(path, "no such session: give a session's folder or its .mcap file")
     if (path / JOURNAL_NAME).is_file():
         raise InputError(
-            path, f"has lost its recording {found.name}: `brushloop sessions repair {path}` makes it again"
+            path, f"has lost its recording {found.name}: `brushloop sessions repair {path}` writes it again"
         )
     inside = sorted(one for one in path.iterdir() if (one / JOURNAL_NAME).is_file() or any(one.glob("*.mcap")))
     if inside:
@@ -153,7 +153,7 @@ def find_recording(path: Path, state: RunState | None = None) -> Path:
 def check_path(path: Path) -> None:
     """Raise `InputError` for a folder that holds links, and, with advice, for an unfinished file."""
     if path.suffix == ".part" and path.is_file():
-        what = "was never finished, because a step or a merge was cut: it is kept as evidence and is not a recording"
+        what = "is unfinished, as a step or a merge was interrupted: it is kept as evidence and is not a recording"
         raise InputError(path, f"{what}. Give the session's folder, {path.parent}")
     if path.is_dir():
         check_folder(path)

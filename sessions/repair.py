@@ -87,19 +87,19 @@ def _repair_file(path: Path) -> Report:
     if file.header is None:
         raise SessionDamaged(path, "has lost its header; it cannot be repaired")
     if not file.session:
-        lost.append("the certainty of its header: it does not match its CRC, and is kept as it was read")
+        lost.append("certainty about the header, which does not match its CRC and is kept as it was read")
     strokes: dict[str, bool] = {}
     attached = {one.name: one.data for one in file.attachments() if one.name != HEADER_FILE}
     kept, counts = _replace_damaged(path, parse_header(file), _whole(file, strokes), attached)
     why = "; ".join(what for problems in verdict.findings.values() for what in problems)
-    report.did.append(f"wrote {path.name} again from what can be read of it: {why}{kept}")
+    report.did.append(f"wrote {path.name} again from its readable parts: {why}{kept}")
     report.strokes = counts.get(Topic.STROKE, 0)
     lost += [f"stroke {name}: its photograph is lost" for name, whole in strokes.items() if not whole]
     gone = file.stated - Counter(counts)
     gone[Topic.STROKE] -= list(strokes.values()).count(False)
     lost += [f"messages on {topic}: {count}" for topic, count in gone.items() if count > 0]
     if file.index is None and len(file.damage) > 1:
-        lost.append("anything else behind the damage: without its index its amount is unknown")
+        lost.append("an unknown number of messages behind the damage, as the file has no index")
     if file.index is not None:
         names = {one.name for one in file.index.attachment_indexes} - {HEADER_FILE, *attached}
         lost += [f"the attached file {name}" for name in sorted(names)]
@@ -130,7 +130,7 @@ class _FolderRepair:
             self._put_strays_aside()
             if state.closed is None and self._final_problems and self._final.exists():
                 kept = self._move_aside(self._final)
-                report.did.append(f"put {self._final.name} aside, for which the journal has no close{kept}")
+                report.did.append(f"put {self._final.name} aside, as the journal has no closing line{kept}")
             elif state.closed is not None and self._final_problems:
                 self._merge_again()
         finally:
@@ -144,11 +144,11 @@ class _FolderRepair:
         lines = (encode_line(event, n, session) for n, event in enumerate(evidence.events(), 1))
         kept = _write_anew(self._folder / JOURNAL_NAME, b"".join(lines))
         as_they_were, rebuilt = len(evidence.reading.events), len(evidence.rebuilt)
-        what = f"{as_they_were} lines as they were, {rebuilt} rebuilt from the files"
+        what = f"{as_they_were} lines unchanged, {rebuilt} rebuilt from the files"
         report.did.append(f"wrote {JOURNAL_NAME} again: {what}{kept}")
         report.did += [f"  {JOURNAL_NAME}: {fault}" for fault in evidence.reading.faults]
         if evidence.lost:
-            report.lost.append(f"lines of {JOURNAL_NAME} that no file holds: {evidence.lost}")
+            report.lost.append(f"lines of {JOURNAL_NAME} that cannot be rebuilt: {evidence.lost}")
 
     def _put_strays_aside(self) -> None:
         sheet = self._state.sheet
@@ -156,8 +156,8 @@ class _FolderRepair:
             if what == UNKNOWN_PATCH and sheet not in self._state.doubtful_sheets:
                 self._log(events.Doubt(t_ns=self._now_ns(), sheet=sheet, file=name))
                 self._report.lost.append(
-                    f"which patch {name} pressed: nothing more is pressed on sheet {sheet + 1}; "
-                    f"go on with a fresh one, --sheet {sheet + 2}"
+                    f"which patch the press in {name} used: nothing more is pressed on sheet {sheet + 1}; "
+                    f"continue with a fresh sheet and --sheet {sheet + 2}"
                 )
             self._report.did.append(f"put {name} aside: it {what}{self._move_aside(self._folder / name)}")
             if name in self._begins:
@@ -205,7 +205,7 @@ class _FolderRepair:
         missing = dict(Counter(step.counts) - Counter(counts))
         t_ns, sha256 = self._now_ns(), file_sha256(path)
         self._log(events.Repaired(t_ns=t_ns, file=step.file, sha256=sha256, counts=counts, missing=missing, why=why))
-        how = f"without {count_words(missing)}" if missing else "whole"
+        how = f"without {count_words(missing)}" if missing else "in full"
         self._report.did.append(f"wrote {step.file} ({step_words(step)}) again {how}: {why}{kept}")
         if missing:
             self._report.lost.append(f"messages in {step.file} ({step_words(step)}): {count_words(missing)}")
@@ -213,7 +213,7 @@ class _FolderRepair:
     def _lose(self, step: Done) -> None:
         kept = self._move_aside(self._folder / step.file)
         self._mark_lost(step, self._verdict.damaged[step.file], kept)
-        again = "" if self._state.closed is not None else "; it is done again when the session goes on"
+        again = "" if self._state.closed is not None else "; the step is repeated when the session is resumed"
         self._report.lost.append(f"{step_words(step)}{again}")
         if self._state.closed is not None or not isinstance(step.result, events.CaptureResult):
             return
@@ -223,7 +223,7 @@ class _FolderRepair:
             if press is None or press.stroke_id != step.result.press.stroke_id:
                 continue
             if press.sheet is not None and press.sheet != self._state.sheet:
-                self._mark_lost(done, f"its photograph is lost and its sheet {press.sheet + 1} is no longer in")
+                self._mark_lost(done, f"its photograph is lost and its sheet {press.sheet + 1} is no longer in place")
 
     def _mark_lost(self, step: Done, why: str, kept: str = "") -> None:
         self._log(events.Lost(t_ns=self._now_ns(), file=step.file, why=why))

@@ -308,10 +308,10 @@ def judge(evidence: Evidence, progress: Progress = unseen) -> Verdict:
             verdict.find(error.path.name, error.what)
     for repair in state.repairs:
         if isinstance(repair, events.Lost):
-            verdict.notes.append(f"{repair.file}: was lost: {repair.why}")
+            verdict.notes.append(f"{repair.file} was lost: {repair.why}")
         else:
             missing = count_words(repair.missing) or "nothing"
-            verdict.notes.append(f"{repair.file}: was repaired; missing: {missing}")
+            verdict.notes.append(f"{repair.file} was repaired; missing: {missing}")
     if kept := [path for path in folder.iterdir() if ".damaged-" in path.name or ".superseded-" in path.name]:
         verdict.notes.append(f"{len(kept)} damaged or replaced files are kept beside the session's own")
     return verdict
@@ -329,9 +329,9 @@ def _judge_journal(verdict: Verdict, evidence: Evidence) -> None:
             case Begin(file=file):
                 verdict.find(JOURNAL_NAME, f"does not mention {file}")
             case Done(file=file):
-                verdict.notes.append(f"{file}: {step_words(event)} is finished, but not journalled as done")
+                verdict.notes.append(f"{file}: {step_words(event)} is finished, but the journal does not say so")
             case events.Closed(file=file):
-                verdict.notes.append(f"{file} is complete, but not journalled as closed")
+                verdict.notes.append(f"{file} is complete, but the journal has no closing line")
             case _:
                 verdict.find(JOURNAL_NAME, "does not say how the session was opened")
     for name, what in evidence.strays.items():
@@ -380,7 +380,7 @@ def _content_problems(file: McapFile, progress: Progress) -> list[str]:
                 problems.append(f"stroke {stroke.stroke_id} occurs twice")
             strokes.add(stroke.stroke_id)
             if stroke.still not in stills:
-                problems.append(f"stroke {stroke.stroke_id} names still {stroke.still}, which is not there")
+                problems.append(f"stroke {stroke.stroke_id} refers to photograph {stroke.still}, which is missing")
     except SessionDamaged as error:
         problems.append(f"{error.path} {error.what}")
     except ValidationError as error:

@@ -22,9 +22,9 @@ class LoopRequest:
 
     session: Annotated[Path, Argument(help="The session whose presses are recovered and made again.")]
     config: Rig = RIG_FILE
-    out: Annotated[Path | None, Option(help="Folder for what the loop makes; <session>/loop by default.")] = None
-    presses: Annotated[int | None, Option(min=1, help="Only this many presses, spread evenly over the session.")] = None
-    seed: Annotated[int, Option(min=0, help="Seed of the order.")] = 1
+    out: Annotated[Path | None, Option(help="Folder for the results; <session>/loop by default.")] = None
+    presses: Annotated[int | None, Option(min=1, help="Use this many presses, spread evenly over the session.")] = None
+    seed: Annotated[int, Option(min=0, help="Seed of the random order of the presses.")] = 1
     sheet: NewSheet = None
     armed: Arm = False
     tui: Tui = None
@@ -38,10 +38,10 @@ class WritingRequest:
     config: Rig = RIG_FILE
     out: Annotated[Path, Option(help="Folder for the plan and the report.")] = Path("written")
     sessions: Annotated[Path, Option(help="Folder that holds sessions.")] = Path("sessions")
-    repeats: Annotated[int, Option(min=1, max=1000, help="How often each is written.")] = 1
-    learn: Annotated[int, Option(min=0, max=20, help="First learn from the ink, in at most this many rounds.")] = 0
-    learn_repeats: Annotated[int, Option(min=1, max=100, help="How often each is written in such a round.")] = 2
-    practice: Annotated[bool, Option(help="First write a practice sheet, and fit the brush to it.")] = False
+    repeats: Annotated[int, Option(min=1, max=1000, help="How often each character is written.")] = 1
+    learn: Annotated[int, Option(min=0, max=20, help="First learn better plans, in at most this many rounds.")] = 0
+    learn_repeats: Annotated[int, Option(min=1, max=100, help="Writings of each character in a round of learning.")] = 2
+    practice: Annotated[bool, Option(help="First write a practice sheet, and fit the brush model to its ink.")] = False
     data: CharacterData = None
     cell_mm: Annotated[float, Option(min=10, max=500, help="Side of the character's patch of paper.")] = 70.0
     sheet: NewSheet = None
@@ -54,7 +54,7 @@ class DemoRequest:
     """Press, calibrate, press again and validate on the loopback rig. Run it again to continue where it stopped."""
 
     out: Annotated[Path, Option(help="Folder for everything that the demo makes.")] = Path("demo-run")
-    full: Annotated[bool, Option("--full", help="More presses, and a written character: all three tables.")] = False
+    full: Annotated[bool, Option("--full", help="Press more and write a character, for all tables.")] = False
     brush: Annotated[Path, Option(help="The rig's brush: `table2`, `loopback`, or a brush.toml.")] = Path("table2")
     show: Annotated[bool, Option("--open", help="Open the report in the browser at the end.")] = False
-    verbose: Annotated[bool, Option("--verbose", help="Show all that the steps print, instead of in demo.log.")] = False
+    verbose: Annotated[bool, Option("--verbose", help="Show the steps' output instead of writing demo.log.")] = False

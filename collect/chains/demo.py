@@ -95,7 +95,7 @@ class Demo:
             *write,
             ("compare every model with every stroke", self._validate),
         ]
-        say(f"Demo on the loopback rig, all simulated: {len(steps)} steps.")
+        say(f"Demo on the simulated loopback rig, in {len(steps)} steps.")
         began_s = time.monotonic()
         try:
             for number, (title, run) in enumerate(steps, 1):
@@ -129,8 +129,8 @@ class Demo:
             say(f"  {label:30} {'█' * round(percent / 100 * BAR):{BAR}} {percent:.1f} %")
         if (shapes := report.stat("ccd-bsm", NORMAL)) is not None:
             say(
-                "Size and place count here. The paper compares only shapes, scaled to one size: so compared, CCD-BSM "
-                f"as published scores {shapes.csim.avg:.1f} %, and {TABLE_2['ccd-bsm'].csim[2]:.1f} % in the paper."
+                "These scores count size and place. The paper compares only shapes, scaled to one size. CCD-BSM as "
+                f"published then scores {shapes.csim.avg:.1f} %, and {TABLE_2['ccd-bsm'].csim[2]:.1f} % in the paper."
             )
         say(f"Does CCD-BSM predict this brush? {verdict(report)}")
 
@@ -202,7 +202,7 @@ def _logged(path: Path) -> Generator[None]:
         try:
             yield
         except Exception as error:
-            error.add_note(f"What was printed before is in {path}.")
+            error.add_note(f"The earlier output is in {path}.")
             raise
 
 

@@ -80,8 +80,8 @@ def check_recovered(path: Path) -> None:
     rows = list(csv.DictReader(io.StringIO(read_text(path))))
     bound = sum("at_bound" in (row.get("flags") or "") for row in rows)
     if 2 * bound > len(rows):
-        share = f"{bound} of {len(rows)} presses were recovered at a bound of the range"
-        raise ConfigError(path, "flags", f"{share}: the fit does not describe this brush, nothing is pressed again")
+        share = f"{bound} of {len(rows)} recovered presses lie at a limit of depth or tilt"
+        raise ConfigError(path, "flags", f"{share}: the fit does not describe this brush, so nothing is pressed again")
 
 
 class Settings(BaseModel):
@@ -113,8 +113,8 @@ def begun_with(wanted: Settings, folder: Path) -> Settings:
     try:
         begun = Settings.model_validate_json(read_bounded(path))
     except ValidationError:
-        raise ConfigError(path, "", "does not hold the settings of a loop: use another --out") from None
+        raise ConfigError(path, "", "holds no settings of `brushloop repress`: use another --out") from None
     for (name, was), (_, now) in zip(begun, wanted, strict=True):
         if was != now and name != "fit":
-            raise ConfigError(path, name, f"this loop was begun with {was}, not {now}: use another --out")
+            raise ConfigError(path, name, f"this folder was begun with {was}, not {now}: use another --out")
     return begun

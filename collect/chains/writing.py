@@ -53,7 +53,7 @@ class Writing:
         for number in range(1, request.learn + 1):
             plan = self._learn(plan, number)
             if all(figure.settled for figure in load_plan(plan).figures):
-                say("No character gained by the last round: the best plans are written.")
+                say("The last round improved no character. The best plans are now written.")
                 break
         session = self._written(plan, request.repeats)
         return self._compare(session, plan, request.out)
@@ -124,7 +124,7 @@ class Writing:
         assert isinstance(protocol, WriteConfig)
         names = "".join(figure.name for figure in protocol.figures)
         if names != what:
-            raise ConfigError(path, "figures", f"plans {names}, not {what}: use another --out")
+            raise ConfigError(path, "figures", f"is a plan for {names}, not for {what}: use another --out")
         if protocol.repeats != repeats:
             raise ConfigError(path, "repeats", f"plans {protocol.repeats} writings, not {repeats}: use another --out")
         return self._collected(path)

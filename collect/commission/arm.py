@@ -66,7 +66,7 @@ async def _flange_at_rest(controller: Controller) -> Pose:
                 before = here
     except TimeoutError:
         raise DeviceTimeout(
-            DEVICE, "getTcpPose", f"the arm did not rest for {PATIENCE_S:g} s", remedy="Hold it still."
+            DEVICE, "getTcpPose", f"the arm did not come to rest within {PATIENCE_S:g} s", remedy="Hold the arm still."
         ) from None
 
 
@@ -141,7 +141,7 @@ class ArmStep(Step):
     async def carry_out(self, visit: Visit) -> None:
         """Ask for the address and read everything else. Raises `DeviceError`."""
         host, port = address_of(await visit.value(ADDRESS, ASK_ADDRESS))
-        visit.working(f"asking {host}:{port} who it is")
+        visit.working(f"asking {host}:{port} for its name")
         framing = await find_framing(host, port)
         async with only_asking(host, port, framing) as controller:
             name, settings = await _name(controller), await read_back(controller)
@@ -153,12 +153,12 @@ class ArmStep(Step):
         )
         tool = tool_length(settings.tool.position_mm)
         if any(settings.tool.position_mm) and tool.verdict == "contradicts":
-            why = f"The pendant's tool is {tool.value} long; {tool.allowed} are plausible. {tool.remedy}"
-            visit.say(why, "It is measured in the third step and replaced.", tone="warning")
+            why = f"The tool set on the pendant is {tool.value} long; {tool.allowed} are plausible. {tool.remedy}"
+            visit.say(why, "The third step measures the tool and replaces this value.", tone="warning")
         if safety not in MOVING_ALLOWED:
             visit.say(
-                f"The safety mode is {safety}: the arm cannot be guided by hand until it is released.",
-                "Look at the pendant; this program clears nothing.",
+                f"The safety mode is {safety}: the arm cannot be guided by hand until this mode has ended.",
+                "End the mode at the pendant: brushloop never does.",
                 tone="warning",
             )
         as_set, (payload_kg, *cog_mm) = "as set on the pendant", settings.payload

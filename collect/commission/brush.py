@@ -27,7 +27,7 @@ from brushloop.drivers.ink.station import InkStationConfig
 DEEPEST_SHARE = 0.45
 """A bundle that is pressed deeper than this share of its length comes near to its ferrule."""
 PRIME_ML = 0.5
-NONE, STATION, PUMP = Choice("n", "nothing: by hand"), Choice("i", "an ink station"), Choice("p", "a Modbus pump")
+NONE, STATION, PUMP = Choice("n", "a person, by hand"), Choice("i", "an ink station"), Choice("p", "a Modbus pump")
 RADIUS = number_of("R: radius of the wet bundle at the ferrule, by calipers", 0.5, 50.0, "mm")
 RADIUS_SIGMA_MM, LENGTH_SIGMA_MM = 0.1, 0.5
 """Standard errors of calipers on wet hair."""
@@ -49,12 +49,12 @@ def ask_depth(length_mm: float) -> Prompt:
 def _line_named(line: str) -> str:
     """The serial line that was typed. Raises ValueError for none."""
     if not line:
-        raise ValueError("no serial line was named; `ls -l /dev/serial/by-id /dev/tty*` lists what there is")
+        raise ValueError("no serial line was named; `ls -l /dev/serial/by-id /dev/tty*` lists them")
     return line
 
 
-ASK_PORT = Prompt("Its serial line, such as /dev/serial/by-id/usb-…", read=_line_named)
-DELIVERY = number_of("Delivery per revolution, by weighing ten of them", 0.001, 10.0, "ml")
+ASK_PORT = Prompt("Serial line of the device, such as /dev/serial/by-id/usb-…", read=_line_named)
+DELIVERY = number_of("Delivery per revolution: weigh that of ten revolutions", 0.001, 10.0, "ml")
 
 
 class BrushStep(Step):
@@ -84,14 +84,14 @@ class BrushStep(Step):
         await visit.value("ink.name", Prompt("Name of the ink, for the record", default="ink", read=str))
 
     async def _primed(self, visit: Visit, config: InkTable) -> None:
-        visit.working(f"asking {config.port} who it is")
+        visit.working(f"asking {config.port} for its name")
         device = config.device(visit.clock)
         async with identified(device) as identity:
             level = await device.level()
             gauge = "no gauge" if level is None else f"well {level:.0%} full"
             visit.say(f"{identity.model} {identity.firmware}: {gauge}")
-            while await visit.yes(f"Give {PRIME_ML:g} ml, until its tube drips? The well must stand under it."):
-                visit.working(f"giving {PRIME_ML:g} ml")
+            while await visit.yes(f"Pump {PRIME_ML:g} ml, until the tube drips? The well must stand under the tube."):
+                visit.working(f"pumping {PRIME_ML:g} ml")
                 await device.dose(min(PRIME_ML, config.dose_ml))
                 level = await device.level()
                 if level is not None:
@@ -107,7 +107,7 @@ def _addressed(bus: str) -> dict[str, str | float]:
         return {"kind": "sri-m8123", "interface": "socketcan", "channel": bus} if bus else {}
     parts = urlsplit(f"//{bus}")
     if not parts.hostname or not parts.port:
-        raise ValueError(f"{bus!r} is no bus: type can0, or HOST:PORT/can0 of a gateway")
+        raise ValueError(f"{bus!r} is no CAN bus: type can0, or HOST:PORT/can0 of a gateway")
     channel = parts.path.strip("/") or "can0"
     # Simulated time may run faster than rounds arrive.
     stale = {"stale_ms": LOOPBACK_STALE_MS} if channel == LOOPBACK_CHANNEL else {}
@@ -120,7 +120,7 @@ def _bus(line: str) -> str:
     return line
 
 
-ASK_BUS = Prompt("CAN bus of the force sensor: can0, or HOST:PORT/can0 of a gateway; Enter: no sensor", read=_bus)
+ASK_BUS = Prompt("CAN bus of the force sensor: can0, or HOST:PORT/can0 of a gateway; Enter if there is none", read=_bus)
 REST_S = 1.0
 """How long the sensor is listened to with nothing touching, before the push and after it."""
 LEAST_PUSH_N, MOST_PUSH_N = 0.3, 60.0
@@ -147,7 +147,7 @@ class ForceStep(Step):
         bus = await visit.value("aside.bus", ASK_BUS)
         visit.keep({f"force.{field}": Taught(value, "typed") for field, value in _addressed(bus).items()})
         if not bus:
-            visit.say("Without a force sensor, each session finds the height of the paper by jogging with keys.")
+            visit.say("Without a force sensor, you find the paper's height in each session by jogging with keys.")
             return
         if "touch.force.push_axis" not in visit.notebook.values:
             await self._pushed(visit)
@@ -184,7 +184,7 @@ class ForceStep(Step):
         points = inside_corners(notebook.get("paper.size_mm"), INSET_MM)
         lean_deg = PaperPlane(*notebook.get("aside.plane")).slope_deg
         widest_deg = min(max(math.ceil(10.0 * (lean_deg + LEAN_ROOM_DEG)) / 10.0, 1.0), 3.0)
-        leans = f"the sheet leans by {lean_deg:.2f} deg, and {LEAN_ROOM_DEG:g} deg more"
+        leans = f"the sheet's lean of {lean_deg:.2f} deg and {LEAN_ROOM_DEG:g} deg more"
         return {
             "touch.method": Taught(method, why),
             "touch.points_mm": Taught(points.tolist(), f"{INSET_MM:g} mm inside the sheet's corners"),
@@ -212,7 +212,7 @@ def judged_push(force_n: NDArray[np.float64], noise_n: float) -> list[float]:
     if not LEAST_PUSH_N <= size_n <= MOST_PUSH_N:
         raise NotAccepted(
             f"the push reads {size_n:.3g} N; a finger gives {LEAST_PUSH_N:g} to {MOST_PUSH_N:g} N.",
-            "Push harder and longer; check that this is the sensor's bus, and its scale and unit by its sheet.",
+            "Push harder and longer. Check the sensor's bus, and its scale and unit by its data sheet.",
         )
     if abs(float(force_n[2])) < STRAIGHT * size_n:
         listed = ", ".join(f"{v:+.2f}" for v in force_n.tolist())

@@ -50,7 +50,7 @@ MIRRORED = (
     "Switch mirroring (`flip`) off in the camera's own set-up, or take the mirror out of its way; then try again."
 )
 OTHER_PRINT = (
-    "Count the squares of the print again, the outermost ones too, and measure one; then teach the camera again."
+    "Count the squares of the print again, the outermost ones too, and measure one; then repeat the camera step."
 )
 
 
@@ -65,7 +65,7 @@ def _squares(line: str) -> list[float]:
 ASK_SQUARES = Prompt(
     "Squares of the print of `brushloop camera board`, along its longer and its shorter side, as 26x20", read=_squares
 )
-SQUARE = number_of("Side of a square (ten of them by calipers, divided by ten)", 2.0, 100.0, "mm")
+SQUARE = number_of("Side of a square: measure ten with calipers and divide by ten", 2.0, 100.0, "mm")
 MARKER_SHARE = 0.75
 """Side of a marker as a share of its square's, as `brushloop camera board` prints them."""
 PRINTED = ("board.squares", "board.square_mm", "board.marker_mm", "board.dictionary")
@@ -85,7 +85,7 @@ class CameraStep(Step):
         square_mm = await visit.value("board.square_mm", SQUARE)
         marker = number_of("Side of a marker", 1.0, 100.0, "mm", f"{MARKER_SHARE * square_mm:g}")
         await visit.value("board.marker_mm", marker)
-        family = Prompt("Family of its markers (an ArUco dictionary)", default="DICT_5X5_1000", read=str)
+        family = Prompt("Family of the board's markers (an ArUco dictionary)", default="DICT_5X5_1000", read=str)
         await visit.value("board.dictionary", family)
         with visit.asked_again_if_refused(*PRINTED):
             try:
@@ -125,12 +125,12 @@ class CameraStep(Step):
             )
         values = {
             f"camera.locked.{name}": Taught(
-                int(value) if name in ("width", "height") else value, "chosen by the camera itself, locked, read back"
+                int(value) if name in ("width", "height") else value, "chosen by the camera, then locked and read back"
             )
             for name, value in locked.items()
         }
-        values["camera.kind"] = Taught("opencv", "the only kind")
-        values["camera.source"] = Taught(source, "typed, and its picture was seen")
+        values["camera.kind"] = Taught("opencv", "the only kind that exists")
+        values["camera.source"] = Taught(source, "typed, and confirmed by its picture")
         visit.keep(values)
 
     async def _lens(self, visit: Visit, camera: OpenCvCamera) -> None:
@@ -157,15 +157,15 @@ class CameraStep(Step):
         for warning in (*file.warnings, *file.guidance):
             visit.say(warning, tone="warning")
         path = file.save(visit.rig_path.parent)
-        how = f"fitted to {len(file.residuals_px)} photographs of the board held in {file.ways} ways"
+        how = f"fitted to {len(file.residuals_px)} photographs of the board at {file.ways} angles"
         known = f"residual {file.rms_px:.2f} px (limit: {RMS_LIMIT_PX:g} px)"
         visit.keep({"camera.lens_file": Taught(str(path.relative_to(visit.rig_path.parent)), how, known=known)})
         visit.say(f"Lens: {known} over {len(file.residuals_px)} photographs.")
 
     async def _held(self, visit: Visit, camera: OpenCvCamera, folder: Path, index: int, views: list[BoardView]) -> bool:
         """Take one photograph of the held board, so that a resumed session does not; False if the person skips it."""
-        where = HOLD[index] if index < len(HOLD) else "where it is still missing"
-        how = f"View {index + 1}: cover the board on the table, hold the second print {where}, all sharp; keep still."
+        where = HOLD[index] if index < len(HOLD) else "in a new place"
+        how = f"View {index + 1}: cover the board on the table. Hold the second print {where}, sharp and still."
         why = "The lens is computed from these views."
         async with shown_live(visit, camera):
             if not await visit.brought(f"hold-board {index}", f"{how} {why}", may_skip=True):

@@ -36,7 +36,7 @@ AWAY = {
     "clear-view": "Guide the arm to any place out of the camera's picture.",
     # Last, because the runs of the proof begin where the arm is left: it has to be within the limits.
     "park": "Now bring the arm to its waiting place: brush upright, above everything, out of the camera's picture, and "
-    f"{APART_MM:g} mm or more from the last place: the pictures from both must agree, as the arm is in neither.",
+    f"{APART_MM:g} mm or more from the last place. Neither picture may show the arm: the two must agree.",
 }
 PARKED = "aside.parked"
 INK = ("well-rim", "well", "wash-rim", "wash-pot")
@@ -48,12 +48,12 @@ BELOW_MM = 2.0
 """Room below the deepest press and the dip, for a sheet that is found a little lower."""
 BOX = tuple(f"robot.limits.{axis}_mm" for axis in "xyz")
 SPEEDS = {
-    "robot.limits.tilt_deg": number_of("Widest lean of the brush", 1.0, 30.0, "deg", "15"),
+    "robot.limits.tilt_deg": number_of("Largest tilt of the brush", 1.0, 30.0, "deg", "15"),
     "robot.limits.speed_mm_s": number_of("Highest speed of the tip in later sessions", 1.0, 500.0, "mm/s", "150"),
     "robot.limits.acc_mm_s2": number_of("Highest acceleration in any motion", 1.0, 5000.0, "mm/s2", "800"),
     "motion.travel_speed_mm_s": number_of("Speed of travel above the sheet", 1.0, 500.0, "mm/s", "100"),
-    "motion.press_speed_mm_s": number_of("Speed down into a press", 1.0, 100.0, "mm/s", "15"),
-    "motion.acc_mm_s2": number_of("Acceleration of travel and press", 1.0, 5000.0, "mm/s2", "500"),
+    "motion.press_speed_mm_s": number_of("Speed of the descent into a press", 1.0, 100.0, "mm/s", "15"),
+    "motion.acc_mm_s2": number_of("Acceleration in travel and press", 1.0, 5000.0, "mm/s2", "500"),
 }
 """With cautious defaults, and the most that `rig.toml` takes."""
 
@@ -104,18 +104,18 @@ class PlacesStep(Step):
         places = tips(visit.notebook)
         if (apart_mm := math.dist(places["park 0"], places["clear-view 0"])) < APART_MM:
             raise NotAccepted(
-                f"the arm was only {apart_mm:.0f} mm apart in the two pictures: they show the same.",
-                f"Bring it to two places {APART_MM:g} mm or more apart; both are asked again.",
+                f"the two places of the arm are only {apart_mm:.0f} mm apart: both pictures show the same.",
+                f"Bring the arm to two places {APART_MM:g} mm or more apart; you are asked for both again.",
             )
         share = changed_share(*pictures)
         if share >= ARM_SHARE:
             beside = np.hstack(pictures).astype(np.uint8)
             visit.say("The arm elsewhere (left), and parked (right):", picture=beside)
             raise NotAccepted(
-                f"the arm, or its shadow, is in one of the two pictures: {100 * share:.0f} % of them differs.",
-                "Park it farther from the sheet, or higher; both places are asked again.",
+                f"the arm, or its shadow, is in one of the two pictures: {100 * share:.0f} % of the pixels differ.",
+                "Park the arm farther from the sheet, or higher; you are asked for both places again.",
             )
-        shown = f"the two pictures agree ({100 * share:.1f} % of them differs): the arm is in neither"
+        shown = f"the two pictures agree ({100 * share:.1f} % of the pixels differ): the arm is in neither"
         visit.keep({PARKED: Taught(True, shown)})
         visit.say(f"{shown.capitalize()}.")
 
@@ -187,13 +187,13 @@ def wipe_of(notebook: Notebook) -> tuple[tuple[float, float], float]:
 
 def check_wipe(notebook: Notebook) -> None:
     """Raise `NotAccepted` for a wipe that leads over the sheet, or that begins elsewhere than in the well."""
-    check_pot(notebook, "well-rim 1", "well 0", "well", "Touch the rim of the same well; only it is asked again.")
+    check_pot(notebook, "well-rim 1", "well 0", "well", "Touch the rim of the same well; only this touch is repeated.")
     (x, y), _ = wipe_of(notebook)
     width, height = notebook.get("paper.size_mm")
     if 0.0 <= x <= width and 0.0 <= y <= height:
         raise NotAccepted(
             "the wipe would end over the sheet, and the drop would fall on it.",
-            "Touch the rim on another side; only this place is asked again.",
+            "Touch the rim on another side; only this touch is repeated.",
         )
 
 
@@ -215,13 +215,13 @@ class LimitsStep(Step):
         visit.working("drawing box and places")
         await asyncio.to_thread(draw_rig, rig, picture)
         visit.say(
-            f"{picture} shows box, sheet, board, well and park from above.",
+            f"{picture} shows limits, sheet, board, well and park position from above.",
             picture=await asyncio.to_thread(read_gray, picture),
         )
         x_mm, y_mm, z_mm = (f"{taught.value} mm" for taught in box.values())
         if not await visit.yes(
             f"The tip will stay in this box of the base frame: x {x_mm}, y {y_mm}, z {z_mm}. It is the smallest "
-            f"around all that you taught, with {MARGIN_MM:g} mm beside and above, and {BELOW_MM:g} mm below all. "
+            f"box around all taught places, with {MARGIN_MM:g} mm beside and above them, and {BELOW_MM:g} mm below. "
             "Agreed?"
         ):
             raise NotAccepted(
@@ -234,7 +234,7 @@ class LimitsStep(Step):
                 f"the arm does not reach the whole sheet: {error.what}.",
                 "Move the board with the sheet nearer to the arm, and teach sheet and places again.",
             ) from None
-        visit.say(f"The controller finds joints for all {count} poses at and over the places of the tip.")
+        visit.say(f"The controller finds joint angles for all {count} poses at and over the places of the tip.")
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """The smallest box around everything that the tip must reach, in the base frame."""
@@ -248,7 +248,7 @@ class LimitsStep(Step):
         park_x, park_y, park_z = notebook.get("motion.park_mm")
         reached = [point for name, point in places.items() if name.split(" ")[0] in INK]
         points = [*reached, (park_x, park_y, park_z), *corners, *((x, y, z) for z in heights_mm)]
-        beside = f"the smallest around sheet, well, wipe, pot and park position, and {MARGIN_MM:g} mm beside and above"
+        beside = f"{MARGIN_MM:g} mm around the smallest box that holds sheet, well, wipe, pot and park position"
         floor = f"{BELOW_MM:g} mm below the deepest press and the dip; {MARGIN_MM:g} mm above travel and park"
         ranges = zip(BOX, hull(points, MARGIN_MM), (beside, beside, floor), strict=True)
         return {field: Taught(range_mm, how) for field, range_mm, how in ranges}

@@ -59,7 +59,7 @@ class ProofStep(Step):
             await self._run(visit, Path(dry_folder), protocol, dry=True)
         visit.say("The dry run made every move of a press without touching anything.")
         await visit.may_move(
-            f"Touch the sheet, press three marks and {PRESSES} strokes: the well must hold ink, the sheet be blank"
+            f"Touch the sheet, press three marks and {PRESSES} strokes (needs ink in the well and a blank sheet)"
         )
         folder = tempfile.mkdtemp(prefix=f"{visit.rig_path.stem}.proof-", dir=visit.rig_path.parent)
         session = await self._run(visit, Path(folder), protocol, dry=False)
@@ -117,7 +117,7 @@ class ProofStep(Step):
         residuals = f"residuals up to {worst_mm:.3f} mm (limit: {rig.touch.residual_mm:g} mm)"
         known = f"{z_mm - by_hand_mm:+.2f} mm from the touch by hand; {residuals}"
         again = sum(capture.retake for capture in captures)
-        later = "the arm was seen to leave the picture later than it did"
+        later = "by how much later than the arm itself the picture shows it leave"
         visit.keep(
             {
                 HEIGHT: Taught(z_mm, how, sigma_mm, known),

@@ -55,8 +55,8 @@ class SheetStep(Step):
     async def carry_out(self, visit: Visit) -> None:
         """Have the corners touched until the origin is known well enough. Raises `NotAccepted`, `StepError`."""
         visit.say(
-            "Lay the board where the sheet will lie, in the middle of the picture, and the sheet on it, its edges "
-            "along the squares.",
+            "Lay the board in the middle of the picture, where the sheet will lie. Lay the sheet on the board, with "
+            "its edges along the squares.",
             "Touch each corner with the brush upright (hold a set square beside it), and hold still.",
             "The lower edge is the one with the print's name.",
         )
@@ -66,7 +66,7 @@ class SheetStep(Step):
                 if kind == BOARD and number % 2:
                     continue  # the sheet's own corners give its origin, and need more touches
                 for corner in CORNERS:
-                    why = f" once more: the sheet's corner is not known to {GOOD_MM:g} mm yet." if number else "."
+                    why = f" once more: the sheet's origin is not known to {GOOD_MM:g} mm yet." if number else "."
                     how = f"Bring the tip to the {corner} corner of {thing}{why}"
                     await touch(visit, f"{kind} {number} {corner}", how, may_skip=True)
                 if kind == BOARD:
@@ -78,16 +78,16 @@ class SheetStep(Step):
             reached = "✓" if fit.origin_sigma_mm <= GOOD_MM else "·"
             visit.say(
                 f"sheet: {width:.1f} x {height:.1f} mm, turned by {fit.yaw_deg:.2f} deg, leaning by "
-                f"{fit.plane.slope_deg:.2f} deg; corner ({x:.2f}, {y:.2f}) mm; residuals up to {fit.worst_mm:.2f} mm "
+                f"{fit.plane.slope_deg:.2f} deg; origin ({x:.2f}, {y:.2f}) mm; residuals up to {fit.worst_mm:.2f} mm "
                 f"(above {LEAST_OUTLIER_MM:g} mm a touch slipped: esc goes back to it)",
-                f"{reached} standard error of the corner: {fit.origin_sigma_mm:.2f} mm (goal: {GOOD_MM:g} mm)",
+                f"{reached} standard error of the sheet's origin: {fit.origin_sigma_mm:.2f} mm (goal: {GOOD_MM:g} mm)",
             )
             if (sigma_mm := fit.origin_sigma_mm) <= GOOD_MM:
                 return
         if sigma_mm > WORST_MM:
             visit.forget(BOARD, SHEET)
             raise NotAccepted(
-                f"the standard error of the sheet's corner is {sigma_mm:.2f} mm, limit {WORST_MM:g} mm.",
+                f"the standard error of the sheet's origin is {sigma_mm:.2f} mm, limit {WORST_MM:g} mm.",
                 "Fix the sheet, hold still while you press Enter, and touch the corners again.",
             )
 
@@ -121,9 +121,9 @@ def all_corners(notebook: Notebook, kind: str) -> Corners:
     if missing := [f"{kind.removesuffix('-corner')} {CORNERS[k]}" for k in range(4) if not corners[k]]:
         raise NotAccepted(
             f"not touched: {', '.join(missing)}.",
-            "All four corners of both are needed. What the arm does not reach by hand is out of its reach: move the "
-            "board with the sheet, so that all corners are 0.25 to 0.7 m from the arm's foot, or turn its wrist the "
-            "other way round, and touch all corners again.",
+            "Board and sheet need all four corners. If the arm does not reach a corner by hand, move board and sheet, "
+            "so that all corners are 0.25 to 0.7 m from the arm's foot, or turn the arm's wrist the other way round. "
+            "Then touch all corners again.",
         )
     return corners
 
@@ -200,8 +200,8 @@ def check_board(board: Corners, spec: BoardSpec) -> None:
         raise NotAccepted(
             f"the board is {100.0 * scale:.1f} % of its printed size: its squares measure "
             f"{scale * spec.square_mm:.2f} mm, not {spec.square_mm:g} mm.",
-            "Print it again at 100 %, without `fit to page`, or measure ten squares with calipers and teach the camera "
-            "again with that size.",
+            "Print it again at 100 %, without `fit to page`, or measure ten squares with calipers and repeat the "
+            "camera step with that size.",
         )
 
 
@@ -262,8 +262,8 @@ def _check_straight(corners: Floats) -> None:
     if abs(askew_deg) > ASKEW_DEG:
         raise NotAccepted(
             f"the sheet lies turned by {askew_deg:+.1f} deg on its board.",
-            "Lay its edges along the squares, and touch again; the lower left corner of both is the one beside the "
-            "print's name.",
+            "Lay its edges along the squares, and touch the corners again; the lower left one is beside the print's "
+            "name, for board and sheet.",
         )
 
 

@@ -61,7 +61,7 @@ def find_tip(flanges: Sequence[Pose]) -> TipFit:
     are too alike.
     """
     if len(flanges) < LEAST_TOUCHES:
-        raise NotAccepted(f"{len(flanges)} touches of the pin", f"do not give the tip: {LEAST_TOUCHES} are needed.")
+        raise NotAccepted(f"{len(flanges)} touches of the pin", f"are too few: {LEAST_TOUCHES} are needed.")
     turns = np.array([Rotation.from_quat(pose.quaternion).as_matrix() for pose in flanges])
     places = np.array([pose.position_mm for pose in flanges])
     equations = np.concatenate([np.concatenate([turn, -np.eye(3)], axis=1) for turn in turns])
@@ -69,7 +69,7 @@ def find_tip(flanges: Sequence[Pose]) -> TipFit:
     condition = float(sizes[0] / max(sizes[-1], 1e-12))
     if condition > WORST_CONDITION:
         raise NotAccepted(
-            f"the touches of the pin are too alike (condition {condition:.0f}, limit {WORST_CONDITION:g}):",
+            f"the touches of the pin are too alike (condition number {condition:.0f}, limit {WORST_CONDITION:g}):",
             "lean the brush by 30 deg or more to all four sides, and do not turn the wrist along with it.",
         )
     solution = np.asarray(np.linalg.lstsq(equations, -places.ravel(), rcond=None)[0], np.float64)
@@ -175,13 +175,13 @@ class TipStep(Step):
     async def carry_out(self, visit: Visit) -> None:
         """Have the pin touched until the tip is known well enough. Raises `NotAccepted`."""
         visit.say(
-            "Fix a pin upright where all sides of it can be reached; power the arm, put the pendant into hand guiding.",
-            "Touch its point with the tip of the dry brush, each time leaning to another side, and hold still.",
+            "Fix a pin upright, within reach from all sides. Power the arm and switch the pendant to hand guiding.",
+            "Touch the pin's point with the tip of the dry brush, leaning to another side each time, and hold still.",
         )
         await self._pin(visit)
         visit.say(
-            "Now the direction of the brush: hold it upright, a set square on the table beside it.",
-            f"All {UPRIGHTS} holds are asked for; the goal for their mean is a standard error of {WORST_DEG:g} deg.",
+            "Now the direction of the brush: hold the brush upright along a set square that stands on the table.",
+            f"{UPRIGHTS} upright poses are needed; the goal for their mean is a standard error of {WORST_DEG:g} deg.",
         )
         await self._uprights(visit)
 
@@ -217,7 +217,7 @@ class TipStep(Step):
         if (stray := stray_touch(list(touches.values()))) is not None:
             number, off_mm, limit_mm = stray
             name = list(touches)[number]
-            off = f"{off_mm:.1f} mm from the point of the others (at most {limit_mm:.1f} mm)"
+            off = f"{off_mm:.1f} mm from the common point of the others (at most {limit_mm:.1f} mm)"
             visit.say(f"Touch {int(name) + 1} lies {off}: it is left out.", tone="warning")
             visit.forget(f"pin {name}")
             return math.inf
@@ -237,10 +237,10 @@ class TipStep(Step):
             if (index := next(free, None)) is None:
                 visit.forget("upright")
                 raise NotAccepted(
-                    f"after {MOST_UPRIGHTS} holds the direction of the brush is not known to {WORST_DEG:g} deg.",
-                    "Hold the brush along a set square, not by eye; or skip the holds: it is then not measured.",
+                    f"after {MOST_UPRIGHTS} poses the direction of the brush is not known to {WORST_DEG:g} deg.",
+                    "Hold the brush along a set square, not by eye; or skip this measurement.",
                 )
-            how = f"Hold {index + 1}: brush along the set square, wrist turned differently each time."
+            how = f"Pose {index + 1}: brush upright along the set square, wrist turned differently each time."
             if not await touch(visit, f"upright {index}", how, may_skip=True):
                 if measured_axis(visit.notebook) is None:
                     visit.say("The direction of the brush is not measured.", tone="warning")
@@ -258,18 +258,19 @@ class TipStep(Step):
         if square.verdict == "contradicts":
             wrong, sure = {names[-1]: f"would make the brush lean {square.value} (plausible: {square.allowed})"}, True
         elif len(holds) > 1 and distance(flanges[-2], flanges[-1])[1] < LEAST_TURN_DEG:
-            wrong, sure = {names[-1]: "is the one before again: turn the wrist in between"}, True
+            wrong, sure = {names[-1]: "equals the pose before it: turn the wrist in between"}, True
         if wrong:
-            verdict = "Left out, and asked for again." if sure else "The next holds will show which were not upright."
-            visit.say(*(f"Hold {int(name) + 1} {why}" for name, why in wrong.items()), verdict, tone="warning")
+            verdict = "It is left out and repeated." if sure else "The next poses will show which were not upright."
+            visit.say(*(f"Pose {int(name) + 1} {why}" for name, why in wrong.items()), verdict, tone="warning")
             if sure:
                 visit.forget(*(f"upright {name}" for name in wrong))
             return False
         known = axis.holds >= UPRIGHTS and axis.sigma_deg <= WORST_DEG
         if len(holds) >= LEAST_UPRIGHTS:
             to_come = max(UPRIGHTS - axis.holds, 0 if known else 1)
-            reached = f"{'✓' if known else '·'} standard error after {axis.holds} holds: {axis.sigma_deg:.2f} deg"
-            visit.say(f"{reached}; {to_come} more to come" if to_come else reached)
+            error = f"{axis.sigma_deg:.2f} deg ({axis.holds} upright poses)"
+            reached = f"{'✓' if known else '·'} standard error of the brush's axis: {error}"
+            visit.say(f"{reached}; {to_come} more poses to come" if to_come else reached)
         return known
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
@@ -279,7 +280,7 @@ class TipStep(Step):
         how = f"the same pin touched from {len(touches)} sides by hand"
         offset = Taught(fit.offset_mm, how, fit.error_mm, f"residuals up to {fit.worst_mm:.2f} mm")
         if (axis := measured_axis(notebook)) is None:
-            turn = Taught([0.0, 0.0, 0.0], "taken as square to the flange", known="not measured")
+            turn = Taught([0.0, 0.0, 0.0], "assumed to be square to the flange", known="not measured")
         else:
             how = f"held upright along a set square {axis.holds} times"
             turn = Taught(list(axis.rotation_deg), how, axis.sigma_deg)

@@ -157,7 +157,7 @@ def gaps(notebook: Notebook) -> Iterator[Check]:
     for step in STEPS:
         if step not in notebook.done:
             arm = " --arm" if step == "proof" else ""
-            yield unmeasured(f"step {step}", "not done since something was taught", f"brushloop rig teach {step}{arm}")
+            yield unmeasured(f"step {step}", "not done since the last change", f"brushloop rig teach {step}{arm}")
     for path, known in notebook.values.items():
         if known.known.startswith(UNKNOWN) and not path.startswith(ASIDE):
             yield unmeasured(path, f"{known.value} {unit_of(path)}", f"{known.how}, {known.known}")
@@ -206,10 +206,10 @@ def toml_value(value: Value) -> str:
 
 Picture = NDArray[np.uint8]
 """(h, w) gray."""
-ARM = Choice("a", "let it move: I look at the cell, my hand is at the emergency stop")
-STAY = Choice("x", "leave it where it is")
+ARM = Choice("a", "let the arm move: I look at the robot cell, my hand is at the emergency stop")
+STAY = Choice("x", "leave the arm where it is")
 YES, NO = Choice("y", "yes"), Choice("n", "no")
-THERE, SKIP = Choice("enter", "done"), Choice("k", "skip it")
+THERE, SKIP = Choice("enter", "done"), Choice("k", "skip this")
 Tone = Literal["finding", "warning", "trouble"]
 """After a warning the step can go on; trouble ends it, and its last line says what to do."""
 
@@ -240,7 +240,7 @@ def number_of(
         if not low <= value <= high:
             raise ValueError(f"{value:g} is outside {low:g} to {high:g} {unit}")
         if check is not None and (checked := check(value)).verdict == "contradicts":
-            raise ValueError(f"{value:g} {unit} cannot be ({checked.allowed}). {checked.remedy}")
+            raise ValueError(f"{value:g} {unit} is not plausible ({checked.allowed}). {checked.remedy}")
         return value
 
     return Prompt(question, default=default, read=read, allowed=f"{low:g} to {high:g} {unit}")
@@ -343,7 +343,7 @@ class Visit:
         if field not in self.notebook.values:
             value = await self.ask(prompt)
             agreed = isinstance(value, float) and prompt.default and value == float(prompt.default)
-            how = "suggested, and agreed" if agreed else f"typed: {prompt.question}"
+            how = "suggested, and accepted" if agreed else f"typed: {prompt.question}"
             self.keep({field: Taught(value, how, sigma)})
         return self.notebook.get(field)
 
@@ -351,9 +351,9 @@ class Visit:
         """Ask for the key that lets the arm move. Raises `NotAccepted` unless both it and `--arm` are given."""
         if not self.armed:
             raise NotAccepted(f"{what}: this moves the arm.", "Start the same command again with --arm.")
-        question = f"{what}. The arm moves by itself, slower than 50 mm/s. Is nobody within its reach?"
+        question = f"{what}. The arm moves by itself, slower than 50 mm/s. Is everybody out of its reach?"
         if await self.ask(choice_of(question, (ARM, STAY), STAY.key)) != ARM.key:
-            raise NotAccepted("the arm was left where it is.", "Try this step again once it may move.")
+            raise NotAccepted("the arm was left where it is.", "Try this step again once the arm may move.")
 
 
 class Step(ABC):

@@ -31,7 +31,7 @@ STEPS = (
     LimitsStep(),
     ProofStep(),
 )
-AGAIN = Choice("a", "try again: what is known already is kept")
+AGAIN = Choice("a", "try again: all values so far are kept")
 STOPPED = "stopped; the same command resumes from there"
 REFUSED = (NotAccepted, DeviceError, InputError, StepError, ConfigError)
 
@@ -110,7 +110,7 @@ class Wizard:
                 ]
         self._visit.save(notebook.finished(step.name))
         if changed:
-            self._visit.say("Changed with it, because it depends on this step:", *changed)
+            self._visit.say("These values depend on this step and changed with it:", *changed)
         self._visit.say(f"✓ {step.title}: done")
 
     def _written(self) -> Path:
@@ -122,7 +122,7 @@ class Wizard:
         rig_of(notebook, path)
         text = rig_text(notebook, path)
         if path.exists() and path.read_text(encoding="utf-8") != text:
-            before = f"; as it was before: {set_aside(path, 'bak')}"
+            before = f"; the earlier file is kept as {set_aside(path, 'bak')}"
         write_whole(path, text)
-        self._visit.say(f"{path}: written, with how each value was obtained{before}")
+        self._visit.say(f"{path} is written; it says how each value was obtained{before}")
         return path

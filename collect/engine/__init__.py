@@ -16,8 +16,8 @@ from typer import Option
 RIG_FILE, PROTOCOL_FILE = Path("rig.toml"), Path("protocol.toml")
 Rig = Annotated[Path, Option(help="The rig: addresses, frames, limits.")]
 Arm = Annotated[bool, Option("--arm", help="Let real hardware move.")]
-Tui = Annotated[bool | None, Option("--tui/--no-tui", help="Show the screen; default: if there is a terminal.")]
-NewSheet = Annotated[int | None, Option(min=1, help="Confirm that sheet N of the session is in. Repeating it is safe.")]
+Tui = Annotated[bool | None, Option("--tui/--no-tui", help="Show the screen, by default in any terminal.")]
+NewSheet = Annotated[int | None, Option(min=1, help="Confirm that the session's sheet N is in place; may be repeated.")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,12 +33,12 @@ class CollectRequest:
     """The operator has looked at the robot cell."""
     dry_run_mm: Annotated[
         float | None,
-        Option("--dry-run", help="Only move, lifted by this many mm: nothing is pressed, dipped or kept."),
+        Option("--dry-run", help="Make every move, this many mm higher: nothing is pressed, dipped or kept."),
     ] = None
     on_screen: Tui = None
     """A screen shows run and camera, and can answer questions."""
     guided: Annotated[bool, Option("--set-up", help="On the screen: accept or repeat each step of the set-up.")] = False
     live: Annotated[bool, Option("--live", help="Let a Foxglove viewer on this machine watch the run.")] = False
-    live_port: Annotated[int, Option(min=0, max=65535, help="Port of --live; 0: any.")] = 8765
+    live_port: Annotated[int, Option(min=0, max=65535, help="Port of --live; 0 takes any free one.")] = 8765
     resume: str | None = None
     """Id of the session to resume, and no other."""

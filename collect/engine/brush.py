@@ -119,7 +119,7 @@ async def zero_touch(context: StepContext, step: ZeroTouchStep) -> ZeroTouchResu
             f"{moved_mm:+.2f} mm from the plane known before"
         )
     if step.index > 0:
-        text = f"The paper was found {moved_mm:+.2f} mm from where it was. From now on, H is counted from there."
+        text = f"The paper lies {moved_mm:+.2f} mm from its earlier height. From now on, H counts from the new height."
         choices = (Choice("g", "good, use the new height"), Choice("k", "keep the old height"))
         if await run.asker.ask(Prompt(text, choices, "k")) != "g":
             raise StepError("the new height was not accepted.")

@@ -27,7 +27,8 @@ from brushloop.sessions.events import Again, BoardResult, CaptureResult, Press, 
 from brushloop.sessions.recording import bad_stills
 from brushloop.sessions.records import Check, Condition, Quality, Stroke, Topic
 
-KEEP, AGAIN, SKIP = Choice("g", "good anyway: it counts"), Choice("r", "press it again"), Choice("k", "skip it")
+KEEP, AGAIN = Choice("g", "good anyway: the stroke counts"), Choice("r", "press the stroke again")
+SKIP = Choice("k", "skip the stroke")
 PICTURE_MARGIN_MM, PICTURE_PX_PER_MM = 10.0, 10.0
 """Margin around the patch, and scale, of the picture that goes with a question."""
 
@@ -148,7 +149,7 @@ def _check_view(before: BoardResult, image: Gray, plane: Plane, paper: PaperConf
     moved_mm = float(np.linalg.norm(seen_mm - _corners_mm(paper), axis=1).max())
     if moved_mm > MOVED_MM:
         raise NeedsOperator(
-            f"the board is seen {moved_mm:.1f} mm from where it was when the session began, at most {MOVED_MM:g} mm: "
+            f"the board is seen {moved_mm:.1f} mm from its place at the start of the session (limit {MOVED_MM:g} mm): "
             "camera or board was moved. Put it back, or start a new session with --new."
         )
 
@@ -169,8 +170,8 @@ async def look_at_sheet(context: StepContext) -> None:
         inked = await uninterrupted(_inked_patches, run, image, {patch.index for patch in context.patches})
     if inked:
         raise NeedsOperator(
-            f"{len(inked)} patches of sheet {sheet + 1} that should be blank are not: {inked[0]} "
-            "Put in a blank sheet, or the one that belongs here."
+            f"{len(inked)} patches of sheet {sheet + 1} should be blank, but are not: {inked[0]} "
+            f"Put in a blank sheet, or sheet {sheet + 1} of this session."
         )
     run.looked_at_sheet = sheet
 
@@ -220,7 +221,7 @@ async def capture(context: StepContext, step: CaptureStep) -> CaptureResult:
     """
     run, press, still = context.run, step.press, context.attempt.serial
     if press.patch is None or press.sheet != run.store.state.sheet:
-        raise StepError(f"{press.stroke_id} is not on the sheet that is in")
+        raise StepError(f"{press.stroke_id} is not on the sheet that is in place")
     patch = run.sheet.patch(press.patch)
     frame = await _fresh_frame(context)
     looking = _looked_at(context, step, frame, patch)

@@ -43,18 +43,18 @@ PICTURE_PX = 320
 SILENT_MS = 1000.0
 """Time without a pose after which the snapshot says so: the arm or the connection to it has failed."""
 UNCHECKED = (
-    "no self-check: it is switched off in rig.toml, or left out there and in the command (--arm). Nothing checks "
-    "whether arm, camera and configuration agree"
+    "no self-check: rig.toml switches it off, or neither rig.toml nor --arm asks for it. Nothing checks whether arm, "
+    "camera and configuration agree"
 )
 
-ARM = Choice("a", "arm it: I am looking at the robot cell, my hand is at the emergency stop")
-LEAVE = Choice("x", "do not arm it")
+ARM = Choice("a", "let the arm move: I look at the robot cell, my hand is at the emergency stop")
+LEAVE = Choice("x", "do not let the arm move")
 CUT_OFF = "The last run was cut off: look where it left the arm."
 RESUMED = (
     "The arm first lifts the brush slowly and parks; the board and the paper are found again, and the plan goes on. "
     "No stroke is made twice."
 )
-RESUME = Choice("g", "resume: the arm is at rest, nobody is within its reach, my hand is at the emergency stop")
+RESUME = Choice("g", "resume: the arm is at rest, everybody is out of its reach, my hand is at the emergency stop")
 NOT_NOW = Choice("x", "do not resume")
 
 
@@ -249,10 +249,10 @@ class Engine:
         elif self._request.armed or not real:
             return
         elif self._request.on_screen:
-            prompt = Prompt(f"{hardware}. May it move?", (ARM, LEAVE), LEAVE.key)
+            prompt = Prompt(f"{hardware}. May the arm move?", (ARM, LEAVE), LEAVE.key)
         else:
             raise ConfigError(
-                "rig.toml", "robot", f"{hardware}: look at the cell, keep a hand at the emergency stop, then add --arm"
+                "rig.toml", "robot", f"{hardware}: look at the robot cell, keep a hand at the emergency stop, add --arm"
             )
         if await self._run.asker.ask_or_default(prompt) == prompt.default:
             raise CollectAborted("it was not confirmed that the arm may move; nothing was powered and nothing moved")

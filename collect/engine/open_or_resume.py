@@ -85,7 +85,7 @@ def _lifted(rig: RigConfig, protocol: ProtocolConfig, by_mm: float) -> RigConfig
         raise ConfigError(
             "--dry-run",
             "",
-            f"{by_mm:g} mm is outside [{low_mm:g}, {high_mm:g}] mm: above the deepest press, below travel",
+            f"{by_mm:g} mm must lie in [{low_mm:g}, {high_mm:g}] mm: above the deepest press, below travel height",
         )
     ink, dip_z_mm = rig.ink, rig.ink.dip_z_mm + by_mm
     wipe = None if ink.wipe is None else ink.wipe.model_copy(update={"z_mm": ink.wipe.z_mm + by_mm})
@@ -119,8 +119,8 @@ def find_resumable(opening: Opening) -> Path | None:
     if folders:
         newest = folders[-1]
         way_out = (
-            f"Go on as it was begun: --config {newest / 'rig.toml'} --protocol {newest / 'protocol.toml'}, beside the "
-            "files that they name, in the same environment; or start a new session with --new."
+            f"Resume it with --config {newest / 'rig.toml'} --protocol {newest / 'protocol.toml'}, each beside the "
+            "files that it names, in the same environment; or start a new session with --new."
         )
         what = ["was begun with another configuration:", *differences(newest, opening.snapshots), way_out]
         raise ConfigError(newest, "", "\n".join(what))
@@ -138,12 +138,12 @@ def check_fresh_sheet(root: Path, sheet: int | None) -> None:
         try:
             pressed = pressed or bool(replay(journal).used_patches)
         except SessionError as error:
-            unreadable = f" One cannot be resumed as it is: {error}; see `brushloop sessions verify {journal.parent}`."
+            unreadable = f" One of them cannot be resumed: {error}; see `brushloop sessions verify {journal.parent}`."
     if pressed or unreadable:
         raise ConfigError(
             root,
             "",
-            f"holds earlier sessions, and a new one would press on whatever sheet is in.{unreadable} "
+            f"holds earlier sessions, and a new one would press on the sheet that is in place.{unreadable} "
             "Put a fresh sheet in, then confirm it with --sheet 1",
         )
     if sheet not in (None, 1):
@@ -193,7 +193,7 @@ def put_in_sheet(store: SessionStore, sheet: int | None) -> None:
     if sheet is None or sheet == now:
         return
     if sheet != now + 1:
-        raise ConfigError("--sheet", "", f"{sheet}: sheet {now} is in use, so only {now} or {now + 1} can be in")
+        raise ConfigError("--sheet", "", f"{sheet}: sheet {now} is in use, so only {now} or {now + 1} can be in place")
     pressed, captured = (
         {(result.press.stroke_id, result.press.take) for result in store.state.results(kind)}
         for kind in (PressResult, CaptureResult)

@@ -72,20 +72,20 @@ def question(error: StepError | DeviceError, sheet: int) -> Prompt:
     text = describe(error)
     match error:
         case SheetFull():
-            text = f"Sheet {sheet + 1} is full. Put a fresh one in, then go on."
+            text = f"Sheet {sheet + 1} is full. Put a fresh sheet in, then go on."
             go_on = f"sheet {sheet + 2} is in, and blank"
         case InkRefused():
-            go_on = "there is ink: dip again"
+            go_on = "there is ink in the well: dip again"
         case ForceTooHigh():
-            go_on = "nothing is under the brush: lift it and go on"
+            go_on = "nothing is under the brush: lift the brush and go on"
         case ArmMoved() | PathDisturbed():
-            go_on = "nobody else uses the arm: lift it and go on"
+            go_on = "nobody else uses the arm: lift the brush and go on"
         case SettingsChanged():
-            go_on = "nobody else uses the arm: restore the settings, lift it and go on"
+            go_on = "nobody else uses the arm: restore the settings, lift the brush and go on"
         case NotPowered():
-            go_on = "nothing is in the way of the arm: power it, lift it and go on"
+            go_on = "nothing is in the way of the arm: power it, lift the brush and go on"
         case MotionError():
-            go_on = "the arm is released and nothing is in its way: lift it and go on"
+            go_on = "the arm is released and nothing is in its way: lift the brush and go on"
         case _:
             go_on = "the cause is removed: try again"
     return Prompt(text, (Choice(GO_ON, go_on), STOP), STOP.key)
@@ -146,20 +146,20 @@ def _facts(result: StepResult, config: RigConfig) -> Iterator[Fact]:
                 yield where, f"{point.z_mm:.3f} mm", None
                 if not taught:
                     span_mm = point.span_mm
-                    yield _within("  its touches span", span_mm, touch.repeatability_mm, f"{span_mm:.3f} mm")
+                    yield _within("  span of touches", span_mm, touch.repeatability_mm, f"{span_mm:.3f} mm")
             if not taught:
-                yield _within("from the height before", result.moved_mm, touch.moved_mm, f"{result.moved_mm:+.3f} mm")
+                yield _within("from the last height", result.moved_mm, touch.moved_mm, f"{result.moved_mm:+.3f} mm")
             off_mm = [abs(residual_mm) for residual_mm in result.residuals_mm]
             if len(off_mm) > 3:
-                yield _within("off the plane", max(off_mm), touch.residual_mm, f"{max(off_mm):.3f} mm")
-            level = "taken as level: fewer than three points"
+                yield _within("distance from plane", max(off_mm), touch.residual_mm, f"{max(off_mm):.3f} mm")
+            level = "assumed level: fewer than three points"
             yield "plane", level if len(off_mm) < 3 else f"leans by {result.slope_deg:.2f}°", None
         case SelfCheckResult(turn_deg=turn_deg):
             off_mm = math.hypot(*result.offset_mm)
             scale_x, scale_y = (100.0 * (scale - 1.0) for scale in result.scale)
-            yield _within("marks lie off by", off_mm, config.self_check.offset_mm, f"{off_mm:.2f} mm")
-            yield _within("turned by", turn_deg, config.self_check.turn_deg, f"{turn_deg:+.2f}°")
-            yield "lengths off by", f"{scale_x:+.2f} % in x, {scale_y:+.2f} % in y", None
+            yield _within("offset of the marks", off_mm, config.self_check.offset_mm, f"{off_mm:.2f} mm")
+            yield _within("turn of the marks", turn_deg, config.self_check.turn_deg, f"{turn_deg:+.2f}°")
+            yield "error of lengths", f"{scale_x:+.2f} % in x, {scale_y:+.2f} % in y", None
             yield "largest residual", f"{max(result.residuals_mm):.2f} mm", None
         case _:
             pass

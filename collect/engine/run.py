@@ -136,7 +136,7 @@ class Run(RunContext):
     async def _new_sheet(self) -> None:
         sheet = self.store.state.sheet
         text = f"Replace sheet {sheet + 1} by a blank one, then go on."
-        choices = (Choice(GO_ON, f"the blank sheet lies there: it becomes sheet {sheet + 2}"), KEEP_SHEET)
+        choices = (Choice(GO_ON, f"the blank sheet is in place and becomes sheet {sheet + 2}"), KEEP_SHEET)
         await self._retreat()
         if await self.asker.ask_or_default(Prompt(text, choices, KEEP_SHEET.key)) == GO_ON:
             self.fresh_sheet()
@@ -163,7 +163,7 @@ class Run(RunContext):
         self.progress.log(f"{asked.question} -> {meant}")
         if answer == STOP.key:
             if parked:
-                raise CollectAborted(f"stopped at a question, parked: {describe(error)}") from error
+                raise CollectAborted(f"stopped at a question, with the arm parked: {describe(error)}") from error
             raise error
         self.procedures.photographer.forget()  # a person may have changed what the camera sees
         if isinstance(error, MotionError | LimitExceeded):
@@ -258,7 +258,7 @@ class Run(RunContext):
         if lag_ms is not None and lag_ms > limit_ms:
             raise NeedsOperator(
                 f"poses of the arm arrive {lag_ms:.0f} ms late; robot.max_pose_lag_ms = {limit_ms:g}. If only pushed "
-                "poses are late, leave robot.rtde_port out of rig.toml: they are then asked for. If not, look at the "
+                "poses are late, leave robot.rtde_port out of rig.toml: poses are then polled. Otherwise, check the "
                 "network."
             )
 

@@ -178,7 +178,7 @@ class Photograph:
             return _check(Failure.NEIGHBOUR, hidden_mm2, "mm^2", limits.foreign_mm2, reason, passed=False)
         ink_mm2 = mm2(window.inked(limits.ink_gate))
         what = f"Patch {patch.index} is not blank: {ink_mm2:.1f} mm^2 of ink."
-        reason = f"{what} Is this the sheet that the session says it is?"
+        reason = f"{what} Is this the sheet that the session expects?"
         return _check(Failure.NEIGHBOUR, ink_mm2, "mm^2", limits.foreign_mm2, reason)
 
     def _ink(self, patch: Patch, margin_mm: float, anchor_mm: Point) -> Ink:
@@ -221,16 +221,16 @@ def neighbour(ink: Ink, limits: QualityConfig) -> Check:
     source = (
         "a stroke of the next patch reaches into it. Leave this patch out and make the patches larger"
         if ink.before_mm2 > ink.beside_mm2
-        else "something dripped or lies apart from the stroke. Wipe the brush on the rim after a dip"
+        else "something dripped, or lies apart from the stroke. Wipe the brush on the rim after a dip"
     )
-    reason = f"{area_mm2:.1f} mm^2 of ink in the patch are not the stroke's: {source}."
+    reason = f"{area_mm2:.1f} mm^2 of ink in the patch do not belong to the stroke: {source}."
     return _check(Failure.NEIGHBOUR, area_mm2, "mm^2", limits.foreign_mm2, reason)
 
 
 def blank(own_mm2: float, depth_mm: float, limits: QualityConfig) -> Check:
     """The press left ink."""
     least_mm2 = limits.blank_mm2_per_mm * depth_mm
-    reason = f"No stroke: {own_mm2:.1f} mm^2 of ink. Dip again; if the well is full, teach the touch height again."
+    reason = f"No stroke: only {own_mm2:.1f} mm^2 of ink. Dip again; if the well is full, teach the touch height again."
     return _check(Failure.BLANK, own_mm2, "mm^2", least_mm2, reason, passed=own_mm2 >= least_mm2)
 
 
@@ -261,7 +261,7 @@ def judge_mark(mark: Mark, depth_mm: float, limits: QualityConfig) -> Iterator[C
     reason = f"The bristles are split: a gap of {mark.gap_mm:.1f} mm. Comb the brush together on the rim and dip again."
     yield _check(Failure.SPLIT, mark.gap_mm, "mm", limits.split_mm, reason)
     # It runs along the heading.
-    reason = f"The tip is bent: the stroke runs {mark.bent_deg:.0f} deg off. Wipe the tip straight and dip again."
+    reason = f"The tip is bent: the stroke is {mark.bent_deg:.0f} deg off the heading. Wipe it straight; dip again."
     yield _check(Failure.BENT, mark.bent_deg, "deg", limits.bent_deg, reason)
 
 

@@ -318,20 +318,20 @@ class Photographer:
         limit = f"camera.max_delay_ms = {self._config.max_delay_ms:g}"
         return CameraLate(f"the camera's delay is too long: {what}; {limit}. {FASTER}")
 
-    def _uneven(self, what: str = "frames come too unevenly to measure it") -> CameraLate:
+    def _uneven(self, what: str = "frames arrive too unevenly to measure the delay") -> CameraLate:
         limit = f"camera.max_jitter_ms = {self._config.max_jitter_ms:g}"
         return CameraLate(f"the camera's delay is not steady: {what}; {limit}. {FASTER}")
 
     def _not_shown(self) -> CameraLate:
         return CameraLate(
-            f"the camera did not show within {self._patience_s:g} s that the arm went over the sheet and away again: "
-            "it looks elsewhere, its picture is frozen, or its delay is far longer than camera.max_delay_ms = "
-            f"{self._config.max_delay_ms:g}. Point it at the sheet, and see that nothing else moves in its view."
+            f"the camera did not show within {self._patience_s:g} s that the arm went over the sheet and away again. "
+            "It looks elsewhere, its picture is frozen, or its delay is far longer than camera.max_delay_ms = "
+            f"{self._config.max_delay_ms:g}. Point it at the sheet; let nothing but the arm move in its view."
         )
 
 
 def _in_picture(seconds: float) -> BadPicture:
     return BadPicture(
-        f"something moves or stays in the picture {seconds:g} s after the arm parked: the arm, a hand or a shadow, "
-        "or camera or sheet were moved. Clear the view; the arm must be out of it at motion.park_mm."
+        f"{seconds:g} s after the arm parked, something still moves or stays in the picture: the arm, a hand or a "
+        "shadow; or camera or sheet was moved. Clear the view; at motion.park_mm the arm must be out of the picture."
     )

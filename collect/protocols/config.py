@@ -48,7 +48,7 @@ def read_rows(folder: Path, name: object, row: type[_R]) -> list[_R]:
     is none of a file there.
     """
     if not isinstance(name, str) or not name or Path(name).name != name or not name.isprintable() or "\\" in name:
-        raise ValueError(f"file: must be the plain name of a file next to it (given: {name!r:.80})")
+        raise ValueError(f"file: must be the name, without folder, of a file beside the protocol (given: {name!r:.80})")
     path = folder / name
     lines = csv.reader(io.StringIO(read_text(path, encoding="utf-8-sig"), newline=""), strict=True)
     rows: list[_R] = []

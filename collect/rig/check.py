@@ -163,7 +163,7 @@ def brush_square(rotation_deg: tuple[float, float, float]) -> Check:
     """
     if not any(rotation_deg):
         remedy = "Hold the brush upright: brushloop rig teach tip."
-        return unmeasured("brush to the flange's axis", "taken as square", remedy)
+        return unmeasured("brush to the flange's axis", "assumed to be square", remedy)
     about_x, about_y, _ = map(math.radians, rotation_deg)
     lean_deg = math.degrees(math.acos(max(-1.0, min(1.0, math.cos(about_x) * math.cos(about_y)))))
     remedy = "The brush would lean far from the flange's axis. Look at the holder, and teach the tip again."
@@ -246,20 +246,20 @@ def _not_measured(config: RigConfig) -> Iterator[Check]:
     if not robot.payload_kg:
         yield unmeasured("payload", "the pendant's", "Weigh holder, brush and sensor: robot.payload_kg.")
     if robot.collision_level is None:
-        yield unmeasured("collision level", "the pendant's", "robot.collision_level fixes it; 9 is the most sensitive.")
+        yield unmeasured("collision level", "the pendant's", "robot.collision_level sets it; 9 is the most sensitive.")
     if unlocked := [name for name, value in camera.locked.model_dump().items() if value is None]:
-        remedy = "They may drift: set camera.locked, or lock them where a stream is served."
+        remedy = "They may drift: set camera.locked, or lock them in the program that serves the stream."
         yield unmeasured("camera settings", f"not locked: {', '.join(unlocked)}", remedy)
     if camera.optics is None:
         yield unmeasured("lens", "not calibrated", "brushloop camera intrinsics makes camera.lens_file.")
     if touch.method == "taught" or len(touch.points_mm) < 3:
-        value = "taught by hand" if touch.method == "taught" else "fewer than three touch points: taken as level"
-        yield unmeasured("height and slope of the paper", value, "Touch three points or more far apart: [touch].")
+        value = "taught by hand" if touch.method == "taught" else "fewer than three touch points: assumed level"
+        yield unmeasured("height and slope of the paper", value, "Touch three or more points, far apart: [touch].")
     if config.self_check.enabled is False:
-        remedy = "Three marks before a session show a mirrored or turned sheet: [self_check] enabled."
+        remedy = "Enable [self_check]: three marks before a session show a mirrored or turned sheet."
         yield unmeasured("self-check", "switched off", remedy)
     if config.ink.wipe is None:
-        yield unmeasured("rim of the well", "no [ink.wipe]", "The height of the rim is unknown: travel must clear it.")
+        yield unmeasured("rim of the well", "no [ink.wipe]", "Travel must clear the rim, whose height is unknown.")
     if config.force is None:
         yield unmeasured("force", "no sensor", "Only the arm itself stops a press that meets something hard.")
 

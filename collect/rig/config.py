@@ -294,8 +294,8 @@ class RigConfig(Config):
                 raise ValueError(f"{name} = [{x:g}, {y:g}] lies on the sheet: dips would press on it")
         if wipe is not None and not self.ink.dip_z_mm <= wipe.z_mm < self.motion.safe_z_mm:
             raise ValueError(
-                f"ink.wipe.z_mm = {wipe.z_mm:g} is outside [{self.ink.dip_z_mm:g}, {self.motion.safe_z_mm:g}): "
-                "between the dip and travel"
+                f"ink.wipe.z_mm = {wipe.z_mm:g} must lie in [{self.ink.dip_z_mm:g}, {self.motion.safe_z_mm:g}): "
+                "between the dip and travel height"
             )
         touched = {"touch.points_mm": self.touch.points_mm, "paper.touch_point_mm": [self.paper.touch_point_mm]}
         for name, points_mm in touched.items():
@@ -317,7 +317,7 @@ def _override(values: dict[str, Any], path: tuple[str, ...], name: str) -> None:
     for part in path[:-1]:
         inner: Any = table.setdefault(part, {})
         if not isinstance(inner, dict):
-            raise ConfigError(variable, ".".join(path), "lies in no table of rig.toml")
+            raise ConfigError(variable, ".".join(path), "belongs to no table of rig.toml")
         table = cast("dict[str, Any]", inner)
     text = os.environ[name]
     try:

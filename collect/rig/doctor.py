@@ -134,11 +134,11 @@ async def _force(config: ForceTable, clock: Clock) -> Finding:
         force_n, dropped = math.hypot(*newest.force_n), sensor.assembler
         finding.notes = f"{rate_hz:.0f} rounds/s, {force_n:.3f} N at rest, not zeroed yet"
         if dropped.torn or dropped.refused or sensor.bus_errors:
-            finding.problem = f"{dropped.torn} torn, {dropped.refused} refused rounds, {sensor.bus_errors} bus errors"
+            finding.problem = f"{dropped.torn} broken, {dropped.refused} refused rounds, {sensor.bus_errors} bus errors"
             finding.remedy = "Check wiring, shielding and termination."
         elif force_n > config.max_n:
             ceiling = f"above the ceiling force.max_n = {config.max_n:g} N"
-            finding.problem = f"{force_n:.2f} N with nothing pressing, {ceiling}"
+            finding.problem = f"{force_n:.2f} N while nothing presses, {ceiling}"
             finding.remedy = "Remove what touches the brush; the bias at each start takes off the weight of the holder."
 
     return await _asked(finding, sensor, look)
@@ -165,7 +165,7 @@ async def _robot(config: RigConfig, clock: Clock) -> Finding:
         finding.notes = "; ".join([*notices, f"{mode}, safety {safety}"])
         if safety not in MOVING_ALLOWED:
             finding.problem = f"safety mode is {safety}"
-            finding.remedy = "Look at the pendant; this program clears nothing."
+            finding.remedy = "End the mode at the pendant: brushloop never does."
         elif mode not in (RobotMode.POWER_OFF, RobotMode.IDLE, RobotMode.RUNNING):
             finding.problem, finding.remedy = f"robot mode is {mode}", "Look at the pendant."
 

@@ -90,10 +90,10 @@ def first_ink(inked: NDArray[np.bool_]) -> int:
     """
     first = int(np.argmax(inked))
     if first == 0:
-        raise StepError("the highest spot of the row has ink already: the paper lies higher than expected")
+        raise StepError("the highest touch of the row left ink: the paper lies higher than expected")
     if not inked[first:].all():
         missing = first + int(np.argmin(inked[first:]))
-        raise StepError(f"spot {missing + 1} of the row left no ink though a higher one did: is the brush dry?")
+        raise StepError(f"touch {missing + 1} of the row left no ink though a higher one did: is the brush dry?")
     return first
 
 
@@ -220,7 +220,7 @@ class FirstInkTouch:
                     first = first_ink(inked)
                     x, y, z = (0.5 * (a + b) for a, b in zip(touched[first - 1], touched[first], strict=True))
                     return Touch(x, y, z, step_mm / math.sqrt(12.0))
-        raise StepError(f"nothing was touched down to {touched[-1][2]:.2f} mm: no spot of the row left ink")
+        raise StepError(f"no touch of the row, down to {touched[-1][2]:.2f} mm, left ink on the paper")
 
     async def _touch(self, spot: Spot) -> None:
         if self._since_dip >= SPOTS_PER_DIP:

@@ -77,7 +77,7 @@ def find_contact(readings: Sequence[Reading], spring: Spring | None = None) -> C
     heights = np.unique(z_mm)
     needed = 3 if spring is None else 2
     if len(heights) < needed or variance_n2 <= 0.0:
-        raise StepError(f"rests at {len(heights)} heights give no contact, {needed} are needed")
+        raise StepError(f"forces at {len(heights)} heights do not give the contact; {needed} are needed")
     descents = np.unique(run)[:, None] == run[None, :]
 
     def free_of_offsets(rows: Floats) -> Floats:
@@ -189,12 +189,12 @@ async def touch_by_force(
         if sure and abs(contact.z_mm - near_z_mm) <= BESIDE_MM and contact.sigma_mm <= config.sigma_mm:
             if contact.z_mm > highest_z_mm:
                 raise StepError(
-                    f"the contact was found at {contact.z_mm:.2f} mm, above {highest_z_mm:.2f} mm where the brush was "
+                    f"the contact was found at {contact.z_mm:.2f} mm, but at {highest_z_mm:.2f} mm the brush was still "
                     "in the air: the sensor is too noisy for so few samples"
                 )
             return contact
         if samples > MOST_SAMPLES:
-            unsure = f"it moved by more than {BESIDE_MM:g} mm with the last descent"
+            unsure = f"its height changed by more than {BESIDE_MM:g} mm with the last descent"
             if contact.sigma_mm > config.sigma_mm:
                 unsure = f"its standard error is {contact.sigma_mm:.3f} mm, more than {config.sigma_mm:g} mm"
             if not sure:

@@ -103,12 +103,10 @@ async def _jogged(
         rests_mm = await procedures.lower(*point, z_mm, config.speed_mm_s)
         question = (
             f"{name.capitalize()}. Jog until the tip just touches the paper. "
-            f"It is {rests_mm - reach.expected_z_mm:+.2f} mm from the expected height."
+            f"The tip is {rests_mm - reach.expected_z_mm:+.2f} mm from the expected height."
         )
         if z_mm <= reach.lowest_z_mm + ROUNDING_MM:
-            question += (
-                " This is the end of the travel: if nothing touches, give up, and correct touch_z_mm in rig.toml."
-            )
+            question += " The tip goes no lower: if nothing touches, give up and correct touch_z_mm in rig.toml."
         key = await asker.ask(Prompt(question, JOG_CHOICES, GIVE_UP))
         if key == GIVE_UP:
             raise NeedsOperator(f"the operator gave up at {name}")

@@ -185,4 +185,4 @@ def _unlike(linear: Floats) -> float:
 
 def _refused(what: str, found_mm: Floats, remedy: str) -> StepError:
     listed = ", ".join(f"({x:.1f}, {y:.1f})" for x, y in found_mm)
-    return StepError(f"self-check: {what}. Found at {listed} mm. {remedy}.")
+    return StepError(f"self-check: {what}. The marks are at {listed} mm. {remedy}.")

@@ -233,7 +233,7 @@ class OperatorApp(PlainApp):
             elif key == LOOK.key:
                 self.call_after_refresh(self.action_review)
 
-        question = Prompt(f"What comes next with {folder}?", (LOOK, ANALYSE, BACK), BACK.key)
+        question = Prompt(f"What shall be done next with {folder}?", (LOOK, ANALYSE, BACK), BACK.key)
         self.push_screen(AskScreen(question), answered)
 
     def _ask(self, engine: Engine, run: RunScreen, now: Snapshot) -> None:

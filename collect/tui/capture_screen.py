@@ -117,7 +117,7 @@ class CaptureScreen(Screen[None], inherit_bindings=False):
         if (csim := self._capture.likeness) is not None:
             lines.append(labelled("CSIM", f"{100.0 * csim:.1f} % in mm"))
         if not self._images:
-            lines.append(Content("no picture: the board is not seen in this photograph"))
+            lines.append(Content("no picture, as the board is not seen in this photograph"))
         if "difference" in self._images:
             for what, colour in COLOURS.items():
                 lines.append(Content.assemble(("██", "rgb({},{},{})".format(*colour)), f" {what}"))

@@ -46,7 +46,7 @@ from brushloop.collect.tui.widgets import (
 
 AT_WORK = yes_or_no("A step is running: stop it and leave?", "stop and leave", "go on")
 STOPPED = "stopped: look at the arm. The same command resumes from there"
-RED_BUTTON = "Use the emergency stop, the red button, if it moves."
+RED_BUTTON = "If the arm moves, use the emergency stop, the red button."
 DONE = "This is done. q leaves."
 TYPING_STOP = "ctrl-c: software stop; red button: emergency stop; ctrl-q: leave, all is kept"
 TONES: dict[Tone, tuple[str, str]] = {
@@ -94,10 +94,10 @@ class CommissionScreen(Screen[None], inherit_bindings=False):
 
     AUTO_FOCUS = "#found"
     HELP = f"""
-Everything taught is kept; the same command resumes. Escape takes the answer or touch before the question back.
-Page up and down turn the pages of what was found.
+Every value is kept, and the same command resumes. Escape takes back the last answer or touch.
+Page up and page down show earlier and later results.
 
-{SOFTWARE_STOP} While you type, s is a letter and ctrl-c the stop.
+{SOFTWARE_STOP} While you type, s is a letter, and only ctrl-c stops.
 """
     DEFAULT_CSS = """
     CommissionScreen #found { width: 1fr; height: 1fr; padding: 0 1; }

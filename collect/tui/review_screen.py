@@ -95,7 +95,7 @@ class Review:
         what its rig was."""
         self.folder = folder
         if not (folder / JOURNAL_NAME).is_file():
-            raise InputError(folder, f"holds no {JOURNAL_NAME}: imported photographs are compared with `validate`")
+            raise InputError(folder, f"holds no {JOURNAL_NAME}: compare imported photographs with `validate`")
         check_folder(folder)
         self._board: SeenBoard | None = None
         self._pictures: dict[int, LastCapture] = {}
@@ -151,7 +151,7 @@ class Review:
         if len(binaries) < 2:
             return "one press only"
         alike = statistics.fmean(csim(a, b) for a, b in itertools.combinations(binaries, 2))
-        return f"{100.0 * alike:.1f} % alike: mean CSIM of every pair of {len(binaries)} presses (equal: 100 %)"
+        return f"mean CSIM {100.0 * alike:.1f} % between pairs, from {len(binaries)} presses (identical: 100 %)"
 
     def predicted(self, capture: ReviewCapture) -> tuple[LastCapture, str]:
         """A capture with the mark that the session's fitted brush predicts, and which fit that is.
@@ -182,7 +182,7 @@ class Review:
             else:
                 stroke = Stroke.model_validate_json(message.data)
         if image is None:
-            raise SessionDamaged(path, f"holds no still {result.still}")
+            raise SessionDamaged(path, f"lacks photograph {result.still}")
         whole = LastCapture(result.press, result.still, result.kept, verdict, image)
         if stroke is None or stroke.cell_mm is None:
             return whole  # a take that does not count has no stroke record
@@ -266,7 +266,7 @@ class ReviewScreen(Screen[None]):
         """Mark the capture bad, or good again."""
         capture = self._capture
         if capture is not None and not capture.result.kept:
-            self.notify(f"{capture.press.stroke_id}: the run did not count it; there is nothing to mark.")
+            self.notify(f"{capture.press.stroke_id} did not count in the run, so it cannot be marked.")
         elif capture is not None:
             self._remark(capture, bad=capture.counts, note=capture.note)
             if capture.counts and self._review.open:
@@ -281,7 +281,7 @@ class ReviewScreen(Screen[None]):
                 if note is not None and self._capture is not None:
                     self._remark(self._capture, bad=self._capture.marked_bad, note=note)
 
-            question = f"{capture.press.stroke_id}: a note. Enter keeps it, escape leaves it."
+            question = f"Note on {capture.press.stroke_id}. Enter keeps it, escape changes nothing."
             app_of(self).push_screen(AskScreen(Prompt(question, default=capture.note, read=str)), answered)
 
     def _remark(self, capture: ReviewCapture, *, bad: bool, note: str) -> None:

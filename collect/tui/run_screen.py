@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from brushloop.collect.engine.engine import Engine
     from brushloop.collect.engine.snapshot import LastCapture
 
-OVER = "Over: q leaves"
+OVER = "The run is over: q leaves"
 GOES_ON = "Press enter to resume, or run the same command later."
 COMMAND_GOES_ON = "Run the same command again to continue."
 WARNING = "warning: "
@@ -86,9 +86,9 @@ class RunScreen(Screen[None], inherit_bindings=False):
 
     AUTO_FOCUS = "#log-pane"
     HELP = """
-Grid: ✓ complete, ▶ now, › next, ! bad takes, × left out
+Grid: ✓ complete, ▶ now, › next, ! has bad takes, × left out
 
-Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
+Sheet: · blank, ● counts, ! does not count, × cut short, △ self-check
 """
     DEFAULT_CSS = """
     RunScreen #band { height: 7; }
@@ -153,14 +153,14 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
         self._grid = DataTable[Text](id="grid", classes="pane", show_cursor=False)
         self._grid.can_focus = False
         self._grid.border_title = "Strokes done/planned by depth H and tilt α"
-        self._why_pane.border_title = "Why it ended"
+        self._why_pane.border_title = "Why the run ended"
         self._sheet = Line("sheet", classes="pane")
         self._sheet.show(Content.styled("no sheet yet", "dim"))
         self._model = ModelByNow()
         self._log, self._log_pane = Line("log"), Newest(id="log-pane", classes="pane")
         self._log_pane.border_title = "Log"
         self._capture, self._words = Vertical(id="capture", classes="pane"), Line("capture-words")
-        self._words.show(Content.styled("no photograph yet since this start", "dim"))
+        self._words.show(Content.styled("no photograph yet in this run", "dim"))
         self._capture.border_title = "Last capture: photograph, binarised, CCD-BSM"
         self._pictures = [picture_widget(name) for name in ("photo", "binary", "model")]
         self._camera = picture_widget("camera")
@@ -322,7 +322,7 @@ def live_content(now: Snapshot) -> Content:
     rows = _live_rows(now)
     if now.picture is not None:
         blur_px = now.picture.blur_px
-        focus = "no edge in view to measure"
+        focus = "no edge in view, so blur unknown"
         if blur_px is not None:
             focus = f"blur {blur_px:.1f} px  {'✓ sharp' if blur_px < SHARP_PX else '! turn the lens'}"
         rows.append(("Focus", focus))

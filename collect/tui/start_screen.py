@@ -272,11 +272,11 @@ No session yet. First steps:
 `brushloop rig new` writes it step by step, `brushloop sim --write-rig rig.toml --rate 20` without an arm.
 
 {protocol} 2  What to press: {plain(str(browser.protocol))}
-e picks one of the examples, or takes the path of your own.
+Press e for one of the examples, or for a file of your own.
 
-· 3  Health: d asks every device; nothing is powered.
+· 3  Health: press d. Every device is asked; nothing is powered.
 
-· 4  The first session: n. It asks for a blank sheet and about each measurement; then the strokes follow.""")
+· 4  First session: press n. Lay a blank sheet and confirm each measurement; then the strokes follow.""")
 
 
 def _row_content(row: Summary) -> Content:

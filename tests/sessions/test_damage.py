@@ -291,7 +291,7 @@ def test_an_attempt_that_was_done_again_since_is_not_given_back_twice(make, open
 def test_where_nobody_knows_which_patch_was_pressed_the_sheet_is_not_used_again(make, opened, repair, resume):
     keep_lines(opened, lambda lines: [line for line in lines if b'"file":"0001-press' not in line])
     cut(opened / "0001-press-H13-a05-.mcap.part")
-    assert "nothing more is pressed on sheet 1; go on with a fresh one, --sheet 2" in repair(opened).lost[1]
+    assert "nothing more is pressed on sheet 1; continue with a fresh sheet and --sheet 2" in repair(opened).lost[1]
     store = resume(opened)
     with pytest.raises(SessionError, match="run the same command with --sheet 2"):
         store.begin("H15-a05", StepKind.PRESS, patches=(7,))
@@ -359,7 +359,7 @@ def test_what_is_wrong_within_a_message_is_damage_though_every_crc_holds(make, s
     [[problem]] = verify_session(store.folder).findings.values()
     assert problem.endswith("the image 0 on /camera/still is not a complete PNG or JPEG image")
     findings = verify_session(make.record(tmp_path / "a.mcap", make.still(1), make.stroke(2))).findings
-    assert findings == {"a.mcap": ["stroke H13-a05-r02 names still 2, which is not there"]}
+    assert findings == {"a.mcap": ["stroke H13-a05-r02 refers to photograph 2, which is missing"]}
 
 
 def test_a_session_may_be_renamed_open_and_closed(opened, resume, repair, tmp_path):

@@ -94,11 +94,11 @@ def test_a_header_that_cannot_be_read_is_reported_in_one_line(make, path, damage
         ("/stroke", b"\xff", "Stroke"),
         ("/stroke", b'{"stroke_id":"a","kind":"press"}', "Stroke still"),
         ("/stroke", b'{"stroke_id":"a","kind":"press","still":-1}', "Stroke still"),
-        ("/stroke", b'{"stroke_id":"a","kind":"press","still":3}', "names still 3, which is not there"),
+        ("/stroke", b'{"stroke_id":"a","kind":"press","still":3}', "refers to photograph 3, which is missing"),
         ("/stroke", b'{"stroke_id":"a","kind":"press","still":0,"depth_mm":NaN}', "Stroke depth_mm"),
         ("/stroke", b'{"stroke_id":"a","kind":"press","still":0,"px_per_mm":[0,0]}', "Stroke px_per_mm"),
         ("/stroke", b'{"stroke_id":"a","kind":"press","still":0,"extra":0}', "Stroke extra"),
-        ("/camera/still", b"\xff\xff\xff", "a photograph does not fit its schema"),
+        ("/camera/still", b"\xff\xff\xff", "the message of a photograph cannot be decoded"),
     ],
 )
 def test_a_message_that_cannot_be_read_names_its_field(make, path, topic, data, message):

@@ -47,7 +47,7 @@ def test_an_open_session_shows_what_is_done_cut_and_next(collected):
     assert shown.finished == {"press": 2, "capture": 2}
     assert shown.void == [
         "press H15-a5-r01, attempt 1: stopped",
-        "press H13-a5-r02, attempt 1: the process ended during it",
+        "press H13-a5-r02, attempt 1: the process ended during the step",
     ]
     assert shown.next == "press H13-a5-r02"
     assert shown.conditions == {"H 13 mm, alpha 5 deg": "1 of 2", "H 15 mm, alpha 5 deg": "1 of 2"}

@@ -72,7 +72,7 @@ def test_a_disk_that_does_not_keep_up_is_heard(make, path, monkeypatch):
     monkeypatch.setattr(mcap_writer, "QUEUE_LIMIT", 1)
     writer = SegmentWriter(path, make.header)
     noise = np.random.default_rng(0).bytes(1_000_000)
-    with pytest.raises(SessionError, match="1 messages wait: the disk does not keep up"):
+    with pytest.raises(SessionError, match="1 messages wait to be written: the disk does not keep up"):
         write_all(writer, (make.still(number, noise) for number in range(1000)))
     writer.abandon()
 
@@ -151,5 +151,5 @@ def test_the_messages_of_other_files_are_copied_as_they_are(written, tmp_path):
 
 
 def test_a_file_that_numbers_its_topics_otherwise_is_not_merged(written, tmp_path):
-    with pytest.raises(SessionDamaged, match="has /things under the number of /other"):
+    with pytest.raises(SessionDamaged, match="gives /things the channel number of /other"):
         copied(tmp_path / "copy.mcap", written, channels=[Channel(1, "/other", "json", {}, 0)])

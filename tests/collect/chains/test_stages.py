@@ -162,7 +162,7 @@ def test_a_loop_goes_on_with_what_it_was_begun_with_and_nothing_else(tmp_path: P
     assert begun_with(SETTINGS, folder) == SETTINGS
     assert begun_with(SETTINGS.model_copy(update={"fit": "ef"}), folder) == SETTINGS, "another fit was made since"
     for name, value in (("original_sha256", "xy"), ("depth_range_mm", (2.0, 20.0)), ("presses", 5)):
-        with pytest.raises(ConfigError, match=f"{name}: this loop was begun with"):
+        with pytest.raises(ConfigError, match=f"{name}: this folder was begun with"):
             begun_with(SETTINGS.model_copy(update={name: value}), folder)
     (folder / FILE).write_text("{}")
     with pytest.raises(ConfigError, match="does not hold the settings of a loop"):

@@ -126,7 +126,7 @@ async def test_killed_again_and_again_it_asks_nothing_twice_and_a_step_taught_ag
     assert {field.split(".")[0] for field in changed} <= {"robot", "paper", "ink", "motion", "board", "aside", "touch"}
     assert {"camera.source", "brush.radius_mm", "touch.force.push_axis"}.isdisjoint(changed)
     assert rig.with_name("rig.toml.bak-1").read_text(encoding="utf-8") == text
-    assert any("Changed with it, because it depends on this step:" in text for _, text in person.shown)
+    assert any("These values depend on this step and changed with it:" in text for _, text in person.shown)
 
     # The proof examines devices and keeps values as ever; its two runs, which take minutes, are left out.
     brought, asked = len(person.brought), len(person.asked)

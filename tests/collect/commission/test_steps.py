@@ -220,7 +220,7 @@ async def test_two_pictures_that_agree_show_the_arm_in_neither(parked: Callable[
 @pytest.mark.parametrize(
     ("away_mm", "in_the_first", "said"),
     [
-        (WELL, False, r"in one of the two pictures: 5 % .* both places are asked again"),
+        (WELL, False, r"in one of the two pictures: 5 % .* you are asked for both places again"),
         ((*PARK_MM[:2], 300.0), True, r"only 40 mm apart.*150 mm or more apart"),
     ],
     ids=["an arm over the pot", "twice one place"],

@@ -26,8 +26,8 @@ from brushloop.sessions.store import SessionStore
 RIG = rig_toml(SimConfig())
 GRID = 'kind = "grid"\ndepths_mm = [11.0, 20.0]\ntilts_deg = [0.0]\nrepeats = 2\n'
 WAY_OUT = (
-    "Go on as it was begun: --config sessions/grid-01/rig.toml --protocol sessions/grid-01/protocol.toml, beside the "
-    "files that they name, in the same environment; or start a new session with --new."
+    "Resume it with --config sessions/grid-01/rig.toml --protocol sessions/grid-01/protocol.toml, each beside the "
+    "files that it names, in the same environment; or start a new session with --new."
 )
 
 
@@ -86,7 +86,7 @@ def test_an_unreadable_session_stands_in_no_others_way(lab: Path, trouble: str) 
     assert find_resumable(opening()) == Path("sessions/grid-01")
     shutil.rmtree(lab / "sessions" / "grid-01")
     [line] = refused()
-    assert "One cannot be resumed as it is: sessions/old/journal.jsonl: " in line
+    assert "One of them cannot be resumed: sessions/old/journal.jsonl: " in line
     assert "--sheet 1" in line
     assert find_resumable(opening(sheet=1)) is None
 

@@ -142,11 +142,11 @@ SPLIT = Prompt(
     number=3,
 )
 TOUCHED = Prompt(
-    "Zero touch and plane: not all is within limits.\n"
+    "Zero touch and plane: not everything is within limits.\n"
     "  method               force\n"
     "  point 1 (4, 4)       120.012 mm\n"
-    "!   its touches span   0.180 mm  (at most 0.15)\n"
-    "  plane                taken as level: fewer than three points",
+    "!   span of touches    0.180 mm  (at most 0.15)\n"
+    "  plane                assumed level: fewer than three points",
     (
         Choice("g", "go on anyway"),
         Choice("a", "measure again"),
@@ -227,7 +227,7 @@ class FakeBrowser(SessionBrowser):
     def standing(self, session_id: str) -> Details:
         header = Header(session_id=session_id, source=Source.LOOPBACK, software="brushloop 0.1")
         details = Details(session_id, "open", header, {"capture": 13}, strokes=13, planned=30)
-        details.void = ["press H15-a5-r01, attempt 1: the process ended during it"]
+        details.void = ["press H15-a5-r01, attempt 1: the process ended during the step"]
         details.next, details.sheets = "press H15-a5-r01", {1: [1, 2]}
         return details
 
@@ -264,7 +264,7 @@ class FakeReview(Review):
         return LastCapture(capture.press, capture.result.still, True, None, photo, binary)
 
     def repeatability(self, condition: Condition) -> str:
-        return "91.4 % alike: mean CSIM of every pair of 9 presses (equal: 100 %)"
+        return "mean CSIM 91.4 % between pairs, from 9 presses (identical: 100 %)"
 
 
 def app_of(engine: Any = None, browser: FakeBrowser | None = None) -> OperatorApp:
