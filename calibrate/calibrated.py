@@ -138,13 +138,13 @@ def _moved(calibration: Calibration, still: bytes, minutes: float, where: str) -
     try:
         view = find_board(decode_gray(still, where), calibration.board, where)
     except CalibrationError as error:
-        return f"{before}, it is not seen: {error.what}"
+        return f"{before}, the board is not seen: {error.what}"
     off = np.linalg.norm(view.pixels - calibration.to_image(paper_mm(view, calibration.board)), axis=1)
     off_px = float(np.median(off))
     if off_px <= MOVED_PX:
         return ""
     off_mm = off_px * calibration.mm_per_px
-    return f"{before}, it lay {off_px:.1f} px ({off_mm:.2f} mm) away: camera or board was touched, and strokes are off"
+    return f"{before}, the board lay {off_px:.1f} px ({off_mm:.2f} mm) away: strokes are off, as camera or board moved"
 
 
 def _picture(calibration: Calibration, image: Gray, view: BoardView) -> dict[str, Any]:
@@ -178,11 +178,11 @@ def _trust(calibration: Calibration, moved: Sequence[str]) -> Iterator[Point]:
     residual = f"The residual is {calibration.rms_px:.2f} px; at most {RMS_LIMIT_PX:g} px are good."
     yield Point(calibration.rms_px <= RMS_LIMIT_PX, residual)
     known = calibration.relative_reach
-    yield Point(known <= WORST_INTERVAL, f"Scale known to ±{100 * known:.3f} %, goal ±{100 * WORST_INTERVAL:g} %.")
+    yield Point(known <= WORST_INTERVAL, f"Scale known to ±{100 * known:.3f} % (goal: {100 * WORST_INTERVAL:g} %).")
     sharp = 1.0 / calibration.mm_per_px
-    yield Point(sharp >= LEAST_PX_PER_MM, f"{sharp:.1f} px/mm; at least {LEAST_PX_PER_MM:g} are needed.")
+    yield Point(sharp >= LEAST_PX_PER_MM, f"The image has {sharp:.1f} px/mm; at least {LEAST_PX_PER_MM:g} are needed.")
     out = calibration.corners_dropped
-    yield Point(not out, f"Corners that are left out, because they do not lie on the plane of the others: {out}.")
+    yield Point(not out, f"Corners left out because they do not lie on the plane of the others: {out}.")
     if calibration.lens.source == FITTED:
         yield Point(None, "No lens file: k1 was fitted on this one board, and is known only where corners were seen.")
     for problem in (*calibration.flags, *moved):

@@ -107,7 +107,7 @@ def _command_line() -> str:
 
 
 Patch = Annotated[float, Option("--cell-mm", min=30, max=500, help="Side of each patch of paper.")]
-Repeats = Annotated[int, Option(min=1, max=1000, help="How often each is written.")]
+Repeats = Annotated[int, Option(min=1, max=1000, help="How often each character is written.")]
 Length = Annotated[float, Option(min=5, max=200, help="Length L of the brush.")]
 CharacterData = Annotated[
     Path | None,
@@ -115,7 +115,7 @@ CharacterData = Annotated[
 ]
 FIT = "Brush fit, the session's own by default; CCD-BSM as published with `published`, or if there is no fit."
 PlanFile = Annotated[Path, Option(help="The plan's folder, or its plan.json.")]
-Written = Annotated[Path, Argument(help="The session in which a plan was written.")]
+Written = Annotated[Path, Argument(help="The session in which the plan's characters were written.")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,8 +141,8 @@ class FitRequest:
     """
 
     session: Annotated[Path, Argument(help="A session of presses, or of drags: its folder or its .mcap file.")]
-    prior: Annotated[Path | None, Option(help="A dragfit of this brush, whose place and width are adapted.")] = None
-    strokes: Annotated[int | None, Option(min=1, help="With --prior: how many strokes, as unlike as possible.")] = None
+    prior: Annotated[Path | None, Option(help="An earlier dragfit of this brush, to be adapted.")] = None
+    strokes: Annotated[int | None, Option(min=1, help="With --prior: number of strokes, chosen to differ.")] = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,14 +152,14 @@ class ValidateRequest:
     places: Annotated[tuple[Path, ...], Argument(metavar="SESSION", help="Sessions: folders or .mcap files.")]
     models: Annotated[tuple[str, ...], Option("--model", help="Only these models; all by default.")] = ()
     generators: Annotated[tuple[Path, ...], Option("--generator", help="Instead of the shipped generator.")] = ()
-    fit: Annotated[Path | None, Option(help="Brush fit, the one in use by default; of drags, a dragfit.")] = None
+    fit: Annotated[Path | None, Option(help="Brush fit (of drags: dragfit); by default the one in use.")] = None
     out: Annotated[Path | None, Option(help="Folder of the report; <session>/validation by default.")] = None
-    gates: Annotated[tuple[str, ...], Option("--gate", help="As 'csim_avg>=0.90', quoted; exit code 5 if missed.")] = ()
-    ablations: Annotated[bool, Option("--ablations", help="Other lambdas, and scores by presses fitted.")] = False
+    gates: Annotated[tuple[str, ...], Option("--gate", help="Least score, quoted: 'csim_avg>=0.90'; else exit 5.")] = ()
+    ablations: Annotated[bool, Option("--ablations", help="Add other lambdas, and fits to fewer presses.")] = False
     curves: Annotated[tuple[str, ...], Option(help="NAME=FOLDER of a training, for figures 9 and 12.")] = ()
-    held_out: Annotated[bool, Option(help="Fit to other conditions, each condition left out in turn.")] = True
+    held_out: Annotated[bool, Option(help="Also predict each condition by a fit to all others.")] = True
     scheduler: Annotated[str, Option(help="An existing Dask cluster, as tcp://host:8786.")] = ""
-    workers: Annotated[int | None, Option(min=1, max=1024, help="Threads; all cores by default.")] = None
+    workers: Annotated[int | None, Option(min=1, max=1024, help="Number of threads; all cores by default.")] = None
     command: str = field(default_factory=_command_line)
     """Named by the report as what made it."""
 
@@ -180,9 +180,9 @@ class ExportRequest:
     """
 
     session: Annotated[Path, Argument(help="A closed session's folder, or an .mcap file.")]
-    out: Annotated[Path, Argument(help="The new folder.")]
+    out: Annotated[Path, Argument(help="Folder to create.")]
     kind: Annotated[str, Option("--format", help="How tables are written: csv or parquet.")] = "csv"
-    crops: Annotated[bool, Option("--crops", help="Not photographs: rectified crops at 20 px/mm with masks.")] = False
+    crops: Annotated[bool, Option("--crops", help="Write rectified crops at 20 px/mm with masks instead.")] = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +190,7 @@ class RecoverRequest:
     """Recover depth and tilt of every captured press; writes a CSV and a protocol that presses them again."""
 
     session: Annotated[Path, Argument(help="A session's folder or its .mcap file; imports count as sessions.")]
-    out: Annotated[Path, Option(help="CSV to write; protocol-replay.toml goes beside it.")] = Path("recovered.csv")
+    out: Annotated[Path, Option(help="CSV to write, beside protocol-replay.toml.")] = Path("recovered.csv")
     fit: Annotated[Path | None, Option(help=FIT)] = None
     depth_range_mm: tuple[float, float] = (2.0, 30.0)
     tilt_range_deg: tuple[float, float] = (0.0, 30.0)
@@ -218,7 +218,7 @@ PROTOCOL = "protocol-write.toml"
 
 @dataclass(frozen=True, slots=True)
 class PlanRequest:
-    """Plan characters: depth from the width of each stroke, heading along it, then refined until the image matches."""
+    """Plan characters: depth follows each stroke's width, heading its path; then refine until the image matches."""
 
     what: Annotated[str, Argument(help="Characters; 字 子 永 are shipped.")]
     out: Annotated[Path, Option(help=f"Folder for {PROTOCOL} and plan.png.")] = Path("write-plan")
@@ -226,7 +226,7 @@ class PlanRequest:
     radius_mm: Annotated[float, Option(min=0.5, max=50, help="Radius R of the brush.")] = 6.0
     length_mm: Length = 48.0
     footprint: Annotated[
-        Path | None, Option(help="Result of `write fit`: the plan leads the brush by the footprint of its own drags.")
+        Path | None, Option(help="Result of `write fit`: the plan is then made for the footprint of this brush.")
     ] = None
     cell_mm: Patch = 70.0
     depth_range_mm: Annotated[tuple[float, float], Option("--depth-range", help="Least and greatest depth, mm.")] = (
@@ -246,7 +246,7 @@ class PlanRequest:
 class PracticeRequest:
     """Plan a practice sheet: strokes from which `write fit` learns how this brush is dragged.
 
-    They go no deeper than 0.3 of the brush's length.
+    The strokes go no deeper than 0.3 times the brush's length.
     """
 
     out: Annotated[Path, Option(help=f"Folder for {PROTOCOL}.")] = Path("practice")
@@ -264,7 +264,7 @@ class FitFootprintRequest:
 
 @dataclass(frozen=True, slots=True)
 class LearnRequest:
-    """Make the next plan from what the ink of this one showed, phase by phase."""
+    """Make the next plan from the ink that this plan left, phase by phase of each stroke."""
 
     session: Written
     plan: PlanFile
@@ -292,23 +292,23 @@ class BoardOptions:
     checkerboard: Annotated[str, Option(help="Inner corners of a checkerboard, as 9x6.")] = ""
     charuco: Annotated[str, Option(help="Squares of a ChArUco board, as 26x20.")] = ""
     square_mm: Annotated[float, Option(min=0.5, max=1000.0, help="Side of a square, measured on the print.")] = 12.0
-    marker_mm: Annotated[float, Option(min=0, max=1000, help="Side of a marker; 0: three quarters of a square.")] = 0.0
-    dictionary: Annotated[str, Option(help="Markers of the ChArUco board.")] = "DICT_5X5_1000"
+    marker_mm: Annotated[float, Option(min=0, max=1000, help="Side of a marker; 0 for 0.75 of a square.")] = 0.0
+    dictionary: Annotated[str, Option(help="ArUco dictionary of the markers.")] = "DICT_5X5_1000"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PrintRequest(BoardOptions):
     """Write a printable board as a PDF at true scale."""
 
-    out: Annotated[Path, Argument(help="The new PDF.")]
-    page: Annotated[str, Option(help="a4, a3, a2 or letter.")] = "a4"
+    out: Annotated[Path, Argument(help="PDF to create.")]
+    page: Annotated[str, Option(help="Size: a4, a3, a2 or letter.")] = "a4"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LensRequest(BoardOptions):
-    """Fit the lens, and say what each photograph contributes, which were dropped, and what else to photograph."""
+    """Fit the lens, and say what each photograph contributes, which ones were dropped, and what is still missing."""
 
-    photographs: Annotated[tuple[Path, ...], Argument(help="Photographs of one board, held in many ways.")]
+    photographs: Annotated[tuple[Path, ...], Argument(help="Photographs of one board, held at many angles.")]
     out: Annotated[Path, Option(help="Folder for the lens file.")] = Path("camera")
 
 
@@ -317,7 +317,7 @@ class TrainRequest:
     """Train the neural stroke generator on exact images of CCD-BSM (Algorithm 1), in one process on one device."""
 
     out: Annotated[Path, Option(help="Folder of this training; the same command resumes it.")] = Path("generator")
-    target: Annotated[str, Option(help="press or anchored.")] = "press"
+    target: Annotated[str, Option(help="Kind of image: press (centred) or anchored (at the point of touch).")] = "press"
     config: Annotated[Path | None, Option(help="A train.toml instead of a target's defaults.")] = None
 
 
@@ -328,7 +328,7 @@ class TuneRequest:
     generator: Annotated[Path, Argument(help="The generator.safetensors to start from.")]
     sessions: Annotated[tuple[Path, ...], Argument(metavar="SESSION", help="Sessions of presses.")]
     out: Annotated[Path, Option(help="Folder of this training.")] = Path("generator-tuned")
-    steps: Annotated[int, Option(min=1, help="Number of steps.")] = 300
+    steps: Annotated[int, Option(min=1, help="Number of training steps.")] = 300
     learning_rate: Annotated[float, Option(min=0, max=1, help="Peak learning rate.")] = 3e-4
 
 
@@ -341,5 +341,5 @@ class TwinRequest:
     """
 
     session: Annotated[Path, Argument(help="A session of presses: its folder or its .mcap file.")]
-    out: Annotated[Path | None, Option(help="File to write; twin.toml in the session's folder.")] = None
+    out: Annotated[Path | None, Option(help="File to write; by default twin.toml in the session.")] = None
     replace: Annotated[bool, Option("--replace", help="Replace the file if it exists.")] = False

@@ -112,7 +112,7 @@ class LoopRecord(Sealed):
     def answer(self) -> Point:
         """The result in one sentence."""
         if not self.lost:
-            return Point(None, f"{self.again}: no condition was pressed twice, so its repeatability is unknown.")
+            return Point(None, f"{self.again}: no condition was pressed twice: the brush's repeatability is unknown.")
         points, *_, measure, row = max(self.lost, key=lambda lost: lost[0])
         good = min((near for _, _, near, *_ in self.lost), key=(False, None, True).index)
         sure = " Whether this goal is met will be certain only with more repeated presses." if good is None else ""
@@ -133,7 +133,7 @@ def compare(request: CompareLoopRequest, progress: Progress = unseen) -> Written
     first, second = (open_session(path, kind="press") for path in (request.original, request.again))
     where, source = str(second.recording.path), second.header.source
     if (first.header.source == Source.LOOPBACK) != (source == Source.LOOPBACK):
-        raise CalibrationError(where, f"is {source}, the original {first.header.source}")
+        raise CalibrationError(where, f"has the source {source}, but the original has {first.header.source}")
     repeated = _replayed(second.header)
     if repeated != first.header.session_id:
         what = "repeats no session" if repeated is None else f"repeats {repeated}"
@@ -182,13 +182,13 @@ def pair_up(
         name, original = press.stroke.stroke_id, by_name.get(press.stroke.again_of or "")
         if original is None:
             refused.append(
-                (name, f"repeats {press.stroke.again_of or 'no stroke'}: it has no original that can be used")
+                (name, f"repeats {press.stroke.again_of or 'no stroke'}, of which no usable original exists")
             )
             continue
         try:
             images = simulated(model, press.condition.depth_mm, press.condition.tilt_deg)
         except DomainError as error:
-            refused.append((name, f"the model does not predict it: {error}"))
+            refused.append((name, f"the model does not predict this press: {error}"))
         else:
             pairs.append(Pair(original, press, images))
     repeated = {pair.original.stroke.stroke_id for pair in pairs}
@@ -268,7 +268,7 @@ def _shown(pair: Pair, percent: Floats) -> dict[str, Any]:
 def _trust(record: LoopRecord) -> Iterator[Point]:
     yield source_point(record.source)
     if record.in_sample:
-        words = "The model that recovered them was fitted to these same presses, with their commanded depths and tilts"
-        yield Point(None, f"{words}: recovered numbers near the commanded ones prove nothing. Compare the marks.")
+        words = "The model that recovered depth and tilt was fitted to these same presses with their commanded values"
+        yield Point(None, f"{words}: recovered values near these prove nothing about it. Compare the marks.")
     if record.refused:
         yield Point(False, f"{len(record.refused)} strokes are not compared; each is named below, with the reason.")

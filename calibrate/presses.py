@@ -99,7 +99,7 @@ def cut(press: Press) -> str:
 def too_thin(press: Press) -> str:
     """Refuse a press that leaves one of the images blank."""
     thin = next((key for key, image in zip(KEYS, press.images, strict=True) if not image.any()), None)
-    return "" if thin is None else f"is too thin to be seen at the scale of {thin[0]} ({thin[1]})"
+    return "" if thin is None else f"is too thin to be seen in its {thin[1]} image ({thin[0]})"
 
 
 def beside_touch(press: Press) -> str:
@@ -241,7 +241,7 @@ def prepare_press(capture: Capture, calibration: Calibration | None) -> Prepared
     if calibration is not None and stroke.anchor_mm is not None:
         return prepared
     if prepared.anchor_px is None:
-        raise CaptureRefused(stroke.stroke_id, "has no anchor (start_x_px, start_y_px): it cannot be laid on a model")
+        raise CaptureRefused(stroke.stroke_id, "has no touch point (start_x_px, start_y_px) to lay it on a model")
     return _cropped(prepared, prepared.anchor_px)
 
 
@@ -258,7 +258,7 @@ def _cropped(prepared: Prepared, anchor_px: tuple[float, float]) -> Prepared:
     window = slice(top + side, top + 2 * side), slice(left + side, left + 2 * side)
     mask, soft = (np.pad(part, side)[window] for part in (prepared.mask, prepared.soft))
     if not mask.any():
-        raise CaptureRefused("anchor", "lies so far from the stroke that none of it is in the field")
+        raise CaptureRefused("anchor", "lies so far from the stroke that no ink is in the field")
     cut = prepared.cut or bool(np.count_nonzero(mask) < np.count_nonzero(prepared.mask))
     return replace(prepared, mask=mask, soft=soft, anchor_px=(anchor_px[0] - left, anchor_px[1] - top), cut=cut)
 

@@ -105,8 +105,8 @@ class Recovered:
             scatter = f" ± {off.std(ddof=1):.2f}" if many > 1 else ""
             inside = int((np.abs(off) <= NORMAL_95 * sd).sum())
             yield (
-                f"{name}: recovered {off.mean():+.2f}{scatter} {unit} from what was commanded; "
-                f"{inside} of {many} intervals (95 %) hold the command"
+                f"{name}: recovered values are {off.mean():+.2f}{scatter} {unit} from the commanded ones; "
+                f"{inside} of {many} intervals (95 %) contain the commanded value"
             )
         if bare := self._flagged(NO_MODEL_ERROR):
             yield (
@@ -115,9 +115,9 @@ class Recovered:
             )
         for name, flag in NOT_INFORMATIVE.items():
             if vague := self._flagged(flag):
-                yield f"warning: {vague} presses do not tell {name}: the interval covers most of the commanded range"
+                yield f"warning: {vague} presses do not determine {name}: intervals cover most of the commanded range"
         if 2 * (bound := self._flagged(Flag.AT_BOUND)) > many:
-            yield f"warning: {bound} presses end at a bound: do not repeat them, fit this brush first (`brushloop fit`)"
+            yield f"warning: {bound} presses lie at a limit of H or alpha: first fit this brush (`brushloop fit`)"
         for stroke_id, why in self.refused:
             yield f"not used: {stroke_id}: {why}"
         yield str(self.out)
@@ -147,7 +147,7 @@ def recover(request: RecoverRequest, progress: Progress = unseen) -> Recovered:
     rows = [row for press in presses if (row := _row(press, inverter, refused))]
     if not rows:
         why = f": {refused[0][0]}: {refused[0][1]}" if refused else ""
-        way_out = "" if fitted else f"; {inverter.model.label} was inverted: fit this brush first (`brushloop fit`)"
+        way_out = "" if fitted else f"; {inverter.model.label} was used: fit this brush first (`brushloop fit`)"
         raise CalibrationError(str(session.recording.path), f"no stroke could be recovered{why}{way_out}")
     recovered = Recovered(session, inverter.model.label, with_model_error(rows, fitted), refused, request.out)
     request.out.parent.mkdir(parents=True, exist_ok=True)

@@ -94,7 +94,7 @@ def open_session(place: Path | Recording, kind: Kind | None = None) -> OpenSessi
             raise CalibrationError(str(recording.path), f"is not calibrated: run `brushloop calibrate {folder}`")
         calibration = Calibration.read(used)
         if calibration.recording_sha256 != sha256:
-            problem = f"belongs to another recording ({calibration.session_id}): `brushloop calibrate` makes its own"
+            problem = f"belongs to another recording ({calibration.session_id}): run `brushloop calibrate` again"
             raise CalibrationError(str(used), problem)
     return OpenSession(recording, sha256, strokes, calibration, Store(folder / FINISHED))
 

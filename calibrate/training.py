@@ -144,9 +144,10 @@ def _samples(file: GeneratorFile, captures: Captures | None) -> Iterator[dict[st
 def _trust(file: GeneratorFile, checks: NDArray[np.float64]) -> Iterator[Point]:
     """What to know of it; `checks` (k, 2) are step and MSE of each validation."""
     if file.config.tuning:
-        yield Point(None, "Tuned on captures: others of the same kind are not an independent test.")
+        yield Point(None, "The generator was tuned on captures: others of the same kind are no independent test.")
     else:
-        yield Point(None, "It has seen no real ink, so on paper it is no better than the closed-form model it learned.")
+        words = "The generator has seen no real ink, so on paper it is no better than the closed-form model it learned."
+        yield Point(None, words)
     if len(checks) > 1:
         last, lowest = checks[-1], checks[np.argmin(checks[:, 1])]
         if last[1] > MUCH_ABOVE * lowest[1]:
@@ -154,7 +155,7 @@ def _trust(file: GeneratorFile, checks: NDArray[np.float64]) -> Iterator[Point]:
             yield Point(False, f"The validation loss {words}: the network memorises its training strokes.")
         else:
             yield Point(True, f"The validation loss is at its lowest, or near it, at the end (step {last[0]:.0f}).")
-    yield Point(None, "Outside the ranges of its inputs it extrapolates polynomials: do not use it there.")
+    yield Point(None, "Outside the ranges of its inputs the generator extrapolates polynomials: do not use it there.")
 
 
 def _losses(losses: NDArray[np.float64], checks: NDArray[np.float64], label: str) -> str:

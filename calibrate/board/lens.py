@@ -171,7 +171,7 @@ class LensFile(Artefact):
             *(f"{name}: {px:.3f} px, dropped: it does not fit the others" for name, px in self.dropped.items()),
             *(f"{name}: {why}" for name, why in self.unusable.items()),
             f"fx {fx:.2f} px, fy {fy:.2f} px, centre {cx:.1f}, {cy:.1f} px, k1 {self.lens.distortion[0]:+.4f}",
-            f"residual {self.rms_px:.3f} px over {len(self.residuals_px)} views, the board held in {self.ways} ways",
+            f"residual {self.rms_px:.3f} px over {len(self.residuals_px)} views, with the board at {self.ways} angles",
             *(f"warning: {warning}" for warning in self.warnings),
             *(f"to do: {advice}" for advice in self.guidance),
         ]
@@ -213,8 +213,8 @@ def fit_lens(
     ways = held(normals)
     fewest = min(int(ways.max()), int(held(nominal_normals(kept)).max())) + 1
     if fewest < LEAST_VIEWS:
-        problem = f"{len(kept)} usable views, but the board is held in {fewest} ways, at least {LEAST_VIEWS} needed"
-        raise CalibrationError(where, "; ".join([f"{problem}: slant it to other sides", *useless]))
+        problem = f"{len(kept)} usable views, but the board is held at {fewest} angles, at least {LEAST_VIEWS} needed"
+        raise CalibrationError(where, "; ".join([f"{problem}: slant the board to other sides", *useless]))
     slants = {v.name: float(s) for v, s in zip(kept, np.degrees(np.arccos(normals[:, 2])), strict=True)}
     warnings = [f"{view.name}: {flag}" for view in kept for flag in view.flags]
     if rms_px > RMS_LIMIT_PX:
@@ -246,7 +246,7 @@ def guidance(views: Sequence[BoardView], slants_deg: Sequence[float], ways: int 
     counts, _, _ = np.histogram2d(places[:, 1], places[:, 0], bins=3, range=((0, height), (0, width)))
     empty = [name for name, count in zip(THIRDS, counts.ravel(), strict=True) if not count]
     if ways < GOOD_WAYS:
-        wanted.append(f"hold the board in more ways ({ways} of {GOOD_WAYS} so far)")
+        wanted.append(f"hold the board at more different angles ({ways} of {GOOD_WAYS} so far)")
     if empty:
         wanted.append(f"bring the board into the {', '.join(empty)} of the image: no corner was seen there")
     slanted = sum(slant >= LEAST_SLANT_DEG for slant in slants_deg)

@@ -34,7 +34,7 @@ VISIBLE_PX = 0.5
 REMAINING_PX = 1.5
 """Distortion left by the lens file: more means another camera; less is a small change of focus, which k1 describes."""
 NO_LENS_FILE = (
-    "the lens bends straight lines: calibrate it with `brushloop camera intrinsics`, then name the lens file as "
+    "the lens bends straight lines: calibrate the lens with `brushloop camera intrinsics`, then name its file as "
     "camera.lens_file in rig.toml, or with --lens"
 )
 OTHER_LENS = "distortion remains after the lens was corrected: the lens file is of another camera, or of another focus"
@@ -166,7 +166,7 @@ def _check_distortion(plane: Plane, lens: Lens | None, where: str) -> None:
     """Raise `CalibrationError` for a plane that was fitted with k1, if the known lens distorts more than allowed."""
     if plane.distortion_px > (VISIBLE_PX if lens is None else REMAINING_PX):
         advice = NO_LENS_FILE if lens is None else OTHER_LENS
-        raise CalibrationError(where, f"the board is bent by {plane.distortion_px:.1f} px: if it lies flat, {advice}")
+        raise CalibrationError(where, f"the board looks bent by {plane.distortion_px:.1f} px: if it is flat, {advice}")
 
 
 def paper_mm(view: BoardView, spec: BoardSpec) -> Floats:

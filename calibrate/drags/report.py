@@ -250,8 +250,8 @@ def summary(validation: DragValidation) -> Iterator[Table | str]:
     yield f"{len(drags.strokes)} strokes measured: {MEASURED} has length, width and area beside what was commanded"
     yield width_sentence(drags)
     if means := validation.means():
-        over = "in sample" if validation.scored[0].fitted else "not fitted to them"
-        table = Table("", "n", "CSIM", "sd", "IoU", title=f"over all, {over}, percent ({header.source})")
+        over = "from a fit to these strokes" if validation.scored[0].fitted else "from a fit to other strokes"
+        table = Table("", "n", "CSIM", "sd", "IoU", title=f"averages, {over}, percent ({header.source})")
         for name, row in means.items():
             percent = (f"{100 * row[measure]:.2f}" for measure in ("csim", "csim_sd", "iou"))
             table.add_row(name, f"{row['strokes']:.0f}", *percent)
@@ -280,10 +280,10 @@ def fit_lines(drags: Drags, artefact: DragArtefact) -> Iterator[Any]:
     label = source_label(header.source, [header.brush])
     yield f"{source_note(header.source, header.brush)}; {len(artefact.fitted_strokes)} dragged strokes"
     yield from (f"left out: {name}: {why}" for name, why in drags.left_out)
-    yield f"depth at both ends: {drags.ends or 'that of the middle, for the table gives no depth at the ends'}"
+    yield f"depth at both ends: {drags.ends or 'as in the middle, because the table gives none for the ends'}"
     if artefact.prior:
         adapted = ", ".join(artefact.refitted)
-        yield f"The brush of {artefact.prior_session} (fit {artefact.prior}), with these adapted: {adapted}."
+        yield f"Adapted from the brush of {artefact.prior_session} (fit {artefact.prior}): {adapted}."
     table = Table("parameter", "fitted", "95 %", title=f"drag model, mm ({label})")
     for name, value in artefact.parameters.items():
         interval = "not determined" if value.low is None else f"{value.low:.3f} to {value.high:.3f}"
@@ -292,10 +292,10 @@ def fit_lines(drags: Drags, artefact: DragArtefact) -> Iterator[Any]:
         table.add_row(name, f"{value.value:.3f}", interval)
     yield table
     if artefact.held_out:
-        title = f"a fifth left out in turn, where the command put it, percent ({label})"
+        title = f"strokes left out of the fit, a fifth at a time, at the commanded place, percent ({label})"
         table = Table("model", "CSIM", "IoU", title=title)
         for name, (csim, iou) in artefact.held_out.items():
             table.add_row(name, f"{csim:.2f}", f"{iou:.2f}")
         yield table
     elif not artefact.prior:
-        yield "Fewer than five commands: too few to leave some out."
+        yield "There are fewer than five different strokes, too few to leave some out of the fit."

@@ -169,13 +169,13 @@ class FitResult:
             yield f"Intervals of the sizes of the marks need {FEWEST_CONDITIONS} combinations of depth and tilt."
         if self.held_out:
             scores = Table(
-                "model", "n", "CSIM", "SSIM", title=f"on combinations left out of the fit in turn, percent ({label})"
+                "model", "n", "CSIM", "SSIM", title=f"scores on combinations left out of the fit, percent ({label})"
             )
             for row in self.held_out:
                 scores.add_row(row.model, str(row.csim.n), f"{row.csim.avg:.2f}", f"{row.ssim.avg:.2f}")
             yield scores
         else:
-            yield "Only one condition: nothing can be held out."
+            yield "There is only one combination of depth and tilt, so none can be left out of the fit."
         yield f"Fit: {self.path}"
         yield f"Page: {self.page}"
 
@@ -314,6 +314,6 @@ def _trust(result: FitResult) -> Iterator[Point]:
         yield Point(None, "No combination was pressed twice, so the repeatability of the brush is not known here.")
     else:
         span = "" if csim.below_interval is None else " (95 % {:.1f} to {:.1f})".format(*csim.below_interval)
-        words = f"Held out, the fit is {csim.below_ceiling:.1f} points of CSIM{span} below the ceiling"
+        words = f"On held-out presses the fit is {csim.below_ceiling:.1f} points of CSIM{span} below the ceiling"
         yield Point(is_near(csim.below_ceiling, csim.below_interval), f"{words}; {NEAR_POINTS:g} or less is near.")
     yield Point(None, "The pictures above show presses that were fitted; judge the fit by the held-out scores.")

@@ -58,7 +58,7 @@ def new_stroke(
     """
     if before.shape != after.shape:
         sizes = [f"{image.shape[1]} x {image.shape[0]} px" for image in (after, before)]
-        raise CaptureRefused(where, f"is {sizes[0]}, the one before it {sizes[1]}")
+        raise CaptureRefused(where, f"is {sizes[0]}, the photograph before it {sizes[1]}")
     shift = _shift(before, after)
     first, second = _reflectance(before), _reflectance(_moved(after, (-shift[0], -shift[1])))
     clean = first > DARK_SHARE
@@ -135,9 +135,9 @@ def _flags(mask: Mask, clean: Mask, shift: tuple[float, float], px_per_mm: float
     around = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     touching_mm = float(np.count_nonzero(around & ~clean)) / px_per_mm
     if touching_mm > 1.0:
-        flags.append(f"crosses: {touching_mm:.1f} mm of its edge lie on older ink, where new ink cannot be seen")
+        flags.append(f"crosses: {touching_mm:.1f} mm of the edge lie on older ink, where new ink cannot be seen")
     if max(map(abs, shift)) > 1.0:
-        flags.append(f"moved: the page lay {np.hypot(*shift):.1f} px from where it was")
+        flags.append(f"moved: the page lay {np.hypot(*shift):.1f} px from its earlier place")
     if touches_edge(mask):
         flags.append("cut: the stroke reaches the edge of the photograph")
     return tuple(flags)

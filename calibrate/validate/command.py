@@ -135,7 +135,7 @@ def validate(
             outcome = validate_presses(sessions, request, scheduler, progress)
             report = _write(outcome, folder, curves, beside)
     except Timeout:
-        raise CalibrationError(str(folder), "another validation is writing there") from None
+        raise CalibrationError(str(folder), "another validation is writing in this folder") from None
     return ValidationOutput(folder, report, notes=tuple(beside.notes), gates=request.gates)
 
 
@@ -157,7 +157,7 @@ def one_source(sessions: Sequence[FittedSession]) -> Source:
     first = sessions[0]
     for other in sessions[1:]:
         if other.header.source != first.header.source:
-            what = f"is {other.header.source}, {first.recording.path.name} is {first.header.source}"
+            what = f"has the source {other.header.source}, {first.recording.path.name} has {first.header.source}"
             raise CalibrationError(str(other.recording.path), f"{what}: validate them separately")
     return first.header.source
 
@@ -174,15 +174,15 @@ def find_beside(sessions: Sequence[FittedSession]) -> Beside:
 
     def belongs(path: Path, record: LoopRecord | WrittenRecord, foreign: str) -> bool:
         if record.source != source:
-            foreign = f"it is of {record.source}, not {source}"
+            foreign = f"its source is {record.source}, not {source}"
         if foreign:
-            beside.notes.append(f"{path} is left out: {foreign}; `{record.MADE_BY}` compares again")
+            beside.notes.append(f"{path} is left out: {foreign}; `{record.MADE_BY}` makes it again")
         return not foreign
 
     for path in (home / LOOP / LoopRecord.FILE for home in homes):
         if path.is_file():
             loop = LoopRecord.read(path)
-            foreign = "" if loop.original_sha256 in originals else f"it is of another recording of {loop.original}"
+            foreign = "" if loop.original_sha256 in originals else f"it belongs to another recording of {loop.original}"
             if belongs(path, loop, foreign):
                 beside.loops.append(loop)
     for folder in dict.fromkeys(place / WRITTEN for home in homes for place in (home, home.parent.parent)):
@@ -263,12 +263,12 @@ class Difference:
         what = "the same stroke" if self.by_stroke else "the average of the same (H, α)"
         test = self.changes[0].test
         yield (
-            f"Paired by {what}, n = {test.n} in {test.groups} conditions; p by flipping the signs of whole conditions, "
-            f"corrected by Holm for {len(self.changes)} series ({self.before.label})."
+            f"Each pair is {what}; n = {test.n} in {test.groups} conditions. p: flipped signs of whole conditions, "
+            f"corrected by Holm's method for {len(self.changes)} series ({self.before.label})."
         )
         if not self.by_stroke:
             yield "Two sessions also differ in things that were not meant to change: brush, ink, paper, zero touch."
-        title = f"after minus before, points of percent ({self.before.label})"
+        title = f"after minus before, percentage points ({self.before.label})"
         table = Table("model", "images", "", "before", "after", "change", "95 %", "p", "", title=title)
         for change in self.changes:
             name, alignment, tone, measure = change.series
@@ -286,7 +286,7 @@ def compare(request: DiffRequest, _progress: Progress = unseen) -> Difference:
     paths = report_path(request.before), report_path(request.after)
     old, new = (Report.read(path) for path in paths)
     if old.source != new.source:
-        what = f"is of {new.source}, {paths[0]} of {old.source}: they cannot be compared"
+        what = f"has the source {new.source}, {paths[0]} has {old.source}: they cannot be compared"
         raise CalibrationError(str(paths[1]), what)
     by_stroke = bool({s.recording_sha256 for s in old.sessions} & {s.recording_sha256 for s in new.sessions})
     first, last = (_scores(path, side, by_stroke=by_stroke) for path, side in zip(paths, (old, new), strict=True))

@@ -146,8 +146,9 @@ def read_curve(text: str) -> Curve:
     try:
         steps, mse = np.loadtxt(path, delimiter=",", skiprows=1, usecols=(0, 1), ndmin=2).T
         return name, steps, mse
-    except (OSError, ValueError):
-        raise CalibrationError(str(path), "is not a table of validation losses (step, mse)") from None
+    except (OSError, ValueError) as error:
+        what = "cannot be read" if isinstance(error, OSError) else "is not a table of validation losses (step, mse)"
+        raise CalibrationError(str(path), what) from None
 
 
 def extremes(outcome: Outcome, model: str) -> tuple[list[int], list[int]]:
@@ -319,7 +320,7 @@ def _session(session: Session) -> Iterator[Point]:
         words = f"{len(session.cut)} strokes are cut by the edge of their photograph, patch or crop"
         yield Point(False, f"{words}: their scores are too low.")
     if scale is not None:
-        words = f"scale known to ±{100 * scale.relative_reach:.3f} %, board seen to {scale.rms_px:.2f} px."
+        words = f"the scale is known to ±{100 * scale.relative_reach:.3f} %, board corners to {scale.rms_px:.2f} px."
         yield Point(2.0 * scale.relative_reach <= WIDE_SCALE, words)
 
 

@@ -284,7 +284,7 @@ def predicted(models: Iterable[Model], at: Condition) -> tuple[dict[str, Pixels]
         try:
             images[model.name] = images_of(*model.mark(at))
         except DomainError as error:
-            refused.append(f"{model.name} does not predict it: {error}")
+            refused.append(f"{model.name} does not predict this press: {error}")
     return images, refused
 
 

@@ -357,7 +357,7 @@ def check_gates(report: Report, gates: Sequence[str]) -> None:
         percent: float | None = None if stat is None else getattr(getattr(stat, measure), statistic)
         if percent is None:
             known = ", ".join(dict.fromkeys(stat.model for stat in report.stats))
-            raise CalibrationError(f"--gate {gate[0]}", f"{model!r} has no {statistic}; scored: {known}")
+            raise CalibrationError(f"--gate {gate[0]}", f"{model!r} has no {statistic}; models with scores: {known}")
         if 0.01 * percent < float(gate["limit"]):
             which = f"{measure}_{statistic} of {', '.join((model, *key))}"
             missed.append(f"{gate[0]}: {which} is {0.01 * percent:.4f} ({report.label})")

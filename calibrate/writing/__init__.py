@@ -207,7 +207,7 @@ def check_drawn_from(plan: Plan, session: OpenSession) -> None:
     commanded = {figure.name: figure.commanded for figure in plan.figures}
     for name, strokes in recorded_figures(session.header).items():
         if commanded.get(name) != as_points(strokes):
-            raise CalibrationError(str(session.recording.path), f"{name!r} was not drawn from this plan")
+            raise CalibrationError(str(session.recording.path), f"{name!r} was not written from this plan")
 
 
 def code_points(name: str) -> str:
@@ -240,7 +240,7 @@ def plan(request: PlanRequest, _progress: Progress = unseen) -> Written:
     tilt_deg = min(max(TILT_DEG, low), high)
     try:
         if high > MOST_TILT_DEG or by.depth_range_mm[0] <= 0:
-            raise ValueError(f"tilts end at {MOST_TILT_DEG:g} deg, depths begin above 0 mm")
+            raise ValueError(f"tilts must be at most {MOST_TILT_DEG:g} deg, and depths above 0 mm")
         reach, patch = by.reach, Patch(request.cell_mm)
         model = stroke_model("ccd-bsm", Brush(by.radius_mm, by.length_mm))
         model.profile(by.depth_range_mm[1], high)
@@ -248,7 +248,7 @@ def plan(request: PlanRequest, _progress: Progress = unseen) -> Written:
         raise CalibrationError("write plan", str(error)) from None
     wanted = read_wanted(request.what, request.data, patch)
     if fitted is None:
-        drawing, label, simulated = model, model.label, "CCD-BSM, marks laid over each other along the way"
+        drawing, label, simulated = model, model.label, "CCD-BSM, marks laid over each other along the path"
     else:
         drawing, label = fitted.footprint(), "fitted footprint"
         simulated = f"the footprint fitted to {fitted.session_id}, {fitted.source}"
@@ -262,7 +262,7 @@ def plan(request: PlanRequest, _progress: Progress = unseen) -> Written:
 
 
 def _said(planned: Sequence[tuple[Figure, Image]], simulated: str) -> Iterator[str]:
-    yield f"simulated by {simulated}: not ink"
+    yield f"simulated by {simulated}, without ink"
     for figure, first in planned:
         points = sum(len(stroke) for stroke in figure.commanded)
         scores = f"first plan {_likeness(figure, first)}; refined {_likeness(figure, figure.simulated)}"
@@ -302,7 +302,7 @@ def read_wanted(what: str, data: Path | None, patch: Patch) -> list[Figure]:
     if not 1 <= len(what) <= MAX_FIGURES or not what.isprintable() or any(c.isspace() for c in what):
         raise CalibrationError("character", f"expected 1 to {MAX_FIGURES} characters")
     if len(set(what)) != len(what):
-        raise CalibrationError("character", "the same character twice: the protocol's `repeats` writes it again")
+        raise CalibrationError("character", "a character occurs twice: the protocol's `repeats` writes it again")
     figures = [_character(name, data, patch) for name in what]
     for figure in figures:
         if not figure.wanted.any():
@@ -317,7 +317,7 @@ def _character(name: str, data: Path | None, patch: Patch) -> Figure:
     if data is None and not path.exists():
         shipped = " ".join(sorted(file.stem for file in folder.glob("*.json")))
         raise CalibrationError(
-            f"character {name!r}", f"is not shipped ({shipped}): --data names a folder of hanzi-writer-data that has it"
+            f"character {name!r}", f"is not shipped (only {shipped}): give a folder of hanzi-writer-data by --data"
         )
     try:
         strokes = parse_glyph(read_bounded(path).decode())

@@ -115,7 +115,7 @@ def fit(request: FitFootprintRequest, progress: Progress = unseen) -> Written:
     )
     path = put_to_use(artefact, opened.recording.path.parent, FOLDER)
     words = (
-        f"footprint of {count} strokes on {len(ink)} patches ({artefact.source}): draws them with CSIM "
+        f"the footprint of {count} strokes on {len(ink)} patches ({artefact.source}) draws them with CSIM "
         f"{csim_percent:.1f} %, ink = 1"
     )
     return Written(path, (*(f"left out: {stroke_id}: {why}" for stroke_id, why in refused), words, str(path)))
@@ -184,7 +184,7 @@ def learn(request: LearnRequest, progress: Progress = unseen) -> Written:
     protocol = write_plan(following, repeats, request.out)
     said = [
         f"{figure.name}: CSIM {figure.rounds[-1].csim_percent:.2f}, ink = 1, mm"
-        + ("; settled: the best round is kept" if figure.settled else "")
+        + ("; no further round helps: the best one is kept" if figure.settled else "")
         for figure in following.figures
     ]
     return Written(protocol, (*said, str(protocol)))
@@ -195,7 +195,7 @@ def learned(written: WritingComparison) -> Plan:
     plan, writings = written.plan, {character.figure.name: character for character in written.characters}
     if absent := [figure.name for figure in plan.figures if figure.name not in writings]:
         where = str(written.session.recording.path)
-        raise CalibrationError(where, f"shows no {absent[0]!r}: nothing is learned for it")
+        raise CalibrationError(where, f"shows no {absent[0]!r}, so nothing is learned for this character")
     ink = [writings[figure.name].mean_ink() for figure in plan.figures]
     known, drawings = plan.planned_by.footprint, drawings_of([each.strokes for each in plan.figures], ink, plan.cell_mm)
     footprint = fit_footprint(drawings, None if known is None else Footprint(known))

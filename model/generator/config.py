@@ -64,7 +64,7 @@ class Target(_Table):
         for name in INPUTS:
             low, high = getattr(self, name)
             if not low < high:
-                raise ValueError(f"{name} = [{low:g}, {high:g}] must grow")
+                raise ValueError(f"{name} = [{low:g}, {high:g}] must increase")
         try:
             self.stroke_model.profile(np.array(self.depth_mm), np.array(self.tilt_deg))
         except (DomainError, UnknownModelError) as error:

@@ -73,7 +73,7 @@ def run_training(
             if not path.exists():
                 run.finish(path)
     except Timeout as error:
-        raise TrainError(folder, "another training writes here") from error
+        raise TrainError(folder, "another training writes in this folder") from error
     return path
 
 

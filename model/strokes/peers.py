@@ -189,13 +189,13 @@ def _cap(centre: Array, radius: Array, start: Array, span: Array) -> tuple[Array
 
 
 def _check_speed(start_width_mm: Array, end_width_mm: Array, growth: Array, speed: Array) -> None:
-    """Raise DomainError where the width changes faster than the curve runs."""
+    """Raise DomainError where the width changes too much for the length of the curve."""
     held = (np.abs(growth) >= speed).any(-1)
     if held.any():
         at = int(held.argmax())
         allowed = f"{float(start_width_mm[at]):g} +- {float(2 * speed[at].min()):g} mm"
         raise DomainError(
-            "end_width_mm", float(end_width_mm[at]), allowed, "the width changes faster than the curve runs"
+            "end_width_mm", float(end_width_mm[at]), allowed, "the width changes too much for the length of the curve"
         )
 
 

@@ -61,7 +61,7 @@ def test_a_camera_that_was_touched_before_the_last_view_of_the_board_is_said(tmp
     touched, unseen = made.moved
     off_mm = off_px * made.calibration.mm_per_px
     assert touched.startswith(f"3 min before the last view of the board, it lay {off_px}.0 px ({off_mm:.2f} mm) away")
-    assert unseen.startswith("2 min before the last view of the board, it is not seen: is blank")
+    assert unseen.startswith("2 min before the last view of the board, the board is not seen: is blank")
 
 
 def test_what_has_no_board_cannot_be_calibrated(tmp_path: Path) -> None:

@@ -269,7 +269,7 @@ def test_a_finished_training_is_not_done_again_and_another_one_is_refused(
     assert {path: path.stat().st_mtime_ns for path in before} == before
     with pytest.raises(TrainError, match="another configuration: steps: 30 -> 40; use a new folder"):
         run_training(tiny.model_copy(update={"steps": 40}), finished, pytest.fail)
-    with FileLock(tmp_path / ".lock"), pytest.raises(TrainError, match="another training writes here"):
+    with FileLock(tmp_path / ".lock"), pytest.raises(TrainError, match="another training writes in this folder"):
         run_training(tiny, tmp_path, pytest.fail)
     (tmp_path / "checkpoint.pt").write_bytes(b"PK\x03\x04 cut")
     with pytest.raises(TrainError, match=r"is not a checkpoint of this training: [^\n]*$"):

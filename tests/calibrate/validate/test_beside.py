@@ -96,7 +96,7 @@ def test_what_is_no_loop_at_all_is_refused(place: Path, text: str) -> None:
 def test_what_belongs_to_other_strokes_ink_or_brushes_is_left_out_with_the_reason(place: Path) -> None:
     for changes, words in (
         ({"source": Source.LOOPBACK}, "it is of loopback rig, not imported photographs"),
-        ({"original_sha256": "3" * 64}, f"it is of another recording of {place.name}"),
+        ({"original_sha256": "3" * 64}, f"it belongs to another recording of {place.name}"),
     ):
         put(place / "loop", loop_text(place, **changes))
         assert words in said("validate", place, *FAST)

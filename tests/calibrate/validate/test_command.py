@@ -55,7 +55,7 @@ def test_after_kill_9_the_same_command_gives_the_same_bytes_and_repeats_nothing(
 
 def test_two_at_a_time_in_one_folder_are_refused(session: Path, tmp_path: Path) -> None:
     with FileLock(tmp_path / ".lock"):
-        assert "another validation is writing there" in refused("validate", session, "--out", tmp_path)
+        assert "another validation is writing in this folder" in refused("validate", session, "--out", tmp_path)
 
 
 def test_a_recording_that_is_not_the_one_its_journal_closed_is_damaged(session: Path, tmp_path: Path) -> None:

@@ -303,4 +303,4 @@ def test_a_character_is_written_twice_and_compared(tmp_path: Path) -> None:
     # A session is compared with the plan that it was drawn from, and with no other.
     plan = tmp_path / "plan"
     said("write", "plan", "--out", plan, "--steps", "1", "--cell-mm", "48", "子")
-    assert "'子' was not drawn from this plan" in refused("write", "compare", session, "--plan", plan)
+    assert "'子' was not written from this plan" in refused("write", "compare", session, "--plan", plan)
