@@ -132,8 +132,8 @@ class RobotNotSafe(MotionError):
 class NotPowered(MotionError):
     """The arm has no power, or its brakes are on, although it was enabled."""
 
-    condition = "It has not moved."
-    remedy = "Find out who switched it off, and why. Enabling the arm again powers it and releases its brakes."
+    condition = "The arm has not moved."
+    remedy = "Find out who switched the arm off, and why. Enabling it again powers it and releases its brakes."
 
     def __init__(self, device: str, op: str) -> None:
         super().__init__(device, op, "robot mode is not Running: the arm was switched off")
@@ -142,15 +142,15 @@ class NotPowered(MotionError):
 class ArmMoved(MotionError):
     """The arm is not where it was left; `moving` is True if it still moves."""
 
-    condition = "Another client or a person moved it; nothing was sent to it."
+    condition = "Another client or a person moved the arm; nothing was sent to it."
     remedy = "Nothing may stand in the way of the brush: the first motion is back along the tool axis."
 
     def __init__(self, device: str, op: str, off_mm: float, off_deg: float, *, moving: bool = False) -> None:
         self.moving = moving
         what = f"the arm is {off_mm:.1f} mm and {off_deg:.1f} deg from where it was left"
         if moving:
-            what = "the arm is moving, and not from here"
-        remedy = "Wait until it rests, and close the other client." if moving else ""
+            what = "the arm is moving, but brushloop does not move it"
+        remedy = "Wait until the arm rests, and close the other client." if moving else ""
         super().__init__(device, op, what, remedy=remedy)
 
 
@@ -165,7 +165,7 @@ class SettingsChanged(MotionError):
     """Settings of the controller have changed; the message gives each as found and as it was set."""
 
     condition = "Nothing was sent to the arm; the tip may be elsewhere than reported."
-    remedy = "Find out who changed it, the pendant or another client. Enabling the arm again restores it."
+    remedy = "Find out who changed the settings, a person or another client. Enabling the arm again restores them."
 
 
 LOAD_PER_CORE = 2.0

@@ -79,8 +79,8 @@ UNKNOWN_CONDITION = (
 )
 
 REFUSAL_REMEDY = {
-    ReturnCode.QUEUE_FULL: "Another client is sending motion; close it.",
-    ReturnCode.BUSY: "Another program has the arm; stop it on the pendant.",
+    ReturnCode.QUEUE_FULL: "Another client is sending motion; close that client.",
+    ReturnCode.BUSY: "Another program controls the arm; stop that program on the pendant.",
 }
 
 NOT_RUNNING = -1

@@ -82,9 +82,9 @@ async def until_settled(
             return
         idle_since = (idle_since or now) if steady else None
         if idle_since is not None and now - idle_since > RESTS_ELSEWHERE_S:
-            raise _not_arrived(f"rests {off_mm:.2f} mm and {off_deg:.2f} deg from the target")
+            raise _not_arrived(f"the arm rests {off_mm:.2f} mm and {off_deg:.2f} deg from the target")
         if late and now - nearer_at > STUCK_S:
-            raise _not_arrived(f"not settled after {allowed_s:.1f} s, {off_mm:.2f} mm and {off_deg:.2f} deg to go")
+            raise _not_arrived(f"no rest after {allowed_s:.1f} s, {off_mm:.2f} mm and {off_deg:.2f} deg off the target")
         await asyncio.sleep(POLL_S)
 
 
@@ -205,11 +205,11 @@ async def queue_all(
     rests = arrived(await controller.pose(), start)
     _, size = await controller.queue()  # last: what another client sends after this answer comes after our lift
     if size > len(lines):
-        raise PathDisturbed(DEVICE, "sequence", f"the controller holds {size} lines, {len(lines)} were sent")
+        raise PathDisturbed(DEVICE, "sequence", f"the controller holds {size} lines, but {len(lines)} were sent")
     if size < len(lines):
         raise _not_begun(f"the controller holds {size} of {len(lines)} lines")
     if not rests:
-        raise _not_begun("the controller does not hold its path: the arm moved before it was released")
+        raise _not_begun("the controller does not hold its path: the arm moved before its path was released")
     go()
     # Without a readable answer the arm may have begun, and a stop would leave the brush down: what it does will tell.
     with contextlib.suppress(ConnectionLost, DeviceTimeout, ProtocolViolation):

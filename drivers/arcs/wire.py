@@ -344,7 +344,7 @@ async def open_arcs(connection: RpcConnection) -> None:
     except (ConnectionLost, DeviceTimeout) as error:
         if error.op == "connect" and await answers(connection.host, AUBOPE_PORT):
             what = f"port {connection.port} does not answer but {AUBOPE_PORT} does: this cabinet runs AUBOPE (V4)"
-            remedy = "It needs the ARCS software; ask the maker for the upgrade."
+            remedy = "The cabinet needs the ARCS software; ask the maker for the upgrade."
             raise DeviceError(DEVICE, "connect", what, remedy=remedy) from None
         raise
 

@@ -136,7 +136,7 @@ class ForceTable(BaseModel, frozen=True, extra="forbid"):
         most_ms = MOST_STALE_LOOPBACK_MS if self.channel == LOOPBACK_CHANNEL else MOST_STALE_MS
         if self.stale_ms > most_ms:
             raise ValueError(
-                f"stale_ms = {self.stale_ms:g}: must be from 20 to {most_ms:g}; the brush is blind that long"
+                f"stale_ms = {self.stale_ms:g}: must be from 20 to {most_ms:g}; no force is felt that long"
             )
         return self
 
@@ -174,7 +174,7 @@ class SriM8123:
                     await asyncio.sleep(RECEIVE_S)
         except TimeoutError:
             dropped = self.assembler
-            what = f"no whole round in {CONNECT_S:g} s ({dropped.torn} torn, {dropped.refused} refused)"
+            what = f"no complete round in {CONNECT_S:g} s ({dropped.torn} broken, {dropped.refused} refused)"
             remedy = "Check power, wiring, termination and bit rate."
             raise DeviceTimeout(DEVICE, "connect", what, remedy=remedy) from None
         # The board has no identification. No real board can be on a virtual bus or on the loopback rig's bus.

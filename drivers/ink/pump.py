@@ -152,7 +152,7 @@ class ModbusPump(InkDevice):
             await finished(self._halt())
             if ran_s > planned_s + MAX_OVERRUN_S:
                 excess_ml = (ran_s - planned_s) * self._ml_per_s
-                what, remedy = f"ran {ran_s:.2f} s instead of {planned_s:.2f} s", "Something held the host up."
+                what, remedy = f"the pump ran {ran_s:.2f} s instead of {planned_s:.2f} s", "The computer was delayed."
                 condition = f"About {excess_ml:.2f} ml too much is in the well; the pump is stopped."
                 raise DeviceError(DEVICE, "dose", what, condition=condition, remedy=remedy)
 

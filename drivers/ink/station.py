@@ -132,7 +132,7 @@ class InkStation(InkDevice):
             await self.dose(dose_ml)
             before, level = level, await self.level()
             if level < before + LEVEL_RISES:
-                raise DoseLost(DEVICE, "dose", f"a dose of {dose_ml:g} ml left the well at {level:.0%} of its capacity")
+                raise DoseLost(DEVICE, "dose", f"after a dose of {dose_ml:g} ml the well is still at {level:.0%}")
         return level
 
     async def light(self) -> float | None:

@@ -154,7 +154,7 @@ class UnknownLab(LoopbackRig):
             lost = ((Device.ROBOT, "deaf"), (Device.TELEMETRY, "mute"))
             self._pulled = [self.faults.hang(Fault(device=d, kind=kind, count=ALWAYS)) for d, kind in lost]
         if short_mm > 0.0:
-            raise ValueError(f"The arm is stretched out, {short_mm:.0f} mm before the {to}.")
+            raise ValueError(f"The arm is fully stretched, {short_mm:.0f} mm short of the {to}.")
         return f"The tip is at the {to}{f', {corner}' if corner else ''}."
 
     async def mend(self) -> str:
@@ -174,7 +174,7 @@ class UnknownLab(LoopbackRig):
         if self.facts.config != was.config:  # table, view or sensor; tool and brush stay
             self.config = self.world.config = self.facts.config
             self.scene = Scene(self.world)
-        done, self._trap = f"I have seen to it: {self._trap}.", None
+        done, self._trap = f"I have corrected this: {self._trap}.", None
         return done
 
     def aim(self, to: str, index: int, name: str) -> Pose:

@@ -330,7 +330,7 @@ def test_what_a_second_client_did_in_a_pause_is_asked_about_before_anything_move
     lab.write_protocol("[11.0]", "[0.0]", repeats=4)
     engine = lab.started(on_screen=True)
     acts: list[tuple[Callable[[Lab], dict[str, Any]], str]] = [
-        (up_slowly, "the arm is moving, and not from here"),
+        (up_slowly, "the arm is moving, but brushloop does not move it"),
         (lambda _: {"RobotManage_poweroff": {}}, "robot mode is not Running"),
         (lambda _: SHORTER, "tool offset is (0, 0, 170) mm"),
     ]
