@@ -258,7 +258,7 @@ def _cropped(prepared: Prepared, anchor_px: tuple[float, float]) -> Prepared:
     window = slice(top + side, top + 2 * side), slice(left + side, left + 2 * side)
     mask, soft = (np.pad(part, side)[window] for part in (prepared.mask, prepared.soft))
     if not mask.any():
-        raise CaptureRefused("anchor", "lies so far from the stroke that no ink is in the field")
+        raise CaptureRefused("anchor", "lies so far from the stroke that none of the stroke is in the field")
     cut = prepared.cut or bool(np.count_nonzero(mask) < np.count_nonzero(prepared.mask))
     return replace(prepared, mask=mask, soft=soft, anchor_px=(anchor_px[0] - left, anchor_px[1] - top), cut=cut)
 

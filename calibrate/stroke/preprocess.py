@@ -92,7 +92,7 @@ def cut_out(
     last = max(0, math.ceil(y + bottom * px_per_mm[1])), max(0, math.ceil(x + right * px_per_mm[0]))
     part = image[row : last[0], column : last[1]]
     if not part.size:
-        raise CaptureRefused(where, "anchor lies so far from the stroke that no ink is in the field")
+        raise CaptureRefused(where, "anchor lies so far from the stroke that none of the stroke is in the field")
     return part, (x - column, y - row)
 
 

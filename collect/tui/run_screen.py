@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from brushloop.collect.engine.engine import Engine
     from brushloop.collect.engine.snapshot import LastCapture
 
-OVER = "The run is over: q leaves"
+OVER = "Over: q leaves"
 GOES_ON = "Press enter to resume, or run the same command later."
 COMMAND_GOES_ON = "Run the same command again to continue."
 WARNING = "warning: "

@@ -79,7 +79,7 @@ def fitted(session: Path) -> tuple[Path, str]:
 
 def test_dragged_strokes_are_fitted_and_written(session: Path, fitted: tuple[Path, str]) -> None:
     path, output = fitted
-    for words in ("bristle lag alone", "leash_mm", "not determined", "no depth at the ends"):
+    for words in ("bristle lag alone", "leash_mm", "not determined", "as in the middle"):
         assert words in output
     fit = DragArtefact.read(path)
     assert len(fit.fitted_strokes) == 6
@@ -92,14 +92,14 @@ def test_dragged_strokes_are_fitted_and_written(session: Path, fitted: tuple[Pat
 
 
 def test_another_session_is_predicted_stroke_by_stroke(session: Path, fitted: tuple[Path, str], tmp_path: Path) -> None:
-    """Here the session itself, so that the report has to say "in sample"."""
+    """Here the session itself, so that the report has to say that the fit is to these strokes."""
     out = tmp_path / "report"
     output = said("validate", session, "--fit", fitted[0], "--out", out)
     page = (out / "report.html").read_text()
     for words in ("bristle lag alone", "In sample", "No command was repeated", "captured and predicted ink"):
         assert words in page
     assert re.findall(r'<script|(?:src|href)="(?!data:image/)', page) == [], "it fetches nothing"
-    assert "in sample" in output
+    assert "from a fit to these strokes" in output
     report = json.loads((out / "report.json").read_text())
     assert report["source"] == "imported photographs"
     assert report["over_all"][PREDICTED]["csim"] > 0.8

@@ -64,7 +64,7 @@ def test_a_session_is_inverted_and_can_be_replayed(tmp_path: Path) -> None:
     out = tmp_path / "out" / "recovered.csv"
     words = said("recover", session(tmp_path), "--out", out)
     assert "3 presses recovered by CCD-BSM as published (imported photographs)" in words
-    assert "H: recovered -0.0" in words
+    assert "H: recovered values are -0.0" in words
     assert "3 of 3 intervals (95 %) contain the commanded value" in words
     assert "warning: the intervals of 3 presses leave out the error of the model" in words
     protocol = load_protocol(out.with_name(PROTOCOL))

@@ -70,7 +70,7 @@ def test_the_command_writes_a_protocol_within_reach_and_a_picture(tmp_path: Path
     options = ["--steps", "2", "--repeats", "2", "--depth-range", "1", "5", "--tilt-range", "0", "6"]
     ran = brushloop("write", "plan", "子永", "--out", "plan", *options, cwd=tmp_path)
     assert ran.returncode == 0, ran.stderr
-    assert "not ink" in ran.stdout
+    assert "without ink" in ran.stdout
     protocol = load_protocol(tmp_path / "plan" / PROTOCOL)
     assert isinstance(protocol, WriteConfig)
     assert protocol.repeats == 2
@@ -114,10 +114,10 @@ def test_a_data_set_is_a_folder_with_a_file_for_each_character(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("一",), "is not shipped (子 字 永)"),
+        (("一",), "is not shipped (only 子 字 永)"),
         (("一", "--data", "nowhere"), "nowhere/一.json: no such file"),
-        (("字字",), "the same character twice"),
-        (("字", "--tilt-range", "0", "45"), "tilts end at 30 deg"),
+        (("字字",), "a character occurs twice"),
+        (("字", "--tilt-range", "0", "45"), "tilts must be at most 30 deg"),
         (("字", "--depth-range", "5", "5"), "depth_mm = (5, 5)"),
         (("字", "--depth-range", "1", "60"), "depth_mm = 60 is outside"),
     ],

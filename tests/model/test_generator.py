@@ -59,7 +59,7 @@ def test_placements_are_those_of_the_validation() -> None:
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"depth_mm": (20, 11)}, r"depth_mm = \[20, 11\] must grow"),
+        ({"depth_mm": (20, 11)}, r"depth_mm = \[20, 11\] must increase"),
         ({"tilt_deg": (-5, 10)}, "tilt_deg = -5 is outside"),
         ({"depth_mm": (11, 60)}, "depth_mm = 60 is outside"),
         ({"model": "spline"}, "unknown stroke model 'spline'"),
@@ -121,7 +121,7 @@ def test_the_shipped_generator_is_small_and_the_one_that_its_card_describes() ->
     card, file = SHIPPED_GENERATOR.with_suffix(".md").read_text(encoding="utf-8"), read_generator(SHIPPED_GENERATOR)
     assert sha256(SHIPPED_GENERATOR) in card
     assert "trained on exact area coverage of the stroke model `ccd-bsm`" in card
-    assert "It has seen no real ink" in card
+    assert "The generator has seen no real ink" in card
     assert f"{file.report['mse']:.3g}" in card
     assert file.config == preset("anchored")  # the documented command trains it
     held_out = sets(file.config.model_copy(update={"seed": 1, "training_images": 1, "validation_images": 64}))[1]
@@ -232,7 +232,7 @@ def test_the_command_leaves_generator_card_and_page_that_say_that_there_is_no_in
     assert left == files | {f"pictures/step-{step:07d}.png" for step in (15, 30)}
     card = (finished / "generator.md").read_text()
     assert "H from 11 to 20 mm, alpha from 0 to 10 deg" in card
-    assert "It has seen no real ink" in card
+    assert "The generator has seen no real ink" in card
     assert "30 steps of 16, seed 0, highest rate 0.005: all steps done" in card
     page = (finished / "training.html").read_text(encoding="utf-8")
     assert page.count('alt="network: depth_mm ') == 12

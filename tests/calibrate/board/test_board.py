@@ -134,7 +134,7 @@ def test_it_says_what_else_to_photograph() -> None:
     lens = fit_lens([*one_corner, *renamed(one_corner, "again-")])
     assert lens.ways == 5, "a view given again is no other way to hold the board"
     message = " / ".join((*lens.guidance, *fit_lens(one_corner).guidance))
-    assert "more ways (5 of 6 so far)" in message
+    assert "more different angles (5 of 6 so far)" in message
     assert "take more photographs (5 of" in message
     assert "right" in message
     assert guidance(views(40), [20.0] * 40) == ()

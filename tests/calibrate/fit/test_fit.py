@@ -184,7 +184,7 @@ def test_one_command_leads_from_photographs_to_a_fit_and_a_report(
     monkeypatch.setenv("COLUMNS", "60")
     session = imported_presses(tmp_path, CONDITIONS)
     output = said("analyse", session)
-    sizes = "heel", "width", "95 %", "left out of the fit in turn", BEZIER, UNCALIBRATED
+    sizes = "heel", "width", "95 %", "left out of the fit", BEZIER, UNCALIBRATED
     for words in (*sizes, "paper's", "CCD-BSMG"):
         assert words in output
     assert "…" not in output, "a size is cut in 60 columns"

@@ -95,13 +95,13 @@ def test_what_is_no_loop_at_all_is_refused(place: Path, text: str) -> None:
 
 def test_what_belongs_to_other_strokes_ink_or_brushes_is_left_out_with_the_reason(place: Path) -> None:
     for changes, words in (
-        ({"source": Source.LOOPBACK}, "it is of loopback rig, not imported photographs"),
+        ({"source": Source.LOOPBACK}, "its source is loopback rig, not imported photographs"),
         ({"original_sha256": "3" * 64}, f"it belongs to another recording of {place.name}"),
     ):
         put(place / "loop", loop_text(place, **changes))
         assert words in said("validate", place, *FAST)
     for changes, words in (
-        ({"source": Source.LOOPBACK}, "it is of loopback rig, not imported photographs"),
+        ({"source": Source.LOOPBACK}, "its source is loopback rig, not imported photographs"),
         ({"brush": "goat hair"}, "it was written with another brush, goat hair"),
     ):
         characters(place.parent.parent / "written", **changes)

@@ -113,7 +113,7 @@ def test_a_gate_that_holds_passes_and_one_that_is_missed_says_by_how_much_and_ex
     with pytest.raises(GateMissed, match=r"csim_avg of circle, mm, binary is 0\..* \(imported photographs\)") as missed:
         check_gates(report, ["circle:mm:csim_avg>=0.99"])
     assert missed.value.exit_code == 5
-    with pytest.raises(CalibrationError, match="'ceiling' has no max; scored: ccd-bsm"):
+    with pytest.raises(CalibrationError, match="'ceiling' has no max; models with scores: ccd-bsm"):
         check_gates(report, ["ceiling:csim_max>=0.9"])
 
 

@@ -117,12 +117,12 @@ class InLab(Person):
             "Squares of the print": "{}x{}".format(*table.board_squares),
             "Side of a square": str(facts.printed_mm[0]),
             "Side of a marker": str(facts.printed_mm[1]),
-            "Family of its markers": table.board_dictionary,
+            "Family of the board's markers": table.board_dictionary,
             "R:": str(brush.radius_mm),
             "L:": str(brush.length_mm),
             "Deepest press": str(facts.max_depth_mm),
             "Delivery per revolution": "0.1",
-            "Its serial line": lab.ink_path,
+            "Serial line of the device": lab.ink_path,
             "CAN bus": lab.can_bus,
         }
         return next((v for start, v in read.items() if question.startswith(start)), "")

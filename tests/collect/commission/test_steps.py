@@ -65,8 +65,8 @@ async def test_holds_that_were_not_upright_are_named_and_asked_for_again(tmp_pat
         visit = person.visit(tmp_path / "rig.toml")
         await ArmStep().carry_out(visit)
         await TipStep().carry_out(visit)
-    warned = [text[:6] for tone, text in person.shown if tone == "warning" and text.startswith("Hold ")]
-    assert warned == ["Hold 1", "Hold 1", "Hold 1", "Hold 7"]
+    warned = [text[:6] for tone, text in person.shown if tone == "warning" and text.startswith("Pose ")]
+    assert warned == ["Pose 1", "Pose 1", "Pose 1", "Pose 7"]
     assert len(visit.notebook.touched("upright")) == 12
     turn = TipStep().derived(visit.notebook)["robot.tcp_rotation_deg"]
     assert "12 times" in turn.how
@@ -236,7 +236,7 @@ async def test_pictures_that_say_nothing_are_taken_again_at_both_places(
 
 # Going back, teaching a step again, leaving off
 
-HOW, GIVE, LINE = "How do you want to go on?", "Give 0.5 ml", "Its serial line"
+HOW, GIVE, LINE = "How do you want to go on?", "Pump 0.5 ml", "Serial line of the device"
 R, L, DEEPEST, NAME = "R", "L", "Deepest press that this brush can take; 45% of L is cautious", "Name of the brush"
 FILLED, INK, CAN = "What keeps the ink well filled?", "Name of the ink", "CAN bus of the force sensor"
 
@@ -309,8 +309,8 @@ async def test_a_step_that_was_refused_goes_on_where_the_person_wants(
 @pytest.mark.parametrize(
     ("asked", "line", "said"),
     [
-        (ask_length([0.0, 0.0, 180.0]), "190", r"190 mm cannot be \(5 to 180 mm\)"),
-        (ask_depth(48.0), "30", r"30 mm cannot be \(0\.5 to 28\.8 mm\)"),
+        (ask_length([0.0, 0.0, 180.0]), "190", r"190 mm is not plausible \(5 to 180 mm\)"),
+        (ask_depth(48.0), "30", r"30 mm is not plausible \(0\.5 to 28\.8 mm\)"),
         (RADIUS, "nan", "is not a number"),
         (RADIUS, "0,1", r"0\.1 is outside 0\.5 to 50 mm"),
         (ASK_PORT, "", "no serial line was named"),

@@ -136,7 +136,7 @@ def full_picture(**changes: Any) -> Snapshot:
 
 SPLIT = Prompt(
     "H15-a5-r01: The tip is split by 0.42 mm. Comb the brush.",
-    (Choice("g", "good anyway: it counts"), Choice("r", "press it again"), Choice("k", "skip it")),
+    (Choice("g", "good anyway: the stroke counts"), Choice("r", "press the stroke again"), Choice("k", "skip the stroke")),
     "k",
     image=capture(kept=False).photo,
     number=3,
