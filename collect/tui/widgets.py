@@ -174,7 +174,7 @@ class AskScreen(ModalScreen[str]):
                 yield Input(self.prompt.default, id="answer", compact=True)
             if not self.own:
                 yield self._live
-                yield Static("Waits until it is answered; the arm does not move meanwhile.", markup=False)
+                yield Static("The arm does not move until this is answered.", markup=False)
         yield Footer(compact=True)
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:

@@ -275,7 +275,7 @@ def test_a_session_that_was_collected_with_a_lens_needs_no_other(tmp_path: Path,
 
 
 def test_the_quick_look_at_a_board_needs_a_picture_without_distortion(shot: Shot, lens: Path) -> None:
-    with pytest.raises(CalibrationError, match="the lens bends straight lines: calibrate the lens with `brushloop camera"):
+    with pytest.raises(CalibrationError, match="the lens bends straight lines: calibrate the lens"):
         see_board(shot.image, shot.board)
     flat = read_lens(lens).undistort(shot.image)
     plane = see_board(flat, shot.board).plane

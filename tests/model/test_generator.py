@@ -121,7 +121,7 @@ def test_the_shipped_generator_is_small_and_the_one_that_its_card_describes() ->
     card, file = SHIPPED_GENERATOR.with_suffix(".md").read_text(encoding="utf-8"), read_generator(SHIPPED_GENERATOR)
     assert sha256(SHIPPED_GENERATOR) in card
     assert "trained on exact area coverage of the stroke model `ccd-bsm`" in card
-    assert "The generator has seen no real ink" in card
+    assert "It has seen no real ink" in card
     assert f"{file.report['mse']:.3g}" in card
     assert file.config == preset("anchored")  # the documented command trains it
     held_out = sets(file.config.model_copy(update={"seed": 1, "training_images": 1, "validation_images": 64}))[1]

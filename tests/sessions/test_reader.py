@@ -166,7 +166,7 @@ def test_what_is_no_session_is_named_as_what_it_is(make, store, tmp_path, look):
     (tmp_path / "empty").mkdir()
     before = make.tree(tmp_path)
     for path, message in (
-        (part, f"was never finished, .* Give the session's folder, {store.folder}"),
+        (part, f"is unfinished, .* Give the session's folder, {store.folder}"),
         (tmp_path / "empty", r"it holds neither journal\.jsonl nor a recording empty\.mcap"),
         (tmp_path, rf"is not a session but holds 1 of them: give one, such as {store.folder}"),
         (tmp_path / "gone", "no such session"),

@@ -180,7 +180,7 @@ def test_the_arm_travels_above_the_rim_of_the_pot_of_water_too() -> None:
     ],
 )
 def test_a_wipe_that_cannot_be_one_is_refused_with_the_way_out(rim: Place, said: str) -> None:
-    with pytest.raises(NotAccepted, match=f"{said}.*only .* is asked again"):
+    with pytest.raises(NotAccepted, match=f"{said}.*only this touch is repeated"):
         check_wipe(touched(**{"well-rim_1": rim}))
 
 

@@ -20,7 +20,7 @@ from textual.app import App
 from textual.pilot import Pilot
 
 from brushloop.collect.commission.visit import Visit
-from brushloop.collect.engine.capture import mark_of
+from brushloop.collect.engine.capture import AGAIN, KEEP, SKIP, mark_of
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.snapshot import ConditionCount, LastCapture, Mark, Picture, SheetMap, Snapshot
@@ -136,7 +136,7 @@ def full_picture(**changes: Any) -> Snapshot:
 
 SPLIT = Prompt(
     "H15-a5-r01: The tip is split by 0.42 mm. Comb the brush.",
-    (Choice("g", "good anyway: the stroke counts"), Choice("r", "press the stroke again"), Choice("k", "skip the stroke")),
+    (KEEP, AGAIN, SKIP),
     "k",
     image=capture(kept=False).photo,
     number=3,

@@ -265,7 +265,7 @@ async def test_b_marks_the_last_capture_and_takes_it_back_while_the_run_is_on(tm
 async def test_a_key_answers_the_question_that_is_shown_and_the_next_one_comes() -> None:
     asking = picture(state=State.ASKING, step="wait for an answer", prompt=replace(SPLIT, image=None))
     async with watched(asking) as run:
-        assert "Waits until it is answered" in await run.look()
+        assert "until this is answered" in await run.look()
         await run.press("z", "escape", "g")
         assert [call for call in run.engine.calls if call.startswith("answer")] == ["answer 3 g"]
         asking = replace(asking, prompt=replace(SPLIT, question="Is there ink?", number=8))
