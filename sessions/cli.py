@@ -122,8 +122,8 @@ def import_(
     licence: Annotated[str, typer.Option(help="Licence of the photographs, kept in the recording.")] = "",
     origin: Annotated[str, typer.Option(help="Source of the photographs, kept in the recording.")] = "",
     brush: Annotated[str, typer.Option(help="Description of the brush.")] = "",
-    brush_radius_mm: Annotated[float | None, typer.Option(min=0.5, max=50.0, help="Radius in mm; default 6.")] = None,
-    brush_length_mm: Annotated[float | None, typer.Option(min=5.0, max=500.0, help="Length in mm; default 48.")] = None,
+    brush_radius_mm: Annotated[float, typer.Option(min=0.5, max=50.0, help="Radius R of the brush, in mm.")] = 6.0,
+    brush_length_mm: Annotated[float, typer.Option(min=5.0, max=500.0, help="Length L of the brush, in mm.")] = 48.0,
     simulated: Annotated[bool, typer.Option("--simulated", help="The ink was simulated; reports say so.")] = False,
 ) -> None:
     """Turn a folder of photographs with a parameter table into a session that every later command accepts."""
@@ -137,4 +137,5 @@ def import_(
     with shown() as progress:
         software = f"brushloop {version('brushloop')}"
         path = import_photographs(folder, csv, target, options, software, time.time_ns, progress=progress)
-    say(f"Imported into {path}", f"Next: brushloop analyse {path.parent}")
+    size = f"Brush: R = {brush_radius_mm:g} mm, L = {brush_length_mm:g} mm (--brush-radius-mm, --brush-length-mm)"
+    say(f"Imported into {path}", *([size] if kind == "press" else []), f"Next: brushloop analyse {path.parent}")

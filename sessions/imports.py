@@ -44,9 +44,9 @@ class ImportOptions:
     licence: str = ""
     origin: str = ""
     brush: str = ""
-    brush_radius_mm: float | None = None
-    """R and L of the bundle, for the models of presses; None for the paper's nominal brush."""
-    brush_length_mm: float | None = None
+    brush_radius_mm: float = 6.0
+    """R and L of the bundle, for the models of presses; the paper's nominal brush by default."""
+    brush_length_mm: float = 48.0
     simulated: bool = False
     """Declares that the ink was simulated; every report says so."""
 
@@ -65,7 +65,7 @@ def import_photographs(
     if not folder.is_dir():
         raise InputError(folder, "is not a folder of photographs")
     if out.exists():
-        raise InputError(out, "exists already; recordings are never overwritten")
+        raise InputError(out, "exists already and is not overwritten: name another folder with --out")
     if not SESSION_ID.fullmatch(out.name):
         raise InputError(out, "a session's name is letters, digits, '.', '_' and '-', at most 100 of them")
     rows = _read_table(folder.resolve(), table, options)
@@ -74,8 +74,8 @@ def import_photographs(
         source=Source.IMPORT_SIMULATED if options.simulated else Source.IMPORT,
         software=software,
         brush=options.brush,
-        brush_radius_mm=options.brush_radius_mm,
-        brush_length_mm=options.brush_length_mm,
+        brush_radius_mm=options.brush_radius_mm if options.kind == "press" else None,
+        brush_length_mm=options.brush_length_mm if options.kind == "press" else None,
         protocol=f"import of {len(rows)} {options.kind} strokes",
         licence=options.licence,
         origin=options.origin or f"{folder.resolve().name}, {table.name}",

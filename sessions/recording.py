@@ -141,9 +141,7 @@ def find_recording(path: Path, state: RunState | None = None) -> Path:
     if not path.is_dir():
         raise InputError(path, "no such session: give a session's folder or its .mcap file")
     if (path / JOURNAL_NAME).is_file():
-        raise InputError(
-            path, f"has lost its recording {found.name}: `brushloop sessions repair {path}` writes it again"
-        )
+        raise InputError(path, f"has lost its recording {found.name}: `brushloop sessions repair {path}` rebuilds it")
     inside = sorted(one for one in path.iterdir() if (one / JOURNAL_NAME).is_file() or any(one.glob("*.mcap")))
     if inside:
         raise InputError(path, f"is not a session but holds {len(inside)} of them: give one, such as {inside[0]}")

@@ -60,14 +60,15 @@ def details(path: Path) -> Details:
     """Describe a session's folder or an MCAP file. Raises `InputError`, `SessionDamaged`."""
     if (path / JOURNAL_NAME).is_file():
         check_path(path)
-        return _of_journal(path.resolve())
-    recording = Recording(path)
-    shown = Details(recording.header.session_id, "recording", recording.header)
-    pressed = [(stroke.depth_mm, stroke.tilt_deg) for stroke in recording.stroke_records()]
-    shown.strokes = len(pressed)
-    shown.conditions, _ = _conditions(pressed, recording.header)
-    shown.messages = dict(recording.counts)
-    shown.file = recording.path.name
+        shown = _of_journal(path.resolve())
+    else:
+        mcap = Recording(path)
+        pressed = [(stroke.depth_mm, stroke.tilt_deg) for stroke in mcap.stroke_records()]
+        shown = Details(mcap.header.session_id, "recording", mcap.header, strokes=len(pressed), file=mcap.path.name)
+        shown.conditions, _ = _conditions(pressed, mcap.header)
+        shown.messages = dict(mcap.counts)
+    if (verdict := path / "validation" / "verdict.txt").is_file():
+        shown.verdict = f"{read_bounded(verdict).decode(errors='replace').strip()} (validation/report.html)"
     return shown
 
 
@@ -87,10 +88,7 @@ def _of_journal(folder: Path) -> Details:
     shown.strokes, shown.marked_bad = len(pressed), len(kept) - len(pressed)
     shown.conditions, shown.planned = _conditions([(one.depth_mm, one.tilt_deg) for one in pressed], header)
     shown.repairs = [f"{repair.event} {repair.file}: {repair.why}" for repair in state.repairs]
-    if (verdict := folder / "validation" / "verdict.txt").is_file():
-        shown.verdict = f"{read_bounded(verdict).decode(errors='replace').strip()} (validation/report.html)"
-    final = merged_file(folder, state)
-    if state.closed is not None and final.is_file():
+    if state.closed is not None and (final := merged_file(folder, state)).is_file():
         shown.file = final.name
     return shown
 
@@ -160,10 +158,8 @@ def _summary(folder: Path) -> Summary | None:
     if not merged_file(folder, state).is_file():
         return None
     recording = Recording(folder)
-    state_name = "imported" if recording.header.source.imported else "closed"
-    return Summary(
-        folder.name, state_name, recording.header.source, recording.counts[Topic.STROKE], recording.path.name
-    )
+    named = "imported" if recording.header.source.imported else "closed"
+    return Summary(folder.name, named, recording.header.source, recording.counts[Topic.STROKE], recording.path.name)
 
 
 def renderables(details: Details) -> Iterator[RenderableType]:
@@ -196,8 +192,7 @@ def _facts(details: Details) -> Table:
         if value := getattr(details.header, name):
             table.add_row(name.replace("_", " "), value)
     table.add_row("recorded by", f"{details.header.software}, schema {details.header.schema_version}")
-    messages = ", ".join(f"{count} {topic}" for topic, count in sorted(details.messages.items()))
-    table.add_row("messages", messages or "none")
+    table.add_row("messages", ", ".join(f"{n} {topic}" for topic, n in sorted(details.messages.items())) or "none")
     if details.file:
         table.add_row("recording", details.file)
     return table

@@ -6,7 +6,9 @@ The progress of long work is a bar on stderr, where that is a terminal.
 from __future__ import annotations
 
 import re
+import shutil
 import sys
+import textwrap
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TypeVar
@@ -33,8 +35,6 @@ def plain(text: str, *, keep: str = "") -> str:
 
     Line ends are escaped as well, so that a name cannot fake a new line. `keep` lists characters left as they are.
     """
-    if text.isprintable():
-        return text
     return _ACTED_ON.sub(lambda found: found[0] if found[0] in keep else _escaped(found[0]), text)
 
 
@@ -44,12 +44,19 @@ def inert(text: str) -> str:
 
 
 def say(*parts: object, err: bool = False) -> None:
-    """Print each part: a string as one line, anything else (a table) as rich lays it out, without markup."""
+    """Print each part: a string as one line, anything else (a table) as rich lays it out, without markup.
+
+    A terminal shows a long line broken between words, but commands (`$ ...`) and JSON as they are, to be copied.
+    """
+    stream = sys.stderr if err else sys.stdout  # None where it is closed
+    wide = shutil.get_terminal_size().columns if stream and stream.isatty() else sys.maxsize
     for part in parts:
-        if isinstance(part, str):
-            typer.echo(plain(part), err=err)  # noqa: TID251 - the one place
-        else:
+        if not isinstance(part, str):
             plain_console(stderr=err).print(part)
+            continue
+        if len(line := plain(part)) > wide and not line.startswith(("$ ", "{")):
+            line = textwrap.fill(line, wide, break_long_words=False, break_on_hyphens=False)
+        typer.echo(line, err=err)  # noqa: TID251 - the one place
 
 
 def text_of(parts: Iterable[object], columns: int) -> str:

@@ -64,7 +64,7 @@ def test_presses_become_a_session_like_any_other(make, rows, out, run):
     [
         ({"brush_radius_mm": 4.0, "brush_length_mm": 31.0}, {"brush_radius_mm": 4.0, "brush_length_mm": 31.0}),
         ({"simulated": True}, {"source": Source.IMPORT_SIMULATED}),
-        ({}, {"origin": "photos, table.csv", "source": Source.IMPORT, "brush_radius_mm": None}),
+        ({}, {"origin": "photos, table.csv", "source": Source.IMPORT, "brush_radius_mm": 6.0}),
     ],
 )
 def test_the_header_holds_what_was_given(rows, out, run, options, fields):
