@@ -146,8 +146,7 @@ def _trust(file: GeneratorFile, checks: NDArray[np.float64]) -> Iterator[Point]:
     if file.config.tuning:
         yield Point(None, "The generator was tuned on captures: others of the same kind are no independent test.")
     else:
-        words = "The generator has seen no real ink, so on paper it is no better than the closed-form model it learned."
-        yield Point(None, words)
+        yield Point(None, "The network saw no real ink: on paper it equals at best the closed-form model it learned.")
     if len(checks) > 1:
         last, lowest = checks[-1], checks[np.argmin(checks[:, 1])]
         if last[1] > MUCH_ABOVE * lowest[1]:

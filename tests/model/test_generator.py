@@ -232,7 +232,7 @@ def test_the_command_leaves_generator_card_and_page_that_say_that_there_is_no_in
     assert left == files | {f"pictures/step-{step:07d}.png" for step in (15, 30)}
     card = (finished / "generator.md").read_text()
     assert "H from 11 to 20 mm, alpha from 0 to 10 deg" in card
-    assert "The generator has seen no real ink" in card
+    assert "The network saw no real ink" in card
     assert "30 steps of 16, seed 0, highest rate 0.005: all steps done" in card
     page = (finished / "training.html").read_text(encoding="utf-8")
     assert page.count('alt="network: depth_mm ') == 12

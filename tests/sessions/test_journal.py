@@ -102,7 +102,7 @@ def test_what_happened_to_lines_is_named(path, change, expected):
 
 
 def test_a_step_that_is_done_twice_is_damage(path):
-    with pytest.raises(SessionDamaged, match="its step was done already"):
+    with pytest.raises(SessionDamaged, match="had done the same step before"):
         replay(written(path, BEGIN, DONE, DONE))
 
 
