@@ -148,7 +148,7 @@ class Run(RunContext):
         try:
             await self.perform(touch)
         except (StepError, DeviceError) as error:
-            self.progress.log(f"zero touch by jog: {error} The previous height of the paper is kept.", warning=True)
+            self.progress.log(f"the previous height of the paper is kept: zero touch by jog: {error}", warning=True)
             if arm_at_fault(error):
                 await self._ask(error)
         await self._retreat()
