@@ -30,6 +30,8 @@ from brushloop.sessions.terminal import Progress, counted, unseen
 
 MOVED_PX = 0.5
 """Median distance of the board's corners from where they were before, above which camera or board was touched."""
+MANY_OUT = 0.02
+"""Share of corners off the plane above which the board may be bent; the fit refuses a tenth."""
 LEAST_PX_PER_MM = 4.0
 """Below this a tip of 0.5 mm is two pixels wide."""
 WORST_INTERVAL = 5e-4
@@ -182,7 +184,9 @@ def _trust(calibration: Calibration, moved: Sequence[str]) -> Iterator[Point]:
     sharp = 1.0 / calibration.mm_per_px
     yield Point(sharp >= LEAST_PX_PER_MM, f"The image has {sharp:.1f} px/mm; at least {LEAST_PX_PER_MM:g} are needed.")
     out = calibration.corners_dropped
-    yield Point(not out, f"Corners left out because they do not lie on the plane of the others: {out}.")
+    usual = "a few, as under the edge of the sheet, are usual" if out <= MANY_OUT * (out + calibration.corners) else ""
+    words = f"{out} of {out + calibration.corners} corners do not lie on the plane of the others and are left out"
+    yield Point(True if not out else None if usual else False, f"{words}: {usual or 'is the board flat?'}.")
     if calibration.lens.source == FITTED:
         yield Point(None, "No lens file: k1 was fitted on this one board, and is known only where corners were seen.")
     for problem in (*calibration.flags, *moved):

@@ -12,23 +12,15 @@ from dataclasses import MISSING, dataclass, field, fields
 from importlib import import_module
 from inspect import Parameter, Signature
 from pathlib import Path
-from typing import Annotated, Any, Protocol, TypeVar, get_args, get_origin, get_type_hints, runtime_checkable
+from typing import Annotated, Any, Protocol, TypeVar, get_args, get_origin, get_type_hints
 
 from typer import Argument, Option
 from typer.core import TyperGroup
 
+from brushloop.calibrate.errors import StrokesLeftOut
 from brushloop.sessions.terminal import Progress, say, shown
 
 Request = TypeVar("Request")
-
-
-@runtime_checkable
-class Checked(Protocol):
-    """A result that may fall short of what was asked."""
-
-    def check(self) -> None:
-        """Raise an error with an exit code if it does, once everything is written and printed."""
-        ...
 
 
 class Printable(Protocol):
@@ -47,12 +39,18 @@ def show_work(work: Callable[[Request, Progress], Result], request: Request) -> 
     with shown() as progress:
         result = work(request, progress)
     say(*result.lines())
-    if isinstance(result, Checked):
-        result.check()
     return result
 
 
-def command(request: type[Any], work: str, carry_out: Callable[[Any, Any], object] = show_work) -> Callable[..., None]:
+def finish(work: Callable[[Request, Progress], Printable], request: Request) -> None:
+    """Do `show_work`; then the result's `check`, if any, may raise, and `StrokesLeftOut` is raised if it names some."""
+    result = show_work(work, request)
+    getattr(result, "check", bool)()
+    if left_out := getattr(result, "left_out", ()):
+        raise StrokesLeftOut(f"finished, but {len(left_out)} strokes could not be used and were left out")
+
+
+def command(request: type[Any], work: str, carry_out: Callable[[Any, Any], object] = finish) -> Callable[..., None]:
     """A command that fills a request and carries out `work` on it, a function of brushloop as `module:name`."""
 
     def run(**options: Any) -> None:

@@ -7,7 +7,7 @@ InputError                  of `brushloop.sessions`
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from brushloop.sessions.errors import InputError
 
@@ -29,6 +29,12 @@ def invalid(where: str, error: ValidationError) -> CalibrationError:
     field = ".".join(map(str, first["loc"]))
     message = PLAIN.get(first["type"], first["msg"])
     return CalibrationError(where, f"{field}: {message}" if field else message)
+
+
+class StrokesLeftOut(Exception):
+    """Strokes could not be used, and are named in what was printed; everything else is done and written."""
+
+    exit_code: ClassVar[int] = 3
 
 
 class CaptureRefused(CalibrationError):

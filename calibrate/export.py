@@ -10,13 +10,12 @@ from __future__ import annotations
 
 import importlib
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from brushloop.calibrate.commands import ExportRequest
 from brushloop.calibrate.errors import CaptureRefused
+from brushloop.calibrate.files import Written
 from brushloop.calibrate.notebook import RecordedPress, Session
 from brushloop.calibrate.presses import Refused
 from brushloop.calibrate.stats import odd_waits
@@ -32,31 +31,7 @@ PATCH_COLUMNS = ("cell_x_mm", "cell_y_mm", "cell_width_mm", "cell_height_mm")
 Row = dict[str, Any]
 
 
-class StrokesLeftOut(Exception):
-    """Strokes could not be cropped; everything else is exported."""
-
-    exit_code: ClassVar[int] = 3
-
-
-@dataclass(frozen=True, slots=True)
-class Exported:
-    """The folder of an export, and the strokes that could not be cropped."""
-
-    out: Path
-    left_out: Sequence[Refused]
-
-    def lines(self) -> Iterator[str]:
-        """What the command prints."""
-        yield f"Exported into {self.out}"
-        yield from (f"left out: {stroke_id}: {reason}" for stroke_id, reason in self.left_out)
-
-    def check(self) -> None:
-        """Raises `StrokesLeftOut` if any stroke is."""
-        if self.left_out:
-            raise StrokesLeftOut(f"{len(self.left_out)} strokes could not be cropped and are left out")
-
-
-def export(request: ExportRequest, progress: Progress = unseen) -> Exported:
+def export(request: ExportRequest, progress: Progress = unseen) -> Written:
     """Export a session into a new or empty folder, with tables as `csv` or `parquet`.
 
     With `crops`, every photograph is replaced by a crop and its mask, by the calibration in use. Raises `InputError`
@@ -96,7 +71,8 @@ def export(request: ExportRequest, progress: Progress = unseen) -> Exported:
             (stage / "header.json").write_text(json.dumps(header, indent=2, ensure_ascii=False) + "\n", "utf-8")
     except OSError as error:
         raise disk_error(out, "cannot write", error) from error
-    return Exported(out, left_out)
+    named = (f"left out: {stroke_id}: {reason}" for stroke_id, reason in left_out)
+    return Written(out, (f"Exported into {out}", *named), left_out)
 
 
 def _write_pictures(

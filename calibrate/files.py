@@ -25,6 +25,8 @@ class Written:
 
     path: Path
     said: Sequence[object]
+    left_out: Sequence[tuple[str, str]] = ()
+    """Strokes that could not be used, and why."""
 
     def lines(self) -> Sequence[object]:
         """What the command prints: lines and tables."""

@@ -169,7 +169,7 @@ def compare(request: CompareLoopRequest, progress: Progress = unseen) -> Written
     for key in KEYS:
         parts = "; ".join(f"{row.model} {row.csim.avg:.2f} / {row.ssim.avg:.2f}" for row in record.rows(key))
         said.append(f"{key[0]}, {key[1]}, CSIM / SSIM: {parts}")
-    return Written(page, (*said, record.answer.text, f"Report:  {page}"))
+    return Written(page, (*said, record.answer.text, f"Report:  {page}"), refused)
 
 
 def pair_up(
@@ -181,9 +181,8 @@ def pair_up(
     for press in repetitions:
         name, original = press.stroke.stroke_id, by_name.get(press.stroke.again_of or "")
         if original is None:
-            refused.append(
-                (name, f"repeats {press.stroke.again_of or 'no stroke'}, of which no usable original exists")
-            )
+            of = press.stroke.again_of or "no stroke"
+            refused.append((name, f"repeats {of}, of which no usable original exists"))
             continue
         try:
             images = simulated(model, press.condition.depth_mm, press.condition.tilt_deg)

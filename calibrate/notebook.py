@@ -272,9 +272,10 @@ def analyse(request: AnalyseRequest, progress: Progress = unseen) -> Written:
     session, recording, said = request.session, Recording(request.session), list[object]()
     if not recording.header.source.imported:
         said += calibrated.calibrate_session(CalibrateRequest(session), progress, recording).lines()
-    said += fit_strokes(FitRequest(session), progress, recording).lines()
+    fitted = fit_strokes(FitRequest(session), progress, recording)
     validated = compare_models(ValidateRequest((session,)), progress, [recording])
-    return Written(validated.page, (*said, *validated.lines()))
+    left_out = max(fitted.left_out, validated.left_out, key=len)
+    return Written(validated.page, (*said, *fitted.lines(), *validated.lines()), left_out)
 
 
 def _path(session: Place) -> Path:

@@ -31,6 +31,7 @@ from brushloop.calibrate.report import source_label
 from brushloop.calibrate.session import Calibration, OpenSession, open_session
 from brushloop.calibrate.stroke.preprocess import (
     BACKGROUND_MM,
+    NOT_IN_FIELD,
     PX_PER_MM,
     Gray,
     Measured,
@@ -150,7 +151,7 @@ def read_for_fit(place: Path | Recording, progress: Progress = unseen) -> tuple[
     Raises `CalibrationError` where it holds none, or was not calibrated.
     """
     session, refused = open_session(place, "press"), list[Refused]()
-    usable = list(read_presses(session, refused, uncommanded, cut, beside_touch, progress=progress))
+    usable = list(read_presses(session, refused, uncommanded, beside_touch, cut, progress=progress))
     if not usable:
         why = ", first: {} {}".format(*refused[0]) if refused else ""
         raise CalibrationError(str(session.recording.path), f"holds no press that can be used for a fit{why}")
@@ -258,7 +259,7 @@ def _cropped(prepared: Prepared, anchor_px: tuple[float, float]) -> Prepared:
     window = slice(top + side, top + 2 * side), slice(left + side, left + 2 * side)
     mask, soft = (np.pad(part, side)[window] for part in (prepared.mask, prepared.soft))
     if not mask.any():
-        raise CaptureRefused("anchor", "lies so far from the stroke that none of the stroke is in the field")
+        raise CaptureRefused("anchor", NOT_IN_FIELD)
     cut = prepared.cut or bool(np.count_nonzero(mask) < np.count_nonzero(prepared.mask))
     return replace(prepared, mask=mask, soft=soft, anchor_px=(anchor_px[0] - left, anchor_px[1] - top), cut=cut)
 

@@ -79,7 +79,7 @@ class Recovered:
     model: str
     rows: list[Row]
     """One for each recovered press."""
-    refused: list[Refused]
+    left_out: list[Refused]
     """(stroke, reason) of each press that was not recovered."""
     out: Path
 
@@ -118,7 +118,7 @@ class Recovered:
                 yield f"warning: {vague} presses do not determine {name}: intervals cover most of the commanded range"
         if 2 * (bound := self._flagged(Flag.AT_BOUND)) > many:
             yield f"warning: {bound} presses lie at a limit of H or alpha: first fit this brush (`brushloop fit`)"
-        for stroke_id, why in self.refused:
+        for stroke_id, why in self.left_out:
             yield f"not used: {stroke_id}: {why}"
         yield str(self.out)
         yield str(self.protocol)

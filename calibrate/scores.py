@@ -141,10 +141,11 @@ def statistics(
         summary = summarise(values, groups)
         if summary is not None and model == CEILING:
             return replace(summary, max=None, min=None, median=None)
-        below = None if top is None else summarise(top - values, groups)
-        if summary is None or below is None:
+        if summary is None or top is None or (below := summarise(top - values, groups)) is None:
             return summary
-        return replace(summary, below_ceiling=below.avg, below_interval=below.avg_interval)
+        avg = round(float(values[np.isfinite(top - values)].mean()), 6)
+        summary = replace(summary, below_ceiling=below.avg, below_interval=below.avg_interval)
+        return replace(summary, below_n=below.n, below_avg=avg)
 
     for k, (alignment, tone) in enumerate(KEYS):
         csim, ssim = (summary(percent[:, k, j], None if ceiling is None else ceiling[:, k, j]) for j in (0, 1))

@@ -1,15 +1,11 @@
 """Statistics: summaries with intervals, paired tests, the ceiling, and odd waits.
 
-Equal scores give equal numbers.
-
 The ceiling is the score of a perfect model, that is of the best image of each condition on a fresh press of it.
-Presses of a condition stray from each other. Two of them differ by the strays of both, a press and the best image only
-by those of one.
-Strays displace the edges of a mark, and what a score loses grows with the distance between two edges. If the strays are
-independent from press to press and about normal, their mean distance is sqrt 2 times that of one press from the best
-image. So the ceiling is 100 - (100 - pairs) / sqrt 2, where `pairs` is the mean score of two presses of a condition in
-percent: a U-statistic, which two presses of each condition suffice for. No template takes its place: one of a few
-presses has strays of its own.
+Two presses differ by the strays of both, a press and the best image only by those of one. Strays displace the edges of
+a mark, and what a score loses grows with the distance between two edges. If the strays are independent from press to
+press and about normal, their mean distance is sqrt 2 times that of one press from the best image. So the ceiling is 100
+- (100 - pairs) / sqrt 2, where `pairs` is the mean score of two presses of a condition in percent: a U-statistic, which
+two presses of each condition suffice for.
 """
 
 from __future__ import annotations
@@ -67,6 +63,9 @@ class Summary:
     below_ceiling: float | None = None
     """Points below the ceiling; None where no condition was pressed twice."""
     below_interval: Interval | None = None
+    below_n: int = 0
+    below_avg: float | None = None
+    """Number and average of the scores that have a ceiling: those of conditions that were pressed twice."""
 
     @property
     def range_and_avg(self) -> tuple[float | None, float | None, float]:
@@ -144,8 +143,8 @@ def ceiling_values(pairs: Floats, groups: Integers) -> Floats:
 
 
 def is_near(below: float, interval: Interval | None, points: float = NEAR_POINTS) -> bool | None:
-    """Whether a model is at most `points` below the ceiling; None where the interval of the difference holds both."""
-    low, high = interval if interval is not None else (below, below)
+    """Whether a model is at most `points` below the ceiling, in tenths as printed; None where both are possible."""
+    low, high = (round(end, 1) for end in interval or (below, below))
     return None if low <= points < high else high <= points
 
 

@@ -68,7 +68,8 @@ def tune(request: TuneRequest, progress: Progress = unseen) -> Written:
     config = captures.config(steps=steps, learning_rate=request.learning_rate, validate_every=max(1, steps // 20))
     written = _trained(config, request.out, progress, captures)
     used = f"{len(captures.images)} presses ({captures.source})"
-    return Written(written.path, (*(f"left out: {name}: {why}" for name, why in left_out), used, *written.said))
+    said = (*(f"left out: {name}: {why}" for name, why in left_out), used, *written.said)
+    return Written(written.path, said, left_out)
 
 
 def captures_of(sessions: Sequence[OpenSession], generator: Path) -> tuple[Captures, list[Refused]]:

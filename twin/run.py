@@ -125,7 +125,7 @@ def twin(request: TwinRequest, progress: Progress = unseen) -> Written:
     said = [f"{source_note(header.source, header.brush)}; twin of {len(presses)} presses"]
     said += (f"left out: {name}: {why}" for name, why in refused)
     said += (*lines, f"Twin: {target}", f"next: brushloop sim --brush {quote(str(target))}")
-    return Written(target, said)
+    return Written(target, said, refused)
 
 
 class TwinStopped(Exception):

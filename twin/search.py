@@ -246,11 +246,7 @@ def fit_spread(
     off = partial(_off_statistics, spec, place, tuple(repeats), grid, statistics(captured, grid), sd)
     low, high = np.array([one.bounds for one in SPREAD]).T
     best = least_squares(
-        off,
-        start,
-        jac=lambda point: derivatives(off, point, high, workers),
-        bounds=(low, high),
-        max_nfev=SPREAD_STEPS,
+        off, start, jac=lambda point: derivatives(off, point, high, workers), bounds=(low, high), max_nfev=SPREAD_STEPS
     )
     twin = _drawn(spec, place, tuple(repeats), grid, best.x)
     jacobian = np.asarray(best.jac, np.float64)

@@ -271,7 +271,7 @@ def fit_session(request: FitRequest, progress: Progress = unseen) -> Written:
     else:
         artefact = adapt_drags(drags, before, request.strokes or len(drags.placed))
     path = put_to_use(artefact, drags.session.recording.path.parent, FOLDER)
-    return Written(path, (*fit_lines(drags, artefact), f"Fit: {path}"))
+    return Written(path, (*fit_lines(drags, artefact), f"Fit: {path}"), drags.left_out)
 
 
 def fit_lines(drags: Drags, artefact: DragArtefact) -> Iterator[Any]:

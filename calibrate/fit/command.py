@@ -134,7 +134,7 @@ class FitResult:
 
     session: OpenSession
     presses: Presses
-    refused: list[Refused]
+    left_out: list[Refused]
     """Presses that cannot be used or are cut by the edge of their photograph."""
     fit: BrushFit
     """The contents of the file."""
@@ -156,7 +156,7 @@ class FitResult:
         header = self.session.header
         label = source_label(header.source, [header.brush])
         yield f"{source_note(header.source, header.brush)}; {len(self.presses)} presses fitted"
-        for name, why in self.refused:
+        for name, why in self.left_out:
             yield f"left out: {name}: {why}"
         if self.sizes:
             title = f"sizes of the marks with 95 % intervals ({label})"
@@ -239,7 +239,7 @@ def _write_page(result: FitResult, press: FittedPress) -> None:
         measured=result.sizes,
         middle="{:g} mm, {:g}°".format(*presses.middle),
         held_out=result.held_out,
-        refused=result.refused,
+        refused=result.left_out,
         px_mm=presses.grid.px_mm,
         provenance=(("fitted with", made_by()), ("artefact", result.path.name)),
     )
@@ -315,5 +315,6 @@ def _trust(result: FitResult) -> Iterator[Point]:
     else:
         span = "" if csim.below_interval is None else " (95 % {:.1f} to {:.1f})".format(*csim.below_interval)
         words = f"On held-out presses the fit is {csim.below_ceiling:.1f} points of CSIM{span} below the ceiling"
+        words += f", over the {csim.below_n} of {csim.n} presses that have one" if csim.below_n < csim.n else ""
         yield Point(is_near(csim.below_ceiling, csim.below_interval), f"{words}; {NEAR_POINTS:g} or less is near.")
     yield Point(None, "The pictures above show presses that were fitted; judge the fit by the held-out scores.")

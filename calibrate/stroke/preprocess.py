@@ -41,6 +41,7 @@ PAPER_ABOVE = 0.85
 """Share of the fitted light above which a pixel counts as paper."""
 MIN_WINDOW_PX = 40
 GATE_MM2 = 1.0
+NOT_IN_FIELD = "shows no ink near its touch point: an import needs the right start_x_px and start_y_px"
 SATURATED = 254
 MOST_SATURATED = 0.5
 OTHER_MM2 = 2.0
@@ -77,11 +78,7 @@ def rescale(image: Gray, px_per_mm: tuple[float, float], where: str) -> Gray:
 
 
 def cut_out(
-    image: Gray,
-    point_px: tuple[float, float],
-    px_per_mm: tuple[float, float],
-    reach_mm: Rect,
-    where: str,
+    image: Gray, point_px: tuple[float, float], px_per_mm: tuple[float, float], reach_mm: Rect, where: str
 ) -> tuple[Gray, tuple[float, float]]:
     """The part of a photograph that reaches so far from a point to the left, top, right and bottom; the point in it.
 
@@ -92,7 +89,7 @@ def cut_out(
     last = max(0, math.ceil(y + bottom * px_per_mm[1])), max(0, math.ceil(x + right * px_per_mm[0]))
     part = image[row : last[0], column : last[1]]
     if not part.size:
-        raise CaptureRefused(where, "anchor lies so far from the stroke that none of the stroke is in the field")
+        raise CaptureRefused(where, NOT_IN_FIELD)
     return part, (x - column, y - row)
 
 

@@ -79,6 +79,11 @@ class ValidationOutput:
         yield from self.notes
         yield f"Report: {self.page}"
 
+    @property
+    def left_out(self) -> Sequence[tuple[str, str]]:
+        """Strokes that could not be used."""
+        return self.report.lost if self.report else self.drags.drags.refused if self.drags else ()
+
     def check(self) -> None:
         """Check the gates, once the report is written. Raises `GateMissed` if any is missed."""
         if self.gates and self.report is None:

@@ -33,7 +33,7 @@ from brushloop.calibrate.report import (
     source_point,
 )
 from brushloop.calibrate.scores import MEASURES, Stat
-from brushloop.calibrate.stats import CEILING, NEAR_POINTS, Floats, Interval, Summary, is_near
+from brushloop.calibrate.stats import CEILING, NEAR_POINTS, Floats, Summary, is_near
 from brushloop.calibrate.validate.run import BEZIER_REFITTED, FITTED_HELD_OUT, HELD_OUT, PRESSES, ModelInfo, Outcome
 from brushloop.calibrate.validate.tables import (
     NORMAL,
@@ -102,6 +102,7 @@ def page_of(
         strict=STRICT,
         normal=NORMAL,
         headline=list(headline(report)),
+        part=part_with_ceiling(_csim(report, report.shown)),
         scores=[(key, _scores(report, key)) for key in KEYS],
         condition_columns=[model for name in CONDITION_COLUMNS if (model := report.model(name)) is not None],
         conditions=outcome.scores.conditions() if report.conditions else {},
@@ -257,34 +258,47 @@ def measured(report: Report) -> str:
 
 
 def headline(report: Report) -> Iterator[tuple[str, float]]:
-    """Name and average CSIM, in percent, of CCD-BSM as published, of the model shown, and of a perfect model."""
-    shown = "" if report.shown == "ccd-bsm" else report.shown
-    names = {"ccd-bsm": "CCD-BSM as published", shown: _label(report, shown), CEILING: "a perfect model (the ceiling)"}
-    for name, label in names.items():
+    """Name and average CSIM in percent of CCD-BSM, the model shown and the ceiling, over the presses that have one."""
+    csim = None
+    for name in dict.fromkeys(("ccd-bsm", report.shown)):
         if (csim := _csim(report, name)) is not None:
-            yield label, csim.avg
+            yield "CCD-BSM as published" if name == "ccd-bsm" else _label(report, name), csim.below_avg or csim.avg
+    if csim is not None and csim.below_avg is not None and csim.below_ceiling is not None:
+        yield "a perfect model (the ceiling)", csim.below_avg + csim.below_ceiling
+
+
+def part_with_ceiling(csim: Summary | None) -> str:
+    """The presses that headline and verdict are about, where they are not all."""
+    if csim is None or csim.below_n in (0, csim.n):
+        return ""
+    return f"over the {csim.below_n} of {csim.n} presses whose condition was pressed more than once"
 
 
 def verdict(report: Report) -> str:
     """Whether, and how well, the model shown predicts; empty where none was compared."""
-    csim, top = _csim(report, report.shown), _csim(report, CEILING)
+    csim = _csim(report, report.shown)
     if csim is None:
         return ""
+    part = f" ({part})" if (part := part_with_ceiling(csim)) else ""
     unseen = " from conditions that it has not seen" if report.shown == FITTED_HELD_OUT else ""
-    says = f"{_label(report, report.shown)} predicts presses{unseen} with an average CSIM of {csim.avg:.1f} %"
-    if top is None or csim.below_ceiling is None:
-        return f"{says}."
-    answer = ANSWERS[is_near(csim.below_ceiling, csim.below_interval)]
-    below = f"{csim.below_ceiling:.1f} points{_span(csim.below_interval)} below the ceiling of {top.avg:.1f} %"
-    return f"{answer}: {says}, {below}; the goal is {NEAR_POINTS:g} points or less."
+    avg = csim.avg if csim.below_avg is None else csim.below_avg
+    says = f"{_label(report, report.shown)} predicts presses{unseen} with an average CSIM of {avg:.1f} %{part}"
+    if csim.below_ceiling is None:
+        return f"It cannot be said, because no condition was pressed twice and so there is no ceiling. {says}."
+    top = avg + csim.below_ceiling
+    below = round(top, 1) - round(avg, 1)  # so that the printed numbers add up
+    span = "" if csim.below_interval is None else " (95 % interval: {:.1f} to {:.1f})".format(*csim.below_interval)
+    return (
+        f"{ANSWERS[is_near(below, csim.below_interval)]}: {says}, {below:.1f} points{span} below the ceiling of "
+        f"{top:.1f} %; the goal is {NEAR_POINTS:g} points or less."
+    )
 
 
 def trust(report: Report) -> Iterator[Point]:
     """Points to check before trusting the numbers."""
     yield source_point(report.source)
     strokes = sum(s.strokes for s in report.sessions)
-    lost = len({(r.session_id, r.stroke_id) for r in report.refused if "does not predict it" not in r.why})
-    if lost:
+    if lost := len(report.lost):
         words = f"{lost} of {strokes} strokes could not be used; each is named below, with the reason."
         yield Point(lost <= MUCH_REFUSED * strokes, words)
     else:
@@ -292,7 +306,11 @@ def trust(report: Report) -> Iterator[Point]:
     for session in report.sessions:
         for point in _session(session):
             yield Point(point.good, f"{session.header.session_id}: {point.text}")
-    yield from _models(report)
+    if _csim(report, CEILING) is None:
+        words = "No condition was pressed twice: the repeatability of the brush is unknown, and there is no ceiling."
+        yield Point(False, words)
+    if _csim(report, FITTED_HELD_OUT) is None:
+        yield Point(None, "No model was calibrated to this brush: run “brushloop fit”, then validate again.")
     for loop in report.loops:
         yield loop.answer
 
@@ -324,22 +342,9 @@ def _session(session: Session) -> Iterator[Point]:
         yield Point(2.0 * scale.relative_reach <= WIDE_SCALE, words)
 
 
-def _models(report: Report) -> Iterator[Point]:
-    """Whether there is a ceiling, and a calibrated model."""
-    if _csim(report, CEILING) is None:
-        words = "No condition was pressed twice: the repeatability of the brush is unknown, and there is no ceiling."
-        yield Point(False, words)
-    if _csim(report, FITTED_HELD_OUT) is None:
-        yield Point(None, "No model was calibrated to this brush: run “brushloop fit”, then validate again.")
-
-
 def _csim(report: Report, model: str) -> Summary | None:
     stat = report.stat(model, STRICT)
     return None if stat is None else stat.csim
-
-
-def _span(interval: Interval | None) -> str:
-    return "" if interval is None else " (95 % interval: {:.1f} to {:.1f})".format(*interval)
 
 
 def _label(report: Report, name: str) -> str:
@@ -362,7 +367,8 @@ def terminal_lines(report: Report) -> Iterator[object]:
     for point in trust(report):
         yield f"{'•' if point.good is None else '✓' if point.good else '✗'} {point.text}"
     for press in report.refused[:MAX_REFUSED_IN_TERMINAL]:
-        yield f"not used: {press.session_id} {press.stroke_id}: {press.why}"
+        used = "not used" if press[:2] in report.lost else "used, but not by every model"
+        yield f"{used}: {press.session_id} {press.stroke_id}: {press.why}"
     if len(report.refused) > MAX_REFUSED_IN_TERMINAL:
         yield f"and {len(report.refused) - MAX_REFUSED_IN_TERMINAL} more, in the report"
 

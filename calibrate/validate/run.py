@@ -38,7 +38,7 @@ from brushloop.sessions.terminal import Progress, counted, unseen
 if TYPE_CHECKING:
     from brushloop.model.strokes import StrokeModel
 
-PUBLISHED = "as published"
+PUBLISHED, NOT_PREDICTED = "as published", "does not predict this press"
 HELD_OUT = "fitted, held-out conditions"
 PRESSES = "captured presses"
 FITTED_HELD_OUT, BEZIER_REFITTED = "ccd-bsm-heldout", "bezier-refitted"
@@ -284,7 +284,7 @@ def predicted(models: Iterable[Model], at: Condition) -> tuple[dict[str, Pixels]
         try:
             images[model.name] = images_of(*model.mark(at))
         except DomainError as error:
-            refused.append(f"{model.name} does not predict this press: {error}")
+            refused.append(f"{model.name} {NOT_PREDICTED}: {error}")
     return images, refused
 
 

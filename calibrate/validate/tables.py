@@ -40,6 +40,7 @@ from brushloop.calibrate.validate.run import (
     FITTED_HELD_OUT,
     KINDS_OF_PRESS,
     LAMBDAS,
+    NOT_PREDICTED,
     FittedSession,
     ModelInfo,
     Outcome,
@@ -157,6 +158,11 @@ class Report(Sealed):
     def model(self, name: str) -> ModelInfo | None:
         """The model of that name, or None if it has no score."""
         return next((model for model in self.models if model.name == name), None)
+
+    @property
+    def lost(self) -> list[tuple[str, str]]:
+        """Session and name of each stroke that could not be used."""
+        return sorted({press[:2] for press in self.refused if NOT_PREDICTED not in press.why})
 
     @property
     def label(self) -> str:

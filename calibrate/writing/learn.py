@@ -118,7 +118,8 @@ def fit(request: FitFootprintRequest, progress: Progress = unseen) -> Written:
         f"the footprint of {count} strokes on {len(ink)} patches ({artefact.source}) draws them with CSIM "
         f"{csim_percent:.1f} %, ink = 1"
     )
-    return Written(path, (*(f"left out: {stroke_id}: {why}" for stroke_id, why in refused), words, str(path)))
+    said = (*(f"left out: {stroke_id}: {why}" for stroke_id, why in refused), words, str(path))
+    return Written(path, said, refused)
 
 
 def fitted(drawings: Drawings) -> tuple[Footprint, float]:

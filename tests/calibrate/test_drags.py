@@ -218,7 +218,7 @@ def test_real_dragged_strokes_are_all_found_and_follow_their_commands(
     imported = brushloop("sessions", "import", DATA / name, "--csv", table, "--kind", "drag", cwd=tmp_path)
     assert imported.returncode == 0, imported.stderr
     ran = brushloop("validate", tmp_path / "sessions" / name, cwd=tmp_path)
-    assert ran.returncode == 0, ran.stderr
+    assert ran.returncode in (0, 3), ran.stderr
     rows = rows_of(tmp_path / "sessions" / name / "validation" / "measured.csv")
     assert len(rows) == strokes
     for command, correlation in least.items():

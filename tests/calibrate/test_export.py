@@ -15,7 +15,8 @@ from brushloop.__main__ import app
 from brushloop.calibrate.calibrated import calibrate_session
 from brushloop.calibrate.commands import CalibrateRequest, ExportRequest
 from brushloop.calibrate.compare import ANCHOR_MM, field_around
-from brushloop.calibrate.export import StrokesLeftOut, export
+from brushloop.calibrate.errors import StrokesLeftOut
+from brushloop.calibrate.export import export
 from brushloop.calibrate.stats import odd_waits, waits_of
 from brushloop.sessions.disk import as_cell, as_text, number
 from brushloop.sessions.errors import InputError, SessionError

@@ -156,5 +156,5 @@ def test_what_cannot_be_read_has_no_scale_or_starts_outside_its_page_is_refused(
     torn = replace(capture, still_png=capture.still_png[:100]), None
     assert list(presses.prepare_job(torn)) == ["refused"]
     stroke = capture.stroke.model_copy(update={"anchor_px": (9000.0, 150.0)})
-    with pytest.raises(CaptureRefused, match="none of the stroke is in the field"):
+    with pytest.raises(CaptureRefused, match="no ink near its touch point"):
         presses.rectified(replace(capture, stroke=stroke), None)

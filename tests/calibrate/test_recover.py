@@ -79,7 +79,7 @@ def test_a_session_is_inverted_and_can_be_replayed(tmp_path: Path) -> None:
         assert 0 < float(row["depth_sd_mm"]) < 0.2
         assert press.depth_mm == pytest.approx(float(row["depth_mm"]), abs=1e-3)
     few = recovered(tmp_path / "sessions" / "shots", tmp_path, presses=2)  # spread evenly over the session
-    assert ([row.stroke_id for row in few.rows], few.refused) == (["p0", "p1"], [])
+    assert ([row.stroke_id for row in few.rows], few.left_out) == (["p0", "p1"], [])
     said("fit", few.session.recording.path)
     models = [recovered(few.session.recording.path, tmp_path, fit=fit).model for fit in (None, Path("published"))]
     assert models == ["CCD-BSM fitted on shots", "CCD-BSM as published"], "the fit in use, unless told otherwise"

@@ -148,3 +148,5 @@ def test_a_model_is_near_where_the_interval_of_the_difference_says_so() -> None:
     assert is_near(found.avg, found.avg_interval, points=0.9) is None
     assert is_near(found.avg, found.avg_interval, points=0.1) is False
     assert is_near(2.0, None) is False
+    assert is_near(1.0, (0.5, 1.53)) is True, "both ends are printed as within the goal"
+    assert is_near(1.0, (0.5, 1.56)) is None

@@ -20,7 +20,7 @@ from brushloop.calibrate.fit.heldout import BEZIER, FITTED
 from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.validate import run as validation
 from brushloop.calibrate.validate.command import compare, validate
-from brushloop.calibrate.validate.page import provenance, trust
+from brushloop.calibrate.validate.page import headline, provenance, trust
 from brushloop.calibrate.validate.run import BEZIER_REFITTED, FITTED_HELD_OUT
 from brushloop.calibrate.validate.tables import Collected, GateMissed, Report, check_gates, collected_in
 from brushloop.sessions.events import CaptureResult, Condition, DipResult, Remark, ZeroTouchResult
@@ -30,6 +30,7 @@ from brushloop.sessions.records import Header, Source, Stroke
 from brushloop.sessions.store import SessionStore
 from tests.calibrate.conftest import CONDITIONS
 from tests.calibrate.given import rows_of
+from tests.command import brushloop as brushloop_process
 from tests.command import refused, said
 from tests.photographed import imported_presses
 
@@ -275,3 +276,34 @@ def test_what_has_no_report_or_an_edited_table_is_refused(session: Path, before:
     edited.write_text(edited.read_text().replace("0.9", "0.8"))
     with pytest.raises(CalibrationError, match="its SHA-256 differs"):
         compare(DiffRequest(before, tmp_path / "validation"))
+
+
+def test_headline_verdict_and_ceiling_are_of_the_presses_whose_condition_was_pressed_twice(tmp_path: Path) -> None:
+    partly = imported_presses(tmp_path, CONDITIONS + CONDITIONS[:2], name="partly")
+    output = said("validate", partly, *QUICK)
+    folder = partly / "validation"
+    report = Report.read(folder)
+    csim = report.stat("line").csim
+    assert (csim.n, csim.below_n) == (7, 4)
+    of_line, of_ceiling = (round(percent, 1) for _, percent in headline(report))
+    assert of_line != round(csim.avg, 1)
+    sentence = (folder / "verdict.txt").read_text().strip()
+    assert f"average CSIM of {of_line} % (over the 4 of 7 presses whose condition" in sentence
+    assert f"{of_ceiling - of_line:.1f} points" in sentence
+    assert f"ceiling of {of_ceiling} %" in sentence
+    page = (folder / "report.html").read_text()
+    assert sentence in page
+    assert f"<b>{of_line} %</b>" in page
+    assert " ".join(sentence.split()) in output
+
+
+def test_without_a_repeated_condition_it_is_said_that_the_question_has_no_answer(tmp_path: Path) -> None:
+    said("validate", once := imported_presses(tmp_path, CONDITIONS[:3], name="once"), *QUICK)
+    assert (once / "validation" / "verdict.txt").read_text().startswith("It cannot be said, because no condition was")
+
+
+def test_strokes_that_are_left_out_end_in_exit_code_3_after_the_report(tmp_path: Path) -> None:
+    imported_presses(tmp_path, CONDITIONS[:2], name="some", blank=True)
+    ran = brushloop_process("analyse", tmp_path / "some")
+    assert (ran.returncode, "1 strokes could not be used" in ran.stderr) == (3, True), ran.stderr
+    assert (tmp_path / "some" / "validation" / "report.html").is_file()
