@@ -9,14 +9,25 @@ import pytest
 
 from brushloop.drivers.arcs import wire
 from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.rig import rig_toml
 from tests import rigs
 from tests.rigs import BARE, BENT_VIEW, COARSE, SHARP, Lab
+
+RIG = rig_toml(SimConfig())
 
 
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """The simulated cabinet may have to wait for its turn on a busy machine."""
     monkeypatch.setattr(wire, "REPLY_S", 30.0)
+
+
+@pytest.fixture
+def rig_path(tmp_path: Path) -> Path:
+    """The `rig.toml` of a loopback rig that nobody serves."""
+    path = tmp_path / "rig.toml"
+    path.write_text(RIG)
+    return path
 
 
 @pytest.fixture

@@ -30,16 +30,14 @@ from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.start import finished_session
 from brushloop.drivers.loopback import simulate
-from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.rig import rig_toml
 from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.recording import Recording
+from tests.collect.conftest import RIG
 from tests.command import refused, said
 from tests.sessions.conftest import Make
 
 # The demo
 
-RIG = rig_toml(SimConfig())
 GRID = 'kind = "grid"\ndepths_mm = [11.0]\ntilts_deg = [0.0]\nrepeats = 1\nseed = 1\n'
 
 

@@ -33,10 +33,9 @@ from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import DeviceTimeout
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.ink.station import InkStationConfig
-from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.rig import rig_toml
 from brushloop.drivers.sim.world import tool_of
 from tests.collect.commission.conftest import BACK, Answering, Person, in_lab
+from tests.collect.conftest import RIG
 
 
 async def test_a_payload_of_0_kg_ends_the_step_unless_it_is_confirmed(tmp_path: Path) -> None:
@@ -109,8 +108,7 @@ async def test_the_proof_runs_nothing_without_the_command_line_and_the_operators
 async def test_every_pose_of_the_proof_is_checked_before_the_arm_is_connected(
     dry: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    text = rig_toml(SimConfig())
-    low = re.sub(r"(?m)^z_mm = \[.*", "z_mm = [98.0, 170.0]", text, count=1)  # travel height is 180
+    low = re.sub(r"(?m)^z_mm = \[.*", "z_mm = [98.0, 170.0]", RIG, count=1)  # travel height is 180
     (tmp_path / "rig.toml").write_text(low)
     monkeypatch.setattr(proof, "Engine", Mock(side_effect=AssertionError("the arm would have moved")))
     visit = Person().visit(tmp_path / "rig.toml", armed=True)
@@ -119,10 +117,8 @@ async def test_every_pose_of_the_proof_is_checked_before_the_arm_is_connected(
         await ProofStep()._run(visit, tmp_path, protocol, dry=dry)
 
 
-def test_every_move_of_the_proof_is_slower_than_50_mm_s(tmp_path: Path) -> None:
-    path = tmp_path / "rig.toml"
-    path.write_text(rig_toml(SimConfig()))
-    rig = load_rig(path)
+def test_every_move_of_the_proof_is_slower_than_50_mm_s(rig_path: Path) -> None:
+    rig = load_rig(rig_path)
     slow = slowly(rig)
     assert rig.motion.travel_speed_mm_s > 50.0, "otherwise faster"
     assert max(slow.motion.travel_speed_mm_s, slow.motion.press_speed_mm_s) < 50.0

@@ -17,13 +17,10 @@ from brushloop.collect.protocols.steps import StepKind
 from brushloop.collect.tui.start_screen import SessionBrowser
 from brushloop.collect.walk import walk
 from brushloop.drivers.host import Clock
-from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.rig import rig_toml
 from brushloop.sessions.events import CaptureResult, Condition, Press, PressResult
 from brushloop.sessions.records import Header, Source
 from brushloop.sessions.store import SessionStore
 
-RIG = rig_toml(SimConfig())
 GRID = 'kind = "grid"\ndepths_mm = [11.0, 20.0]\ntilts_deg = [0.0]\nrepeats = 2\n'
 WAY_OUT = (
     "Resume it with --config sessions/grid-01/rig.toml --protocol sessions/grid-01/protocol.toml, each beside the "
@@ -32,10 +29,9 @@ WAY_OUT = (
 
 
 @pytest.fixture
-def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def lab(rig_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Both files and an open session that was begun with them, seen from the folder that holds all of it."""
     monkeypatch.chdir(tmp_path)
-    Path("rig.toml").write_text(RIG)
     Path("protocol.toml").write_text(GRID)
     begin()
     return tmp_path

@@ -43,13 +43,13 @@ from brushloop.drivers.sim.rig import rig_toml
 from brushloop.drivers.sim.world import World
 from brushloop.sessions.events import PressResult, StepResult
 from brushloop.sessions.records import Condition
+from tests.collect.conftest import RIG
 from tests.collect.sent import not_checked, not_sent, noting
 from tests.command import refused, said
 from tests.rigs import WASH, WIPE, Lab
 from tests.runs import answered_alike
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
-RIG = rig_toml(SimConfig())
 
 
 def rig(folder: Path, text: str = RIG) -> RigConfig:
@@ -67,8 +67,8 @@ def example(name: str) -> ProtocolConfig:
 
 
 @pytest.fixture
-def config(tmp_path: Path) -> RigConfig:
-    return rig(tmp_path)
+def config(rig_path: Path) -> RigConfig:
+    return load_rig(rig_path)
 
 
 @pytest.mark.parametrize(
@@ -188,11 +188,6 @@ def test_a_self_check_takes_a_patch_before_the_first_stroke(tmp_path: Path) -> N
 
 
 # The command: tables, a picture, and the controller's word on reach
-
-
-@pytest.fixture
-def rig_path(config: RigConfig, tmp_path: Path) -> Path:
-    return tmp_path / "rig.toml"
 
 
 @pytest.fixture

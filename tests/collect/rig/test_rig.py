@@ -18,14 +18,11 @@ from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.doctor import Scrubber, examine
 from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.host import Clock
-from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.faults import Device, Fault
-from brushloop.drivers.sim.rig import rig_toml
+from tests.collect.conftest import RIG
 from tests.command import brushloop, refused, said
 from tests.drivers.arcs.test_connections import Replayed
 from tests.rigs import WASH, WIPE, Lab
-
-RIG = rig_toml(SimConfig())
 
 
 def rig_file(tmp_path: Path, old: str = "", new: str = "") -> Path:
@@ -97,20 +94,18 @@ def test_a_value_from_the_environment_is_refused_by_its_variable(
 # What is shown of a rig.toml, and what in it cannot be true
 
 
-@pytest.fixture
-def rig(tmp_path: Path) -> Path:
-    return rig_file(tmp_path)
-
-
 def test_the_loopback_rig_contradicts_nothing_a_contradiction_ends_with_code_5_and_an_unusable_file_with_code_2(
-    rig: Path,
+    rig_path: Path,
 ) -> None:
-    words = said("rig", "check", rig)
+    words = said("rig", "check", rig_path)
     assert "plausible tool length" in words
     assert "not measured lens not calibrated" in words
     assert words.endswith("10 values are plausible, 0 contradict others, 7 were not measured")
-    assert brushloop("rig", "check", rig_file(rig.parent, "max_depth_mm = 22.0", "max_depth_mm = 47.0")).returncode == 5
-    why = refused("rig", "check", rig_file(rig.parent, "safe_z_mm = 180.0", "safe_z_mm = 18.0"))
+    assert (
+        brushloop("rig", "check", rig_file(rig_path.parent, "max_depth_mm = 22.0", "max_depth_mm = 47.0")).returncode
+        == 5
+    )
+    why = refused("rig", "check", rig_file(rig_path.parent, "safe_z_mm = 180.0", "safe_z_mm = 18.0"))
     assert "motion.safe_z_mm = 18 is below" in why
 
 
@@ -128,39 +123,39 @@ def test_the_loopback_rig_contradicts_nothing_a_contradiction_ends_with_code_5_a
     ],
 )
 def test_a_value_that_cannot_be_true_is_named_with_its_remedy(
-    rig: Path, old: str, new: str, name: str, remedy: str
+    rig_path: Path, old: str, new: str, name: str, remedy: str
 ) -> None:
-    checks = {check.name: check for check in check_rig(load_rig(rig_file(rig.parent, old, new)))}
+    checks = {check.name: check for check in check_rig(load_rig(rig_file(rig_path.parent, old, new)))}
     assert checks[name].verdict == "contradicts"
     assert checks[name].allowed
     assert remedy in checks[name].remedy
 
 
 def test_what_is_shown_is_where_the_tip_goes_in_a_picture_with_the_box_and_every_place(
-    rig: Path, tmp_path: Path
+    rig_path: Path, tmp_path: Path
 ) -> None:
-    places = places_of(load_rig(rig))
+    places = places_of(load_rig(rig_path))
     # Yaw 90: paper x runs along base y, paper y against base x.
     assert places["sheet lower right"] == pytest.approx([460.0, 134.0, 98.03])
     assert places["well"] == pytest.approx([310.0, -185.0, 122.0])
-    table = brushloop("rig", "show", rig).stdout
+    table = brushloop("rig", "show", rig_path).stdout
     assert all(name in table for name in places)
     assert re.search(r"park .* 250\.0 .* -120\.0 .* 210\.0", table)
-    rig_file(rig.parent, "[ink.device]", WIPE + WASH + "[ink.device]")
+    rig_file(rig_path.parent, "[ink.device]", WIPE + WASH + "[ink.device]")
     picture = tmp_path / "rig.svg"
-    said("rig", "show", rig, "--picture", picture)
+    said("rig", "show", rig_path, "--picture", picture)
     drawn = picture.read_text()
     for words in ("from above", "box of limits", "board", "sheet"):
         assert f"<!-- {words}" in drawn, words
     for words in ("well", "wipe, over the rim", "wash pot", "park", "touch point"):
         assert f"<!-- {words} -->" in drawn, words
-    assert "must end in" in refused("rig", "show", rig, "--picture", tmp_path / "rig.gif")
+    assert "must end in" in refused("rig", "show", rig_path, "--picture", tmp_path / "rig.gif")
 
 
-def test_what_was_taught_says_what_was_never_measured(rig: Path) -> None:
+def test_what_was_taught_says_what_was_never_measured(rig_path: Path) -> None:
     mass = Taught(0.0, "as set on the pendant", known="not weighed")
-    Notebook().with_values({"robot.payload_kg": mass}).finished("arm").save(rig)
-    words = said("rig", "check", rig)
+    Notebook().with_values({"robot.payload_kg": mass}).finished("arm").save(rig_path)
+    words = said("rig", "check", rig_path)
     assert "robot.payload_kg 0.0 kg as set on the pendant, not weighed" in words
     assert "not measured step proof" in words
     assert "brushloop rig teach proof --arm" in words
@@ -233,11 +228,11 @@ def test_a_rig_in_order_is_reported_with_all_that_was_answered_and_left_as_it_wa
     assert report.read_bytes() == before
 
 
-def test_names_addresses_and_paths_stay_in_the_lab(rig: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_addresses_and_paths_stay_in_the_lab(rig_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("BRUSHLOOP_ROBOT__HOST", "arm7.lab.example")
     monkeypatch.setenv("LOGNAME", "wanghui")
     monkeypatch.setattr("socket.gethostname", lambda: "rigpc")
-    scrubber = Scrubber(load_rig(rig).model_dump(mode="json"))
+    scrubber = Scrubber(load_rig(rig_path).model_dump(mode="json"))
     said = (
         "robot: connect: arm7.lab.example:30004 as wanghui@rigpc from 192.0.2.7 (fe80::1:2:3, 00:1b:44:11:3a:b7); "
         "see /home/wanghui/rig.toml and C:\\Users\\wanghui, http://wanghui:secret@cam.example/stream, "

@@ -138,14 +138,18 @@ async def test_an_arm_that_was_not_seen_at_rest_is_never_said_to_rest() -> None:
         assert not run.app.is_running
 
 
-async def test_a_key_that_bounces_after_an_answer_asks_for_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_key_answers_the_newest_question_and_asks_for_nothing_where_it_bounces(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     async with watched(picture()) as run:
-        for number, bounce_s, then in ((3, 0.0, ["request SKIP"]), (4, 1e9, [])):
+        for number, bounce_s, then in ((4, 0.0, ["request SKIP"]), (5, 1e9, [])):
             monkeypatch.setattr(run_screen, "BOUNCE_S", bounce_s)
             run.engine.calls.clear()
+            await run.look(picture(state=State.ASKING, prompt=SPLIT))
             await run.look(picture(state=State.ASKING, prompt=replace(SPLIT, number=number)))
-            await run.press("k")
+            await run.press("z", "escape", "k")
             await run.look(picture())
+            assert isinstance(run.app.screen, RunScreen)
             await run.press("k")
             assert run.engine.calls == [f"answer {number} k", *then]
 
@@ -260,18 +264,6 @@ async def test_b_marks_the_last_capture_and_takes_it_back_while_the_run_is_on(tm
         await run.look(replace(now, state=State.DONE))
         await run.press("b")
         assert not remarks_of(tmp_path)[last.still].bad
-
-
-async def test_a_key_answers_the_question_that_is_shown_and_the_next_one_comes() -> None:
-    asking = picture(state=State.ASKING, step="wait for an answer", prompt=replace(SPLIT, image=None))
-    async with watched(asking) as run:
-        assert "until this is answered" in await run.look()
-        await run.press("z", "escape", "g")
-        assert [call for call in run.engine.calls if call.startswith("answer")] == ["answer 3 g"]
-        asking = replace(asking, prompt=replace(SPLIT, question="Is there ink?", number=8))
-        assert "Is there ink?" in await run.look(asking)
-        assert "RUNNING" in await run.look(picture())
-        assert isinstance(run.app.screen, RunScreen)
 
 
 async def test_enter_goes_on_with_an_open_session_and_n_asks_for_a_blank_sheet_first() -> None:
