@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -172,7 +170,7 @@ async def test_thirty_labs(seed: int, tmp_path: Path, monkeypatch: pytest.Monkey
         "CAMERA__MAX_DELAY_MS": 3000,
     }.items():
         monkeypatch.setenv(f"BRUSHLOOP_{name}", str(value))
-    trap, began_s = TRAPPED.get(seed), time.monotonic()
+    trap = TRAPPED.get(seed)
     with in_lab(seed, trap, rate=SOAK_RATE) as person:
         person.mends = trap is not None
         rig = tmp_path / "rig.toml"
@@ -181,11 +179,8 @@ async def test_thirty_labs(seed: int, tmp_path: Path, monkeypatch: pytest.Monkey
             assert await Wizard(person.visit(rig, armed=True)).again("camera") is None
             made = await first_day(person, rig)
         assert trap is None or _words_on(person, trap), person.trouble
-        if trap is not None:
-            sys.stdout.write(f"{seed:2d} {trap}: {_words_on(person, trap)}\n")
         assert made is not None, person.trouble
         off, (_, _, captures) = errors(made, person.lab), read_proof(newest_session(made))
         again = sum(capture.retake for capture in captures)
-        sys.stdout.write(f"{seed:2d}: {off}, {again} presses made again, {time.monotonic() - began_s:.0f} s\n")
         assert all(off[name] <= most for name, most in LIMITS.items()), off
         assert len(captures) - again == proof.PRESSES

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -144,7 +144,6 @@ def laid(
 
 
 @given(st.floats(-179.0, 179.0), st.floats(-500.0, 500.0), st.floats(-500.0, 500.0), st.floats(-0.02, 0.02))
-@settings(max_examples=40)
 def test_a_sheet_is_found_exactly_from_exact_touches(yaw_deg: float, x_mm: float, y_mm: float, slope: float) -> None:
     board, sheet = laid(yaw_deg, (x_mm, y_mm), (slope, -slope))
     check_board(board, BOARD)

@@ -11,7 +11,7 @@ from unittest.mock import Mock
 import pytest
 
 from brushloop.collect.engine import engine
-from brushloop.collect.engine.open_or_resume import CollectRequest, Opening, find_resumable, open_sessions, put_in_sheet
+from brushloop.collect.engine.open_or_resume import CollectRequest, Opening, find_resumable, put_in_sheet
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.protocols.steps import StepKind
 from brushloop.collect.tui.start_screen import SessionBrowser
@@ -136,6 +136,7 @@ def test_the_start_screen_resumes_each_session_with_its_own_protocol(
 ) -> None:
     """Another protocol lies in the folder, and a newer session is open."""
     begin("grid-02")
+    assert find_resumable(opening()) == Path("sessions/grid-02"), "the newest of those that it could be"
     edit("protocol.toml", "repeats = 2", "repeats = 3")
     monkeypatch.setattr(engine, "engine_for", engine_for := Mock())
     browser = SessionBrowser()
@@ -159,12 +160,3 @@ def test_a_sheet_stays_in_until_each_stroke_on_it_is_photographed() -> None:
     assert not sheets
     put_in_sheet(store, 2)
     assert sheets == ["fresh"]
-
-
-def test_open_sessions_are_listed_oldest_first_without_the_closed(lab: Path) -> None:
-    for name in ("grid-00", "grid-02"):
-        begin(name)
-    store = SessionStore(lab / "sessions" / "grid-01", Clock().now_ns)
-    store.close()
-    store.release()
-    assert [folder.name for folder in open_sessions(lab / "sessions")] == ["grid-00", "grid-02"]

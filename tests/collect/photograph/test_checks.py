@@ -56,7 +56,7 @@ def stroke(image: Gray, x_mm: float, y_mm: float, length_mm: float = 18.0, level
 
 
 @given(sigma=st.floats(0.8, 4.0), contrast=st.integers(80, 200))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_blur_is_measured_whatever_the_contrast_of_the_ink(sigma: float, contrast: int) -> None:
     sharp = np.full((400, 400), 220, np.uint8)
     sharp[:, 200:] -= np.uint8(contrast)

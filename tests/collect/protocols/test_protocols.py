@@ -84,7 +84,6 @@ def run(config: ProtocolConfig, patch: int = 7) -> list[Step]:
 
 
 @given(protocols)
-@settings(deadline=None)
 def test_every_planned_stroke_is_dipped_for_marked_and_captured_exactly_once(config: ProtocolConfig) -> None:
     plan, walked = config.planned(), run(config)
     ids = [stroke.stroke_id for stroke in plan]
@@ -257,7 +256,7 @@ def test_strokes_and_points_are_bounded_over_the_whole_protocol(tmp_path: Path) 
 
 
 @given(st.binary(max_size=200) | st.text(max_size=200).map(str.encode))
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_whatever_stands_in_the_files_is_read_or_refused(tmp_path: Path, rubbish: bytes) -> None:
     for csv in (rubbish, b"depth_mm,stroke_id\n" + rubbish):
         with contextlib.suppress(ConfigError):
