@@ -105,7 +105,7 @@ def _cropped(press: RecordedPress) -> tuple[Row, dict[str, bytes]]:
     raster, ink, prepared = press.crop
     values = {"flags": "; ".join(prepared.flags), **_pair("px_per_mm_{}", (PX_PER_MM, PX_PER_MM))}
     pictures = {"image": encode_png(raster), "mask": encode_png(ink.astype("uint8") * 255)}
-    return values | _pair("anchor_{}_px", prepared.anchor_px), pictures
+    return values | _pair("start_{}_px", prepared.anchor_px), pictures
 
 
 def _row(header: Header, stroke: Stroke) -> Row:
@@ -115,8 +115,8 @@ def _row(header: Header, stroke: Stroke) -> Row:
         "session_id": header.session_id,
         "source": str(header.source),
         **{name: getattr(stroke, name) for name in STROKE_COLUMNS},
-        **_pair("anchor_{}_mm", stroke.anchor_mm),
-        **_pair("anchor_{}_px", stroke.anchor_px),
+        **_pair("start_{}_mm", stroke.anchor_mm),
+        **_pair("start_{}_px", stroke.anchor_px),
         **_pair("px_per_mm_{}", stroke.px_per_mm),
         **dict(zip(PATCH_COLUMNS, stroke.cell_mm or (None,) * len(PATCH_COLUMNS), strict=True)),
         "licence": header.licence,

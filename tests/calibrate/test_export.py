@@ -62,7 +62,7 @@ def test_what_was_commanded_reached_and_waited_are_columns_and_what_is_not_given
     messages = [message for n, given in enumerate(fields) for message in (make.still(n), make.stroke(n, **given))]
     export(ExportRequest(make.record(tmp_path / "a.mcap", *messages), to, "csv"))
     rows = rows_of(to / "strokes.csv")
-    columns = ("depth_mm", "reached_mm", "anchor_x_mm", "anchor_y_mm", "commanded_length_mm")
+    columns = ("depth_mm", "reached_mm", "start_x_mm", "start_y_mm", "commanded_length_mm")
     assert [rows[0][c] for c in columns] == [""] * 5
     assert [rows[-1][c] for c in columns] == ["13.0", "12.9", "1.5", "2.5", "30.0"]
     assert [row["dip_to_touch_s"] for row in rows] == ["", "1.0", "1.1", "10.0", "1.2"]
@@ -148,7 +148,7 @@ def test_crops_and_masks_lie_over_the_true_marks(tmp_path: Path, to: Path) -> No
         assert crop.shape == mask.shape == (768, 768)
         assert (float(row["px_per_mm_x"]), float(row["px_per_mm_y"])) == (20.0, 20.0)
         left, top = (20.0 * v for v in ANCHOR_MM)
-        assert (float(row["anchor_x_px"]), float(row["anchor_y_px"])) == pytest.approx((left, top))
+        assert (float(row["start_x_px"]), float(row["start_y_px"])) == pytest.approx((left, top))
         truth = true_mask(shot, field_around(anchor), 20.0)
         assert iou(mask > 0, truth) >= 0.9
         assert crop[mask > 0].mean() < 0.5 * crop[mask == 0].mean()
