@@ -66,7 +66,7 @@ def plan(
     rig, wanted = load_rig(config).settled(arm), load_protocol(protocol)
     check_protocol(config, protocol, rig, wanted)
     planned = make_plan(rig, wanted)
-    say(plan_table(planned))
+    say(plan_table(planned), f"Every pose is within the limits of {config}.")
     if picture is not None:
         draw_plan(rig, wanted, planned, picture)
         say(f"The sheets are drawn in {picture}")

@@ -50,17 +50,17 @@ def _settled(request: CollectRequest) -> CollectRequest:
     return replace(request, on_screen=screen, guided=request.guided and screen)
 
 
-def collect(request: CollectRequest) -> Snapshot:
+def collect(request: CollectRequest, *, chained: bool = False) -> Snapshot:
     """Run to the end and print where the recording lies and what comes next; return how it ended.
 
-    Raises the error that ended the run.
+    `chained`: a command continues after the run. Raises the error that ended the run.
     """
     opening = Opening.load(_settled(request))
     with contextlib.closing(LiveView(request.live_port)) if request.live else contextlib.nullcontext() as live:
-        now = _run(replace(opening, live=live)).snapshot()
+        now = _run(replace(opening, live=live), chained=chained).snapshot()
     folder = Path(now.folder)
     say(f"recorded: {folder / folder.name}.mcap")
-    if not isinstance(opening.protocol, WriteConfig):  # characters are analysed together with their plan
+    if not chained and not isinstance(opening.protocol, WriteConfig):  # characters are analysed with their plan
         say(f"next:     brushloop analyse {folder}")
     return now
 
@@ -77,7 +77,7 @@ def collect_session(
     return Path(collect(request).folder)
 
 
-def _run(opening: Opening) -> Engine:
+def _run(opening: Opening, *, chained: bool = False) -> Engine:
     """Run to the end; return the engine that ran last, as the operator may resume after a stop."""
     engine = engine_for(opening)
     if not opening.request.on_screen:
@@ -87,9 +87,10 @@ def _run(opening: Opening) -> Engine:
     def again(session_id: str) -> Engine:
         return engine_for(replace(opening, request=replace(opening.request, new=False, resume=session_id)))
 
-    from brushloop.collect.tui.app import OperatorApp, run_app
+    from brushloop.collect.tui.app import ANALYSE, GO_ON, OperatorApp, run_app
 
     app = OperatorApp(again, engine)
+    app.next = GO_ON if chained else ANALYSE
     run_app(app)
     return app.engine or engine
 
@@ -113,13 +114,8 @@ def show_progress(engine: Engine) -> None:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     shown, silent = 0, False
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("{task.fields[eta]}"),
-    )
+    described, to_go = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[eta]}")
+    columns = described, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), to_go
     with Progress(*columns, console=plain_console(stderr=True)) as progress:
         task = progress.add_task("connect", total=None, eta="")
         while True:
@@ -174,7 +170,7 @@ def collected_session(request: CollectRequest) -> Path:
     session = finished_session(request.out, request.config, request.protocol)
     if session is None:
         say(f"$ brushloop collect --config {request.config} --protocol {request.protocol} --out {request.out}")
-        session = Path(collect(request).folder)
+        session = Path(collect(request, chained=True).folder)
     calibrated(session)
     return session
 

@@ -42,6 +42,7 @@ UNSEEN = yes_or_no(f"{NOT_AT_REST} Quit all the same?", "quit, and leave the arm
 NO_RUN = Snapshot(state=State.DONE)
 """What is shown before the first run of a day and between two of them."""
 LOOK, BACK = Choice("v", "look through the captures"), Choice("q", "back to the run")
+GO_ON = Choice("g", "go on: leave this screen, and the command continues with its next step")
 ANALYSE = Choice("a", "analyse: calibrate, fit the brush, compare the models, and write the report")
 
 
@@ -66,6 +67,8 @@ class OperatorApp(PlainApp):
         self.engine = engine
         self.leaving = False
         """Whether the app is to end soon, whatever the state; may be set by any thread."""
+        self.next = ANALYSE
+        """What is offered after a finished run."""
         self._browser = browser
         self._again = again
         self._now = NO_RUN if engine is None else engine.snapshot()
@@ -232,8 +235,10 @@ class OperatorApp(PlainApp):
                 self._offer_analysis(folder)
             elif key == LOOK.key:
                 self.call_after_refresh(self.action_review)
+            elif key == GO_ON.key:
+                self.call_after_refresh(self.action_quit)
 
-        question = Prompt(f"What shall be done next with {folder}?", (LOOK, ANALYSE, BACK), BACK.key)
+        question = Prompt(f"What shall be done next with {folder}?", (LOOK, self.next, BACK), BACK.key)
         self.push_screen(AskScreen(question), answered)
 
     def _ask(self, engine: Engine, run: RunScreen, now: Snapshot) -> None:
