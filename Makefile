@@ -23,6 +23,7 @@ $(STAMP)-dev: requirements/run.lock requirements/dev.lock requirements/install.p
 	@touch $(STAMP) $@
 
 setup: $(STAMP)  ## make .venv with all that the commands need, and run none of them
+	@echo "brushloop is installed in $(VENV). Next, in each new terminal: . $(BIN)/activate; then brushloop --help lists the commands."
 
 # Bytecode is kept, whatever the shell says: without it each of the demo's processes compiles some 600 modules again.
 demo: $(STAMP)  ## press, calibrate, press again and validate on the loopback rig; `brushloop demo --full` does more

@@ -46,9 +46,7 @@ HOLD = (
     "in the lower left of the picture",
     "turned by a quarter and slanted",
 )
-MIRRORED = (
-    "Switch mirroring (`flip`) off in the camera's own set-up, or take the mirror out of its way; then try again."
-)
+MIRRORED = "Switch mirroring (`flip`) off in the camera's set-up, or take the mirror out of its way; then try again."
 OTHER_PRINT = (
     "Count the squares of the print again, the outermost ones too, and measure one; then repeat the camera step."
 )
@@ -139,7 +137,7 @@ class CameraStep(Step):
         folder.mkdir(exist_ok=True)
         taken = [folder / str(name) for name in visit.notebook.table(VIEW).values()]
         views = [
-            await asyncio.to_thread(find_board, read_gray(path), spec, path.name) for path in taken if path.is_file()
+            await asyncio.to_thread(find_board, read_gray(path), spec, path.name, 0) for path in taken if path.is_file()
         ]
         for index in range(MOST_VIEWS):
             if f"{VIEW}{index:02d}" in visit.notebook.values:
@@ -173,8 +171,8 @@ class CameraStep(Step):
         visit.working("looking for the board in the picture")
         picture = await still(camera, visit.clock)
         coded = cv2.imencode(".png", picture)[1].tobytes()
-        # Named after its content: a photograph that is taken once more does not replace one that going back restores.
-        name = f"{hashlib.sha256(coded).hexdigest()[:16]}.png"
+        # Named after its content too: a photograph taken once more does not replace one that going back restores.
+        name = f"view-{index + 1:02d}-{hashlib.sha256(coded).hexdigest()[:16]}.png"
         if (view := await _board_in(visit, picture, name, lying=False)) is None:
             return True
         (folder / name).write_bytes(coded)
@@ -191,7 +189,7 @@ async def _board_in(visit: Visit, picture: Gray, name: str, *, lying: bool) -> B
     """
     board = board_of(visit.notebook)
     try:
-        view = await asyncio.to_thread(find_board, picture, board, name)
+        view = await asyncio.to_thread(find_board, picture, board, name, 0)  # any number of corners will do
     except CalibrationError as error:
         if "mirrored" in error.what:
             raise NotAccepted(f"{error.what}.", MIRRORED) from None

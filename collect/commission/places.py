@@ -109,8 +109,7 @@ class PlacesStep(Step):
             )
         share = changed_share(*pictures)
         if share >= ARM_SHARE:
-            beside = np.hstack(pictures).astype(np.uint8)
-            visit.say("The arm elsewhere (left), and parked (right):", picture=beside)
+            visit.say("The arm elsewhere (left), and parked (right):", picture=np.hstack(pictures).astype(np.uint8))
             raise NotAccepted(
                 f"the arm, or its shadow, is in one of the two pictures: {100 * share:.0f} % of the pixels differ.",
                 "Park the arm farther from the sheet, or higher; you are asked for both places again.",
@@ -221,8 +220,8 @@ class LimitsStep(Step):
         x_mm, y_mm, z_mm = (f"{taught.value} mm" for taught in box.values())
         if not await visit.yes(
             f"The tip will stay in this box of the base frame: x {x_mm}, y {y_mm}, z {z_mm}. It is the smallest "
-            f"box around all taught places, with {MARGIN_MM:g} mm beside and above them, and {BELOW_MM:g} mm below. "
-            "Agreed?"
+            f"box around sheet, well, wipe, pot and park position, with {MARGIN_MM:g} mm beside and above them, and "
+            f"{BELOW_MM:g} mm below. Agreed?"
         ):
             raise NotAccepted(
                 "the box was not agreed.", "Teach the place again that makes the box too large: `brushloop rig teach`."

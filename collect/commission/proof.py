@@ -130,14 +130,13 @@ class ProofStep(Step):
             f"marks off by {math.hypot(*check.offset_mm):.1f} mm (limit: {rig.self_check.offset_mm:g} mm), turned "
             f"{check.turn_deg:+.2f} deg (limit: {rig.self_check.turn_deg:g} deg)",
             f"{PRESSES} presses passed the quality checks, {again} were repeated",
-            f"camera delay {delay_ms:.0f} ms: up to {SLOW_CAMERA_MS:g} ms are good",
+            f"camera delay {delay_ms:.0f} ms (slow above {SLOW_CAMERA_MS:g} ms)",
         )
         if delay_ms > SLOW_CAMERA_MS:
-            slow = f"The camera is slow: {delay_ms / 1e3:.1f} s. Each photograph waits for it."
-            visit.say(slow, FASTER, tone="warning")
+            visit.say("The camera is slow: each photograph waits for it.", FASTER, tone="warning")
         visit.say(
             "Lay a fresh sheet before the first session: this one has the marks of the proof.",
-            "Then: brushloop collect --protocol FILE --arm",
+            "Then: brushloop collect --protocol examples/protocol-quick.toml --arm",
             "READY",
         )
 

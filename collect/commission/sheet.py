@@ -55,8 +55,8 @@ class SheetStep(Step):
     async def carry_out(self, visit: Visit) -> None:
         """Have the corners touched until the origin is known well enough. Raises `NotAccepted`, `StepError`."""
         visit.say(
-            "Lay the board in the middle of the picture, where the sheet will lie. Lay the sheet on the board, with "
-            "its edges along the squares.",
+            "Take off plain paper that still covers the board. Leave the board in the middle of the picture and the "
+            "sheet on the board, with its edges along the squares; if they do not lie there yet, lay them there now.",
             "Touch each corner with the brush upright (hold a set square beside it), and hold still.",
             "The lower edge is the one with the print's name.",
         )

@@ -70,9 +70,9 @@ class Taught:
     at: str = field(default_factory=now_utc)
     """When, in UTC."""
 
-    def comment(self, unit: str) -> str:
-        """One line for `rig.toml`."""
-        error = "" if self.sigma is None else f", standard error {self.sigma:.3g} {unit}"
+    def comment(self, path: str) -> str:
+        """One line for `rig.toml` about the field at `path`, whose end is its unit."""
+        error = "" if self.sigma is None else f", standard error {self.sigma:.3g} {path.rpartition('_')[2]}"
         return f"{self.how}{error}{'; ' if self.known else ''}{self.known} ({self.at})"
 
 
@@ -160,7 +160,7 @@ def gaps(notebook: Notebook) -> Iterator[Check]:
             yield unmeasured(f"step {step}", "not done since the last change", f"brushloop rig teach {step}{arm}")
     for path, known in notebook.values.items():
         if known.known.startswith(UNKNOWN) and not path.startswith(ASIDE):
-            yield unmeasured(path, f"{known.value} {unit_of(path)}", f"{known.how}, {known.known}")
+            yield unmeasured(path, f"{known.value} {path.rpartition('_')[2]}", f"{known.how}, {known.known}")
 
 
 def rig_of(notebook: Notebook, rig_path: Path) -> RigConfig:
@@ -179,17 +179,12 @@ def rig_text(notebook: Notebook, rig_path: Path) -> str:
             continue
         table, _, name = path.rpartition(".")
         if (known := notebook.values.get(path)) is not None:
-            comment = known.comment(unit_of(path)).replace("\n", " ")
+            comment = known.comment(path).replace("\n", " ")
             tables[table] += [f"# {line}" for line in textwrap.wrap(comment, 116)]
         tables[table].append(f"{name} = {toml_value(value)}")
     for table in sorted(tables, key=lambda name: (name != "", name.split(".")[0] != "robot", name)):
         lines += ["", *([f"[{table}]"] if table else []), *tables[table]]
     return "\n".join(lines) + "\n"
-
-
-def unit_of(field: str) -> str:
-    """The unit of a field that was measured: its name ends with it."""
-    return field.rpartition("_")[2]
 
 
 def toml_value(value: Value) -> str:

@@ -32,7 +32,6 @@ STEPS = (
     ProofStep(),
 )
 AGAIN = Choice("a", "try again: all values so far are kept")
-STOPPED = "stopped; the same command resumes from there"
 REFUSED = (NotAccepted, DeviceError, InputError, StepError, ConfigError)
 
 
@@ -91,7 +90,7 @@ class Wizard:
                 visit.say(describe(error), *(["Check power, cable and address."] if unhelpful else []), tone="trouble")
                 await visit.ask(choice_of("How do you want to go on?", (AGAIN,), AGAIN.key), back=False)
         except LeftOff:
-            raise CollectAborted(STOPPED) from None
+            raise CollectAborted("stopped; the same command resumes from there") from None
         except WentBack:
             visit.back()
 
@@ -109,6 +108,7 @@ class Wizard:
                     if (old := before.get(field)) is not None and toml_value(old) != toml_value(new.value)
                 ]
         self._visit.save(notebook.finished(step.name))
+        self._visit.picture = None  # the next step is about something else
         if changed:
             self._visit.say("These values depend on this step and changed with it:", *changed)
         self._visit.say(f"✓ {step.title}: done")

@@ -113,10 +113,13 @@ async def zero_touch(context: StepContext, step: ZeroTouchStep) -> ZeroTouchResu
     # How far the paper lies above where it was before, at the touched point where it moved most.
     before = run.procedures.plane
     moved_mm = max((p.z_mm - before.touch_z_mm(p.x_mm, p.y_mm) for p in measured.points), key=abs)
+    if step.index == 0 and before.slope_deg == 0.0:
+        # Only the height at one point was known: elsewhere, a lean would look like a move.
+        moved_mm = plane.touch_z_mm(*rig.config.paper.touch_point_mm) - before.z0_mm
     if measured.method != "taught":
         run.progress.log(
-            f"zero touch by {measured.method}: the paper leans by {measured.slope_deg:.2f} deg, and lies at most "
-            f"{moved_mm:+.2f} mm from the plane known before"
+            f"zero touch by {measured.method}: the paper leans by {measured.slope_deg:.2f} deg, and lies "
+            f"{moved_mm:+.2f} mm from the height that was known before"
         )
     if step.index > 0:
         text = f"The paper lies {moved_mm:+.2f} mm from its earlier height. From now on, H counts from the new height."

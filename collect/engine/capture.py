@@ -195,7 +195,7 @@ async def _fresh_frame(context: StepContext) -> Frame:
         run.progress.log("measuring the camera's delay: the arm goes over the sheet and back, two to six times")
     frame = await photographer.photograph()
     if photographer.delay is not known:
-        measured = f"camera delay: {photographer.delay}, limit {run.rig.config.camera.max_delay_ms:g} ms"
+        measured = f"camera delay: {photographer.delay}; refused above {run.rig.config.camera.max_delay_ms:g} ms"
         context.recorder.log(measured)
         run.progress.log(measured)
     return frame

@@ -46,10 +46,10 @@ def places_of(config: RigConfig) -> dict[str, tuple[float, float, float]]:
     deepest_mm = paper.touch_z_mm - config.brush.max_depth_mm
     width, height = paper.size_mm
     on_paper_mm = {
-        "sheet lower left": (0.0, 0.0, deepest_mm),
-        "sheet lower right": (width, 0.0, deepest_mm),
-        "sheet upper right": (width, height, deepest_mm),
-        "sheet upper left": (0.0, height, deepest_mm),
+        "sheet lower left, deepest press": (0.0, 0.0, deepest_mm),
+        "sheet lower right, deepest press": (width, 0.0, deepest_mm),
+        "sheet upper right, deepest press": (width, height, deepest_mm),
+        "sheet upper left, deepest press": (0.0, height, deepest_mm),
         "well": (*ink.well_mm, ink.dip_z_mm),
     }
     if ink.wipe is not None:
@@ -64,7 +64,7 @@ def places_of(config: RigConfig) -> dict[str, tuple[float, float, float]]:
 
 def rig_table(config: RigConfig) -> Table:
     """A place a row, in the frames of the base and of the paper, in mm; then two corners of the box of limits."""
-    limits = limits_of(config)
+    limits = config.robot.limits
     table = Table("place", "base x", "y", "z", "paper x", "y", title=f"{config.name}: mm")
     for column in table.columns[1:]:
         column.justify = "right"

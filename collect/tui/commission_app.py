@@ -18,6 +18,7 @@ from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, VerticalScroll
 from textual.content import Content
+from textual.reactive import reactive
 from textual.screen import Screen
 from textual.widgets import Footer, Input
 
@@ -46,7 +47,6 @@ from brushloop.collect.tui.widgets import (
 
 AT_WORK = yes_or_no("A step is running: stop it and leave?", "stop and leave", "go on")
 STOPPED = "stopped: look at the arm. The same command resumes from there"
-RED_BUTTON = "If the arm moves, use the emergency stop, the red button."
 DONE = "This is done. q leaves."
 TYPING_STOP = "ctrl-c: software stop; red button: emergency stop; ctrl-q: leave, all is kept"
 TONES: dict[Tone, tuple[str, str]] = {
@@ -82,7 +82,8 @@ class Steps:
         except asyncio.CancelledError as stopped:
             # The notes say whether the arm was seen at rest.
             notes = getattr(stopped, "__notes__", [])
-            raise CollectAborted(" ".join([*notes, RED_BUTTON]) if notes else STOPPED) from None
+            button = "If the arm moves, use the emergency stop, the red button."
+            raise CollectAborted(" ".join([*notes, button]) if notes else STOPPED) from None
         except CollectAborted:
             if self._stop_sent:  # a run within the steps has its own word for that
                 raise CollectAborted(STOPPED) from None
@@ -119,6 +120,7 @@ Page up and page down show earlier and later results.
         Binding("tab", "picture", "Picture", priority=True),
         HELP_KEY,
     ]
+    picture_hidden = reactive(False, bindings=True)
 
     def __init__(self, visit: Visit) -> None:
         super().__init__()
@@ -157,14 +159,18 @@ Page up and page down show earlier and later results.
         return self.prompt is not None and self.prompt.read is not None
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
-        """Whether there is a question to go back from."""
-        return self.prompt is not None if action == "back" else super().check_action(action, parameters)
+        """Whether there is a question to go back from, or a picture that has no room beside the findings."""
+        own = {"back": self.prompt is not None, "picture": self.picture_hidden}
+        return own[action] if action in own else super().check_action(action, parameters)
 
     def show(self, *, over: bool) -> None:
         """Draw what differs; `over`: the steps are done."""
         visit, prompt = self._visit, self._visit.asker.prompt
         self._title.show(f"First day   {one_line(str(visit.rig_path))}   {plain(visit.step)}")
-        self._picture.show(visit.picture if visit.live is None else visit.live)
+        picture = visit.picture if visit.live is None else visit.live
+        self._picture.show(picture)
+        self.picture_hidden = picture is not None and self.has_class("-narrow")
+        self.set_class(self.picture_hidden and self.has_class("-picture"), "-picture")
         found = [(text, *TONES[tone]) for tone, text in tuple(visit.findings)]
         self._found.show(Content("\n").join(Content.styled(sign + plain(text), style) for text, sign, style in found))
         if prompt is not self.prompt or over != self._over:

@@ -119,6 +119,7 @@ class UnknownLab(LoopbackRig):
             f"markers of {marker_mm:g} mm, {table.board_dictionary}",
             f"brush     radius R = {brush.radius_mm:g} mm, length L = {brush.length_mm:g} mm, "
             f"press at most {facts.max_depth_mm:g} mm",
+            "table     board, blank sheet, pin, a well that holds ink and has a rim to wipe on, pot of water",
             *(() if control is None else (f"hand      brushloop sim hand {control} bring pin",)),
             "Ctrl-C ends",
         ]

@@ -167,16 +167,16 @@ def test_the_paper_is_found_again_by_jog_and_a_jog_that_is_given_up_or_not_taken
     answer(engine, "+0.00 mm", "t")
     answer(engine, "+2.00 mm", "1")  # as it was requested
     answer(engine, "+1.00 mm", "t")
-    answer(engine, "found +1.", "g")
+    answer(engine, "lies +1.", "g")
     engine.control.toggle(OperatorRequest.JOG)
     answer(engine, "Touch 1 of 1.", "t")
-    answer(engine, "found +1.", "k")
+    answer(engine, "lies +1.", "k")
     engine.control.toggle(OperatorRequest.JOG)
     answer(engine, "Touch 1 of 1.", "x")
     wait_for_end(engine)
     now = engine.snapshot()
     assert now.strokes_done == 3
-    assert any("lies at most +1." in line for line in now.messages)
+    assert any("lies +1." in line for line in now.messages)
     assert [result.method for result in lab.state.results(ZeroTouchResult)] == ["jog", "jog"]
     voids = [why for _, why in lab.state.cut]
     assert voids[-2:] == ["the new height was not accepted.", "the operator gave up at touch 1 of 1"]

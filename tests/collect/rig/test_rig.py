@@ -47,7 +47,7 @@ def rig_file(tmp_path: Path, old: str = "", new: str = "") -> Path:
         ("[motion]", '[touch]\nmethod = "camera"\npoints_mm = [[4.0, 4.0]]\n[motion]', r"touch: .*by camera three are"),
         ("[motion]", "[quality]\ndark_level = 200.0\nbright_level = 150.0\n[motion]", r"quality: .*dark_level"),
         ("[motion]", WIPE.replace("322.0", "120.0") + "[motion]", r"ink.wipe.rim_mm = .* lies on the sheet"),
-        ("[motion]", WIPE.replace("130.0", "250.0") + "[motion]", r"ink.wipe.z_mm = 250 is outside"),
+        ("[motion]", WIPE.replace("130.0", "250.0") + "[motion]", r"ink.wipe.z_mm = 250 must lie in"),
         ("[motion]", WASH.replace("305.0", "100.0") + "[motion]", r"ink.wash.pot_mm = .* lies on the sheet"),
     ],
 )
@@ -136,7 +136,7 @@ def test_what_is_shown_is_where_the_tip_goes_in_a_picture_with_the_box_and_every
 ) -> None:
     places = places_of(load_rig(rig_path))
     # Yaw 90: paper x runs along base y, paper y against base x.
-    assert places["sheet lower right"] == pytest.approx([460.0, 134.0, 98.03])
+    assert places["sheet lower right, deepest press"] == pytest.approx([460.0, 134.0, 98.03])
     assert places["well"] == pytest.approx([310.0, -185.0, 122.0])
     table = brushloop("rig", "show", rig_path).stdout
     assert all(name in table for name in places)
@@ -175,7 +175,7 @@ async def test_whatever_is_wrong_is_reported_with_a_remedy_and_every_other_devic
     wired_lab.rig.arcs.cabinet.safety_stop()
     findings = await examine(load_rig(wired_lab.folder / "rig.toml"), Clock())
     assert not any(finding.well for finding in findings)
-    problems = ("board corners found", "no whole round", "no reply", "ProtectiveStop")
+    problems = ("board corners found", "no complete round", "no reply", "ProtectiveStop")
     remedies = ("into view", "wiring", "", "pendant")
     for finding, answers, problem, remedy in zip(findings, (True, False, False, True), problems, remedies, strict=True):
         assert finding.answers is answers

@@ -72,6 +72,7 @@ async def test_a_number_out_of_range_is_refused_with_the_range() -> None:
         await pilot.press("9", "9", "enter")
         await pilot.pause()
         assert "99 is outside 0.5 to 50 mm" in shown(app)
+        assert "Picture" not in shown(app), "there is none"
         assert app.first_day.prompt is not None
     assert asking.answers == []
 
