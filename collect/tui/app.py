@@ -42,7 +42,7 @@ UNSEEN = yes_or_no(f"{NOT_AT_REST} Quit all the same?", "quit, and leave the arm
 NO_RUN = Snapshot(state=State.DONE)
 """What is shown before the first run of a day and between two of them."""
 LOOK, BACK = Choice("v", "look through the captures"), Choice("q", "back to the run")
-GO_ON = Choice("g", "go on: leave this screen, and the command continues with its next step")
+GO_ON = Choice("g", "go on: leave this screen; the command continues")
 ANALYSE = Choice("a", "analyse: calibrate, fit the brush, compare the models, and write the report")
 
 
