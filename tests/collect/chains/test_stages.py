@@ -163,7 +163,7 @@ def test_a_loop_goes_on_with_what_it_was_begun_with_and_nothing_else(tmp_path: P
         with pytest.raises(ConfigError, match=f"{name}: this folder was begun with"):
             begun_with(SETTINGS.model_copy(update={name: value}), folder)
     (folder / FILE).write_text("{}")
-    with pytest.raises(ConfigError, match="does not hold the settings of a loop"):
+    with pytest.raises(ConfigError, match="holds no settings of `brushloop repress`"):
         begun_with(SETTINGS, folder)
 
 
@@ -175,7 +175,7 @@ def test_presses_that_cannot_be_made_again_are_refused_before_anything_is_comput
     rig.write_text(RIG, encoding="utf-8")
     protocol.write_text(GRID, encoding="utf-8")
     session = finished(rig, protocol, tmp_path / "sessions", 1)
-    with pytest.raises(ConfigError, match="would press on whatever sheet is in"):
+    with pytest.raises(ConfigError, match="would press on the sheet that is in place"):
         run_loop(LoopRequest(session, rig))
     rig.write_text(RIG.replace("simulated bristle bundle", "goat hair"), encoding="utf-8")
     with pytest.raises(ConfigError, match=r"brush\.name: 'goat hair, seed 1': the original was pressed with"):
@@ -187,7 +187,7 @@ def test_a_fit_that_does_not_describe_the_brush_is_not_pressed(tmp_path: Path) -
     path.write_text("stroke_id,flags\na,\nb,at_bound\nc,\nd,at_bound\n")
     check_recovered(path)
     path.write_text("stroke_id,flags\na,\nb,at_bound\nc,upright at_bound\n")
-    with pytest.raises(ConfigError, match="2 of 3 presses were recovered at a bound"):
+    with pytest.raises(ConfigError, match="2 of 3 recovered presses lie at a limit"):
         check_recovered(path)
 
 
@@ -254,7 +254,7 @@ def test_practice_comes_first_and_learning_ends_when_all_is_settled(
     )
     assert Writing(request).run() == tmp_path / "out" / "written.html"
     assert commands.ran == ["practice", "fit", "plan", *["compare", "learn"] * rounds, "compare"]
-    assert ("No character gained" in capsys.readouterr().out) == (rounds < 3)
+    assert ("improved no character" in capsys.readouterr().out) == (rounds < 3)
 
 
 def test_a_fresh_sheet_is_asked_for_before_anything_is_planned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -125,7 +125,7 @@ async def test_a_day_at_the_rig(lab: Lab) -> None:
         await operator.accepts("Self-check")
 
         # a stroke comes out badly: the question has its picture, and the answer presses it again
-        await operator.is_asked(SPLIT, "r  press it again")
+        await operator.is_asked(SPLIT, "r  press the stroke again")
         assert any("\u2801" <= sign <= "\u28ff" for sign in shown(app)), "a picture, as braille with dots"
         bad = operator.engine.snapshot()
         await operator.answers("r", SPLIT)
@@ -177,7 +177,7 @@ async def test_a_day_at_the_rig(lab: Lab) -> None:
         rig.world.fresh_sheet()
         await operator.answers("g", "Sheet 1 is full")
         await asyncio.to_thread(runs.wait_for_end, operator.engine)
-        await operator.sees(AskScreen, "What comes next", "a  analyse")
+        await operator.sees(AskScreen, "What shall be done next", "a  analyse")
         assert operator.engine.snapshot().strokes_done == STROKES
 
         # review: one is marked bad with a note
