@@ -170,7 +170,7 @@ async def look_at_sheet(context: StepContext) -> None:
         inked = await uninterrupted(_inked_patches, run, image, {patch.index for patch in context.patches})
     if inked:
         raise NeedsOperator(
-            f"{len(inked)} patches of sheet {sheet + 1} should be blank, but are not: {inked[0]} "
+            f"patches of sheet {sheet + 1} that should be blank hold ink ({len(inked)}), first: {inked[0]} "
             f"Put in a blank sheet, or sheet {sheet + 1} of this session."
         )
     run.looked_at_sheet = sheet

@@ -163,7 +163,7 @@ def test_a_session_that_is_gone_on_with_holds_no_link(make, place):
     make.store(folder).release()
     (folder / "rig.toml").unlink()
     (folder / "rig.toml").symlink_to(place / "outside" / "victim.toml")
-    with pytest.raises(InputError, match=r"rig\.toml: is a link, which nothing in a session's folder may be") as caught:
+    with pytest.raises(InputError, match=r"rig\.toml: is a link, which is not allowed in a session's folder") as caught:
         SessionStore(folder, make.clock())
     assert caught.value.exit_code == 2
     assert folder not in open_sessions(folder.parent)

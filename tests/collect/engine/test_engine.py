@@ -210,7 +210,7 @@ def test_a_dry_run_moves_all_the_way_and_leaves_neither_ink_nor_session(lab: Lab
     """One too low or too high is refused with the range."""
     lab.write_protocol("[11.0, 20.0]")
     for depth_mm in (24.0, 46.0):
-        with pytest.raises(ConfigError, match=r"--dry-run.*outside \[25, 44.97\] mm"):
+        with pytest.raises(ConfigError, match=r"--dry-run.*must lie in \[25, 44.97\] mm"):
             lab.engine(dry_run_mm=depth_mm)
     well_ml = lab.rig.world.well.ml
     ran = lab.command("--dry-run", "30")

@@ -196,7 +196,7 @@ def load(folder: Path, protocol: str, csv: str | bytes | None = None):
         (LIST, "depth_mm,stroke_id\n11,\x1b[2J\n", r"line 2: stroke_id: .*control"),
         (LIST + "repeats = 2\n", "depth_mm,stroke_id\n11,a\n12,a-r02\n", r"'a-r02' occurs twice"),
         (LIST, None, r"p.csv: no such file"),
-        (LIST.replace("p.csv", "../p.csv"), None, r"protocol.toml: file: must be the plain name of a file next to it"),
+        (LIST.replace("p.csv", "../p.csv"), None, r"protocol.toml: file: must be the name, without folder"),
         (LIST + "presses = []\n", "depth_mm\n11\n", r"presses: a file is named too"),
         (REPLAY, "stroke_id,depth_mm\na,11\n,12\n", r"every press that repeats one of old needs its stroke_id"),
         (REPLAY.replace("old", "a b"), "stroke_id,depth_mm,tilt_deg\na,11,0\n", r"of: a name has no spaces"),

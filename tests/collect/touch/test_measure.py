@@ -150,7 +150,7 @@ async def test_an_arm_that_was_stopped_or_failed_is_left_where_it_is(
 
 
 class Operator(Asker):
-    """Jogs down in large steps, then smaller ones, until the tip touches; or to the end of the travel, and then says
+    """Jogs down in large steps, then smaller ones, until the tip touches; or to the goes no lower, and then says
     `at_the_end`."""
 
     def __init__(self, bench: Bench, at_the_end: str = "") -> None:
@@ -162,7 +162,7 @@ class Operator(Asker):
     async def ask(self, prompt: Prompt) -> str:
         self.questions.append(prompt.question)
         if self._at_the_end:
-            return self._at_the_end if "end of the travel" in prompt.question else "1"
+            return self._at_the_end if "goes no lower" in prompt.question else "1"
         gap_mm = -self._bench.world.on_sheet(self._bench.target)[2]
         return next((key for key, step in (("1", 1.0), ("2", 0.1), ("3", 0.02)) if gap_mm > step), "t")
 
@@ -172,7 +172,7 @@ async def test_a_jog_ends_at_the_travel_limit_and_says_so(tmp_path: Path) -> Non
     operator = Operator(bench, "x")
     with pytest.raises(NeedsOperator, match="touch 1 of 3"):
         await measured(bench, operator, method="jog")
-    said = [("is -2.00 mm from" in question, "end of the travel" in question) for question in operator.questions]
+    said = [("is -2.00 mm from" in question, "goes no lower" in question) for question in operator.questions]
     assert said[0] == (False, False)
     assert said[-1] == (True, True)
     assert all(lowest == told for lowest, told in said)
@@ -216,7 +216,7 @@ FEW, MANY = [(4.0, 4.0), (70.0, 4.0), (36.0, 36.0)], [*((x, 4.0) for x in (4.0, 
 async def test_no_touch_leaves_what_was_checked(
     tmp_path: Path, method: str, points_mm: list[tuple[float, float]]
 ) -> None:
-    """An operator jogs to the end of the travel at each point: touches that each find the paper lower do not add up."""
+    """An operator jogs to the goes no lower at each point: touches that each find the paper lower do not add up."""
     bench = Bench(tmp_path, (0.5, -0.5), paper_z_mm=119.4)
     touch: dict[str, Any] = {"method": method, "residual_mm": 9.0, "touches": 1, "points_mm": points_mm}
     config = bench.rig.config.model_copy(update={"touch": TouchConfig.model_validate(touch)})

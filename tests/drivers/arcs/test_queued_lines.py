@@ -227,7 +227,7 @@ def sends_aside(_: AuboArcs, cabinet: Cabinet) -> None:
             lambda arm, _: asyncio.create_task(arm.stop()),
             pytest.raises(MotionFailed, match=r"was stopped|holds 0 of 3 lines"),
         ),
-        (sends_aside, pytest.raises(PathDisturbed, match=r"holds 4 lines, 3 were sent.*nother client")),
+        (sends_aside, pytest.raises(PathDisturbed, match=r"holds 4 lines, but 3 were sent.*nother client")),
     ],
 )
 @pytest.mark.parametrize(("method", "number"), [(STOP_MOVE, 1), (LINE, 1), (LINE, 3), (SIZE, 1)])

@@ -187,7 +187,7 @@ async def test_an_arm_that_somebody_moves_right_now_is_not_fought(arm: AuboArcs,
     await other.move_line(LOW, 1.0, 800.0)
     sent = cabinet.taken
     for refused in (arm.move(ELSEWHERE, **QUICK), arm.take_up(), arm.confirm()):
-        with pytest.raises(ArmMoved, match="Wait until it rests") as caught:
+        with pytest.raises(ArmMoved, match="Wait until the arm rests") as caught:
             await refused
         assert caught.value.moving
     assert cabinet.taken == sent, "nothing was queued behind it"
