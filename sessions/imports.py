@@ -84,20 +84,23 @@ def import_photographs(
         with staged_folder(out) as stage, new_mcap(stage / f"{out.name}.mcap", header, {}) as writer:
             for image, stroke in counted(rows, "photographs imported", len(rows), progress):
                 t_ns = now_ns()
-                writer.record(Outgoing(Topic.STILL, t_ns, t_ns, stroke.still, _photograph(image, t_ns)))
+                writer.record(Outgoing(Topic.STILL, t_ns, t_ns, stroke.still, _photograph(image, stroke, t_ns)))
                 writer.record(Outgoing(Topic.STROKE, t_ns, t_ns, stroke.still, stroke))
     except OSError as error:
         raise InputError(out, f"cannot write: {in_one_line(error)}") from error
     return out / f"{out.name}.mcap"
 
 
-def _photograph(path: Path, t_ns: int) -> CompressedImage:
-    """A photograph that can be decoded, as it is recorded. Raises `InputError`."""
+def _photograph(path: Path, stroke: Stroke, t_ns: int) -> CompressedImage:
+    """A photograph that can be decoded and shows the start of its stroke, as it is recorded. Raises `InputError`."""
     data = read_bounded(path, MAX_IMAGE_BYTES)
     try:
-        decode_gray(data, str(path))
+        height, width = decode_gray(data, str(path)).shape
     except SessionDamaged as error:
         raise InputError(path, error.what) from None
+    x, y = stroke.anchor_px or (0, 0)
+    if not (0 <= x < width and 0 <= y < height):
+        raise InputError(path, f"is {width} x {height} pixels, without (start_x_px, start_y_px) = ({x:g}, {y:g})")
     return image_message(t_ns, data, "png" if data.startswith(PNG_START) else "jpeg")
 
 
@@ -106,8 +109,6 @@ def _read_table(folder: Path, path: Path, options: ImportOptions) -> list[tuple[
 
     `folder` is that of the photographs, with links resolved.
     """
-    if not path.is_file():
-        raise InputError(path, "no such table")
     try:
         text = read_bounded(path, MAX_TABLE_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError:

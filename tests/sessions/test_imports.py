@@ -128,6 +128,7 @@ REFUSED = [
     (row('"a\n.png"'), "line 3: 'a\\n.png' holds control"),
     (row('"a.png"x'), "line 2: ',' expected after '\"'"),
     (row("cut.png"), "photos/cut.png: is not a complete PNG or JPEG image"),
+    (row().replace("1,1,1,1\n", "900,1,1,1\n"), "photos/a.png: is 24 x 24 pixels, without (start_x_px, start_y_px) = (900, 1)"),
     ("file,größe_mm\n".encode("latin-1"), "photos/table.csv: is not UTF-8 text"),
 ]
 
@@ -156,7 +157,7 @@ def test_what_is_too_large_is_refused(rows, refusal, monkeypatch, limit, file):
 def test_without_folder_or_table_and_where_a_session_is_nothing_is_imported(make, photos, out, refusal):
     assert refusal() == "photos: is not a folder of photographs"
     photos.mkdir()
-    assert refusal() == "photos/table.csv: no such table"
+    assert refusal() == "photos/table.csv: no such file"
     make.photographs(photos, *ROWS)
     out.mkdir(parents=True)
     assert "exists already" in refusal()

@@ -29,8 +29,8 @@ NAMED = {
     Trap.SWAPPED_CORNER: r"are swapped|as in a mirror",
     Trap.MIRRORED_CAMERA: r"mirrored.*Switch mirroring",
     Trap.WRONG_BOARD_SIZE: r"% of its printed size.*Print it again at 100 %",
-    Trap.PARK_IN_PICTURE: r"in one of the two pictures.*Park it farther",
-    Trap.SHEET_OUT_OF_REACH: r"move the board with the sheet",
+    Trap.PARK_IN_PICTURE: r"in one of the two pictures.*Park the arm farther",
+    Trap.SHEET_OUT_OF_REACH: r"move board and sheet",
     Trap.OLD_SOFTWARE: r"runs AUBOPE.*ask the maker for the upgrade",
     Trap.CABLE_PULLED: r"Check power, cable and address",
 }
