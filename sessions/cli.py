@@ -134,8 +134,8 @@ def import_(
 
     options = ImportOptions(kind, px_per_mm, licence, origin, brush, brush_radius_mm, brush_length_mm, simulated)
     target = out or Path("sessions") / folder.resolve().name
+    software = f"brushloop {version('brushloop')}"
     with shown() as progress:
-        software = f"brushloop {version('brushloop')}"
         path = import_photographs(folder, csv, target, options, software, time.time_ns, progress=progress)
     size = f"Brush: R = {brush_radius_mm:g} mm, L = {brush_length_mm:g} mm (--brush-radius-mm, --brush-length-mm)"
     say(f"Imported into {path}", *([size] if kind == "press" else []), f"Next: brushloop analyse {path.parent}")
