@@ -58,7 +58,7 @@ def characters(folder: Path, **fields: Any) -> Path:
 
 def test_a_loop_in_the_session_is_the_third_row_of_table_1(place: Path) -> None:
     put(place / "loop", loop_text(place))
-    assert "than other presses of the same depth and tilt" in said("validate", place, *FAST)
+    assert "than other presses of the same depth and tilt" in said("validate", place, *FAST, left_out=True)
     report, page = report_of(place)
     [row] = [row for row in table_1(report) if row.label == "robot writing"]
     assert row.scores is not None
@@ -99,13 +99,13 @@ def test_what_belongs_to_other_strokes_ink_or_brushes_is_left_out_with_the_reaso
         ({"original_sha256": "3" * 64}, f"it belongs to another recording of {place.name}"),
     ):
         put(place / "loop", loop_text(place, **changes))
-        assert words in said("validate", place, *FAST)
+        assert words in said("validate", place, *FAST, left_out=True)
     for changes, words in (
         ({"source": Source.LOOPBACK}, "its source is loopback rig, not imported photographs"),
         ({"brush": "goat hair"}, "it was written with another brush, goat hair"),
     ):
         characters(place.parent.parent / "written", **changes)
-        assert words in said("validate", place, *FAST)
+        assert words in said("validate", place, *FAST, left_out=True)
     report, _ = report_of(place)
     assert report.loops == report.written == ()
 
@@ -113,7 +113,7 @@ def test_what_belongs_to_other_strokes_ink_or_brushes_is_left_out_with_the_reaso
 @pytest.mark.parametrize("beside", ["sessions/presses/written", "written"])
 def test_table_3_has_the_papers_rows_beside_and_figure_13(place: Path, beside: str) -> None:
     characters(place.parent.parent / beside)
-    assert "Table 3: 字" in said("validate", place, *FAST)
+    assert "Table 3: 字" in said("validate", place, *FAST, left_out=True)
     report, page = report_of(place)
     like, strict = (table_3(report.written[0], "字", key[0]) for key in (NORMAL, STRICT))
     assert {row.label: None if row.paper is None else row.paper.csim[2] for row in like} == {
@@ -143,7 +143,7 @@ def test_what_others_wrote_is_escaped(place: Path) -> None:
     named = dict.fromkeys(("model", "session", "command", "software"), bad)
     characters(place / "written", table_3=table_of(bad, bad), **named)
     put(place / "loop", loop_text(place, command=bad, software=bad, model=bad))
-    assert "Table 3: <img" in said("validate", place, *FAST)  # a terminal shows it as it is
+    assert "Table 3: <img" in said("validate", place, *FAST, left_out=True)  # a terminal shows it as it is
     _, page = report_of(place)
     assert "<img src=x" not in page
     assert page.count("&lt;img src=x onerror=alert(1)&gt;{{ 7 * 7 }}") > 8

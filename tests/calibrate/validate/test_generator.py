@@ -45,7 +45,7 @@ def generator(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_generator_is_scored_beside_what_it_was_trained_on(session: Path, generator: Path, tmp_path: Path) -> None:
-    said("validate", session, "--out", tmp_path, "--generator", generator, "--no-held-out")
+    said("validate", session, "--out", tmp_path, "--generator", generator, "--no-held-out", left_out=True)
     report = Report.read(tmp_path)
     drawn, exact = (report.stat(name, NORMAL) for name in ("ccd-bsmg", "ccd-bsm"))
     assert drawn is not None
@@ -76,7 +76,7 @@ def test_a_generator_is_tuned_on_the_presses_of_a_session(session: Path, generat
     images = captures_of([open_session(session)], generator)[0].images
     inputs, truth = images.pick(np.arange(len(images)))
     command = ("train", "tune", generator, session, "--out", tmp_path / "tuned", "--steps", "100")
-    output = said(*command, "--learning-rate", "0.001")
+    output = said(*command, "--learning-rate", "0.001", left_out=True)
     assert "left out: blank" in output
     assert "10 presses (imported photographs)" in output
     tuned = load_generator(tmp_path / "tuned" / "generator.safetensors")

@@ -41,7 +41,7 @@ QUICK = ("--model", "line", "--no-held-out")
 @pytest.fixture(scope="module")
 def folder(session: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("report")
-    output = said("validate", session, "--out", out)
+    output = said("validate", session, "--out", out, left_out=True)
     assert "10 brush presses at 5 combinations" in output
     assert "1 more could not be used" in output
     assert "imported photographs" in output
@@ -127,7 +127,7 @@ def test_what_is_no_gate_is_refused_before_any_work(text: str) -> None:
 
 
 def test_only_the_models_asked_for_and_an_unknown_one_is_refused(session: Path, tmp_path: Path) -> None:
-    said("validate", session, "--out", tmp_path, *QUICK, "--model", "circle")
+    said("validate", session, "--out", tmp_path, *QUICK, "--model", "circle", left_out=True)
     report = Report.read(tmp_path)
     assert {stat.model for stat in report.stats} == {"line", "circle", "another press", "ceiling"}
     assert "'square' is not one of: ccd-bsm" in refused("validate", session, "--out", tmp_path, "--model", "square")
@@ -139,7 +139,7 @@ def test_a_capture_that_a_person_marked_bad_is_left_out_by_name(session: Path, t
     still = next(stroke.still for stroke in Recording(marked).stroke_records() if stroke.stroke_id == "3")
     for bad in (True, False):  # also where the work of before is still there
         add_remark(marked, Remark(t_ns=1, still=still, stroke_id="3", bad=bad, note="<b>hair</b> in it"))
-        said("validate", marked, "--out", tmp_path / "out", *QUICK)
+        said("validate", marked, "--out", tmp_path / "out", *QUICK, left_out=True)
         reasons = {press.stroke_id: press.why for press in Report.read(tmp_path / "out").refused}
         assert reasons.get("3") == ("was marked bad: <b>hair</b> in it" if bad else None)
         assert ("&lt;b&gt;hair" in (tmp_path / "out" / "report.html").read_text()) == bad
@@ -149,8 +149,8 @@ def test_ablations_show_lambda_and_the_number_of_strokes(session: Path, tmp_path
     curve = tmp_path / "training"
     curve.mkdir()
     (curve / "validation.csv").write_text("step,mse,iou,csim\n10,0.1,0.5,0.6\n20,0.01,0.9,0.95\n")
-    given = ("--model", "ccd-bsm", "--model", "ccd-bsm-lambda-1", "--model", "ccd-bsm-lambda-pi/2")
-    said("validate", session, "--out", tmp_path / "out", *given, "--ablations", "--curves", f"QBC={curve}")
+    given = ("--ablations", "--model", "ccd-bsm", "--model", "ccd-bsm-lambda-1", "--model", "ccd-bsm-lambda-pi/2")
+    said("validate", session, "--out", tmp_path / "out", *given, "--curves", f"QBC={curve}", left_out=True)
     report = Report.read(tmp_path / "out")
     assert report.stat("ccd-bsm-lambda-1") is not None
     by_count = {step.strokes: step.csim for step in report.by_strokes if step.model == "CCD-BSM"}
@@ -227,7 +227,7 @@ TWO = ("--model", "line", "--model", "ellipse", "--no-held-out")
 @pytest.fixture(scope="module")
 def before(session: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("before")
-    said("validate", session, "--out", out, *TWO)
+    said("validate", session, "--out", out, *TWO, left_out=True)
     return out
 
 
@@ -235,7 +235,7 @@ def test_another_version_of_a_model_is_compared_stroke_by_stroke(
     session: Path, before: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(validation, "_pressed", lambda model, at: (model.profile(at.depth_mm, at.tilt_deg), -9.0))
-    said("validate", session, "--out", tmp_path, *TWO)
+    said("validate", session, "--out", tmp_path, *TWO, left_out=True, left_out=True)
     found = compare(DiffRequest(before, tmp_path / "report.json"))
     assert found.by_stroke
     assert len(found.changes) == 3 * 4 * 2
