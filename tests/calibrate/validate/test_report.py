@@ -235,7 +235,7 @@ def test_another_version_of_a_model_is_compared_stroke_by_stroke(
     session: Path, before: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(validation, "_pressed", lambda model, at: (model.profile(at.depth_mm, at.tilt_deg), -9.0))
-    said("validate", session, "--out", tmp_path, *TWO, left_out=True, left_out=True)
+    said("validate", session, "--out", tmp_path, *TWO, left_out=True)
     found = compare(DiffRequest(before, tmp_path / "report.json"))
     assert found.by_stroke
     assert len(found.changes) == 3 * 4 * 2
