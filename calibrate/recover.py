@@ -21,7 +21,7 @@ from brushloop.calibrate.compare import MM_PER_PX
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import check_target, write_whole
 from brushloop.calibrate.fit.command import BrushFit
-from brushloop.calibrate.presses import Press, Refused, cut, read_presses
+from brushloop.calibrate.presses import Press, Refused, beside_touch, cut, read_presses
 from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.calibrate.stats import Floats, student_95
 from brushloop.model.inversion import Flag, Inverter, Range
@@ -143,7 +143,7 @@ def recover(request: RecoverRequest, progress: Progress = unseen) -> Recovered:
     count, refused = len(session.strokes), list[Refused]()
     most = min(count, request.presses or count)
     chosen = {session.strokes[number * count // most].stroke_id for number in range(most)}
-    presses = read_presses(session, refused, cut, chosen=chosen, progress=progress)
+    presses = read_presses(session, refused, beside_touch, cut, chosen=chosen, progress=progress)
     rows = [row for press in presses if (row := _row(press, inverter, refused))]
     if not rows:
         why = f": {refused[0][0]}: {refused[0][1]}" if refused else ""
