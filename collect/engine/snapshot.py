@@ -13,6 +13,8 @@ from collections import Counter, deque
 from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from itertools import pairwise
+from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from brushloop.collect.engine.control import State
@@ -361,8 +363,8 @@ class Progress:
         )
 
     def _eta_s(self, times_ns: Sequence[int]) -> float | None:
-        """Remaining time, from the times of this process's captures that count."""
+        """Remaining time, from the median time between this process's captures that count: a pause is no pace."""
         if not self.left:
             return 0.0
-        timed = len(times_ns) - 1
-        return len(self.left) * (times_ns[-1] - times_ns[0]) / 1e9 / timed if timed > 0 else None
+        each_ns = [after - before for before, after in pairwise(times_ns)]
+        return len(self.left) * median(each_ns) / 1e9 if each_ns else None
