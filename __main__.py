@@ -26,10 +26,10 @@ EXIT_CODES = {
     1: "a defect: please report it with its traceback",
     2: "input or configuration cannot be used; nothing half-written is left",
     3: "finished, but strokes were left out, or a repair lost something",
-    4: "stopped or aborted, also by a full disk, too little memory or a closed output; the same command continues",
+    4: "stopped or aborted, also by a full disk, too little memory or a closed output; repeat the command to continue",
     5: "finished, but a required score was missed (`validate --gate`), or the rig's settings contradict each other",
     6: "a recording is damaged: try `brushloop sessions repair`",
-    130: "interrupted by Ctrl-C; `collect` and `sim` then end in order, with one of the codes above",
+    130: "interrupted by Ctrl-C (`collect` and `sim` instead shut down in order, with one of the codes above)",
 }
 """What each exit code of every command means."""
 
@@ -99,10 +99,10 @@ def options(
 EVERY_DAY, SET_UP, RESEARCH, SIMULATOR = "Every day", "Set-up", "Research", "Simulator"
 GROUPS = {
     "validate": (RESEARCH, "Compare every stroke model with every captured stroke (`brushloop validate SESSION...`)."),
-    "repress": (RESEARCH, "Recover depth and tilt of a SESSION's presses, repeat and compare them; or only compare."),
+    "repress": (RESEARCH, "Recover depth and tilt of a SESSION's presses, press them again, compare; or only compare."),
     "write": (RESEARCH, "Write characters on the rig and compare them with the wanted images; or do one step alone."),
     "train": (RESEARCH, "Train the neural stroke generator, or tune it on captures."),
-    "sim": (SIMULATOR, "Serve the simulated loopback rig, break it, or act as the person in an unknown lab."),
+    "sim": (SIMULATOR, "Serve the loopback rig, make its devices fail, or act as the person in a simulated lab."),
 }
 """Groups whose first command runs where no other is named: where the help lists them, and its words."""
 COMMANDS: tuple[tuple[str, str, type[Any], str], ...] = (
@@ -127,7 +127,7 @@ COMMANDS: tuple[tuple[str, str, type[Any], str], ...] = (
 )
 """Commands of analysis: name, where the help lists it, what it takes, and the function that does it."""
 
-camera = typer.Typer(help="Print a board, and calibrate the lens by photographs of it.", no_args_is_help=True)
+camera = typer.Typer(help="Make a printable board, and calibrate the lens by photographs of it.", no_args_is_help=True)
 groups = {"sessions": brushloop.sessions.cli.app, "camera": camera}
 app.add_typer(brushloop.collect.cli.app, name="collect", rich_help_panel=EVERY_DAY)
 app.add_typer(groups["sessions"], name="sessions", rich_help_panel=EVERY_DAY)
@@ -153,13 +153,13 @@ def sim(
     rate: Annotated[float, typer.Option(min=0.01, max=1000, help="Simulated seconds per real second.")] = 1.0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of brush, presses and noise.")] = 1,
     fps: Annotated[float, typer.Option(min=1, max=60, help="Camera pictures per real second.")] = 8.0,
-    idle_exit: Annotated[float, typer.Option(min=0, help="End after so many seconds without clients; 0: never.")] = 0.0,
+    idle_exit: Annotated[float, typer.Option(min=0, help="Seconds without a client until the end; 0: never.")] = 0.0,
     brush: Annotated[
         Path, typer.Option(help="A shipped brush, `loopback` or `table2`, or one described in a brush.toml.")
     ] = Path("loopback"),
     control: Annotated[Path | None, typer.Option(help="Control socket to make for `sim fault` and `sim hand`.")] = None,
     unknown: Annotated[
-        int | None, typer.Option(min=0, help="Serve a lab of unknown dimensions, drawn from this seed.")
+        int | None, typer.Option(min=0, help="Serve a simulated lab whose unknown dimensions are drawn from this seed.")
     ] = None,
     trap: Annotated[str | None, typer.Option(help="What is wrong in the unknown lab, such as swapped-corner.")] = None,
 ) -> None:
@@ -198,12 +198,12 @@ def sim(
 
 @groups["sim"].command()
 def fault(
-    control: Annotated[Path, typer.Argument(help="Control socket of a rig: `brushloop sim --control PATH`.")],
+    control: Annotated[Path, typer.Argument(help="Control socket of a rig, made by `brushloop sim --control PATH`.")],
     what: Annotated[str, typer.Argument(help="Device to break; or list, clear, state, release or fresh-sheet.")],
     kind: Annotated[
         str | None, typer.Argument(help="Kind of fault, such as mute, late, black or bus-off (all in docs/faults.md).")
     ] = None,
-    on: Annotated[str | None, typer.Option(help="Only in calls of this robot method, such as moveLine.")] = None,
+    on: Annotated[str | None, typer.Option(help="Fail only in calls of this robot method, such as moveLine.")] = None,
     nth: Annotated[int | None, typer.Option(help="Begin at the n-th request, push or frame.")] = None,
     phase: Annotated[str | None, typer.Option(help="Begin while the arm does this, such as descending.")] = None,
     press: Annotated[int | None, typer.Option(help="Begin while this many presses are on the paper.")] = None,
@@ -229,11 +229,11 @@ def fault(
 
 @groups["sim"].command()
 def hand(
-    control: Annotated[Path, typer.Argument(help="Control socket of a lab: `brushloop sim --control PATH`.")],
+    control: Annotated[Path, typer.Argument(help="Control socket of a lab, made by `brushloop sim --control PATH`.")],
     act: Annotated[str, typer.Argument(help="What the person does: bring, measure or mend.")],
-    to: Annotated[str | None, typer.Argument(help="Thing, such as pin or square; an unknown word lists all.")] = None,
-    index: Annotated[int, typer.Option(min=1, max=999, help="Its number, from 1, such as a direction at the pin.")] = 1,
-    corner: Annotated[str | None, typer.Option(help="Its corner, such as 'lower left' or 'upper right'.")] = None,
+    to: Annotated[str | None, typer.Argument(help="Thing, such as pin; an unknown word lists all things.")] = None,
+    index: Annotated[int, typer.Option(min=1, max=999, help="Number of the thing, from 1 (direction at the pin).")] = 1,
+    corner: Annotated[str | None, typer.Option(help="Corner of the thing, as 'lower left' or 'upper right'.")] = None,
 ) -> None:
     """Act as the person in an unknown lab: guide the arm by hand, hold the printed board, correct mistakes."""
     from brushloop.drivers.loopback import ask

@@ -117,9 +117,9 @@ def current(session: Path, folder: str = FOLDER) -> Path | None:
         return None
     name = NAME.fullmatch(read_bounded(pointer, MAX_POINTER_BYTES))
     if name is None:
-        what = f"holds no name of an artefact ({HASH_CHARS} hexadecimal digits and .json)"
+        what = f"does not hold the name of an artefact ({HASH_CHARS} hexadecimal digits and .json)"
         raise CalibrationError(str(pointer), what)
     path = pointer.with_name(name[1].decode())
     if not path.is_file():
-        raise CalibrationError(str(pointer), f"names {path.name}, which is not there: calibrate or fit {session} again")
+        raise CalibrationError(str(pointer), f"names {path.name}, which is missing: calibrate or fit {session} again")
     return path

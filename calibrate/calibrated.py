@@ -86,7 +86,7 @@ def calibrate_session(
     known = rig.lens if request.lens is None else read_lens(request.lens)
     stills = list(recording.stills_of("board"))
     if not stills:
-        raise CalibrationError(where, "holds no view of the board (a `board` step)")
+        raise CalibrationError(where, "holds no photograph of the board, which a `board` step takes")
     *earlier, (last_ns, still) = stills
     image = decode_gray(still, where)
     view, plane = see_board_and_lens(image, rig.board, known, where, rig.sheet_mm)
@@ -136,17 +136,17 @@ def calibrate_lens(request: LensRequest, progress: Progress = unseen) -> Written
 
 def _moved(calibration: Calibration, still: bytes, minutes: float, where: str) -> str:
     """What an earlier photograph of the board says against the calibration; empty where the board lay in its place."""
-    before = f"{minutes:.0f} min before the last view of the board"
+    before = f"{minutes:.0f} min before the last photograph of the board, the board"
     try:
         view = find_board(decode_gray(still, where), calibration.board, where)
     except CalibrationError as error:
-        return f"{before}, the board is not seen: {error.what}"
+        return f"{before} is not seen: {error.what}"
     off = np.linalg.norm(view.pixels - calibration.to_image(paper_mm(view, calibration.board)), axis=1)
     off_px = float(np.median(off))
     if off_px <= MOVED_PX:
         return ""
     off_mm = off_px * calibration.mm_per_px
-    return f"{before}, the board lay {off_px:.1f} px ({off_mm:.2f} mm) away: strokes are off, as camera or board moved"
+    return f"{before} lay {off_px:.1f} px ({off_mm:.2f} mm) away: camera or board moved, so strokes are misplaced"
 
 
 def _picture(calibration: Calibration, image: Gray, view: BoardView) -> dict[str, Any]:
@@ -188,7 +188,7 @@ def _trust(calibration: Calibration, moved: Sequence[str]) -> Iterator[Point]:
     words = f"{out} of {out + calibration.corners} corners do not lie on the plane of the others and are left out"
     yield Point(True if not out else None if usual else False, f"{words}: {usual or 'is the board flat?'}.")
     if calibration.lens.source == FITTED:
-        yield Point(None, "No lens file: k1 was fitted on this one board, and is known only where corners were seen.")
+        yield Point(None, "Without a lens file, k1 is fitted on this one board and known only where corners were seen.")
     for problem in (*calibration.flags, *moved):
         yield Point(False, f"{problem[0].upper()}{problem[1:]}.")
     if not moved:

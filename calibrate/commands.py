@@ -111,7 +111,7 @@ CharacterData = Annotated[
     Path | None,
     Option(help="Folder with a file for each character, as 字.json, from github.com/chanind/hanzi-writer-data."),
 ]
-FIT = "Brush fit, the session's own by default; CCD-BSM as published with `published`, or if there is no fit."
+FIT = "Brush fit; the session's own by default. `published`, or a session without a fit: CCD-BSM as published."
 PlanFile = Annotated[Path, Option(help="The plan's folder, or its plan.json.")]
 Written = Annotated[Path, Argument(help="The session in which the plan's characters were written.")]
 
@@ -139,8 +139,8 @@ class FitRequest:
     """
 
     session: Annotated[Path, Argument(help="A session of presses, or of drags: its folder or its .mcap file.")]
-    prior: Annotated[Path | None, Option(help="An earlier dragfit of this brush, to be adapted.")] = None
-    strokes: Annotated[int | None, Option(min=1, help="With --prior: number of strokes, chosen to differ.")] = None
+    prior: Annotated[Path | None, Option(help="An earlier fit of drags with this brush, to be adapted.")] = None
+    strokes: Annotated[int | None, Option(min=1, help="With --prior: number of differing strokes to adapt to.")] = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,11 +149,11 @@ class ValidateRequest:
 
     places: Annotated[tuple[Path, ...], Argument(metavar="SESSION", help="Sessions: folders or .mcap files.")]
     models: Annotated[tuple[str, ...], Option("--model", help="Only these models; all by default.")] = ()
-    generators: Annotated[tuple[Path, ...], Option("--generator", help="Instead of the shipped generator.")] = ()
-    fit: Annotated[Path | None, Option(help="Brush fit (of drags: dragfit); by default the one in use.")] = None
+    generators: Annotated[tuple[Path, ...], Option("--generator", help="Replaces the shipped generator.")] = ()
+    fit: Annotated[Path | None, Option(help="Fit of the presses or drags; by default the one in use.")] = None
     out: Annotated[Path | None, Option(help="Folder of the report; <session>/validation by default.")] = None
-    gates: Annotated[tuple[str, ...], Option("--gate", help="Least score, quoted: 'csim_avg>=0.90'; else exit 5.")] = ()
-    ablations: Annotated[bool, Option("--ablations", help="Add other lambdas, and fits to fewer presses.")] = False
+    gates: Annotated[tuple[str, ...], Option("--gate", help="Least score, as 'csim_avg>=0.90'; exit 5 if missed.")] = ()
+    ablations: Annotated[bool, Option("--ablations", help="Also try other lambdas, and fits to fewer presses.")] = False
     curves: Annotated[tuple[str, ...], Option(help="NAME=FOLDER of a training, for figures 9 and 12.")] = ()
     held_out: Annotated[bool, Option(help="Also predict each condition by a fit to all others.")] = True
     scheduler: Annotated[str, Option(help="An existing Dask cluster, as tcp://host:8786.")] = ""
@@ -180,7 +180,7 @@ class ExportRequest:
     session: Annotated[Path, Argument(help="A closed session's folder, or an .mcap file.")]
     out: Annotated[Path, Argument(help="Folder to create.")]
     kind: Annotated[str, Option("--format", help="How tables are written: csv or parquet.")] = "csv"
-    crops: Annotated[bool, Option("--crops", help="Write rectified crops at 20 px/mm with masks instead.")] = False
+    crops: Annotated[bool, Option("--crops", help="Rectified crops (20 px/mm) and masks, no photographs.")] = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,7 +188,7 @@ class RecoverRequest:
     """Recover depth and tilt of every captured press; writes a CSV and a protocol that presses them again."""
 
     session: Annotated[Path, Argument(help="A session's folder or its .mcap file; imports count as sessions.")]
-    out: Annotated[Path, Option(help="CSV to write, beside protocol-replay.toml.")] = Path("recovered.csv")
+    out: Annotated[Path, Option(help="CSV to write; protocol-replay.toml is put beside it.")] = Path("recovered.csv")
     fit: Annotated[Path | None, Option(help=FIT)] = None
     depth_range_mm: tuple[float, float] = (2.0, 30.0)
     tilt_range_deg: tuple[float, float] = (0.0, 30.0)
@@ -203,7 +203,7 @@ class CompareLoopRequest:
     """Compare re-pressed strokes with their originals, and with the brush's own repeatability."""
 
     original: Annotated[Path, Argument(help="The session whose strokes were pressed again.")]
-    again: Annotated[Path, Argument(help="The session of the replay protocol.")]
+    again: Annotated[Path, Argument(help="The session that pressed them again.")]
     fit: Annotated[Path | None, Option(help=FIT)] = None
     out: Annotated[Path, Option(help="Folder for loop.html, loop.csv, loop.json.")] = Path("loop")
     command: str = field(default_factory=_command_line)
@@ -257,7 +257,7 @@ class PracticeRequest:
 class FitFootprintRequest:
     """Fit the footprint of the dragged brush, for `write plan --footprint`."""
 
-    session: Annotated[Path, Argument(help="A calibrated session of a practice sheet, or of any figures.")]
+    session: Annotated[Path, Argument(help="A calibrated session of a practice sheet or of written characters.")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -299,7 +299,7 @@ class PrintRequest(BoardOptions):
     """Write a printable board as a PDF at true scale."""
 
     out: Annotated[Path, Argument(help="PDF to create.")]
-    page: Annotated[str, Option(help="Size: a4, a3, a2 or letter.")] = "a4"
+    page: Annotated[str, Option(help="Size of the page: a4, a3, a2 or letter.")] = "a4"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -316,7 +316,7 @@ class TrainRequest:
 
     out: Annotated[Path, Option(help="Folder of this training; the same command resumes it.")] = Path("generator")
     target: Annotated[str, Option(help="Kind of image: press (centred) or anchored (at the point of touch).")] = "press"
-    config: Annotated[Path | None, Option(help="A train.toml instead of a target's defaults.")] = None
+    config: Annotated[Path | None, Option(help="A train.toml, used instead of the defaults of --target.")] = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -112,7 +112,7 @@ class LoopRecord(Sealed):
     def answer(self) -> Point:
         """The result in one sentence."""
         if not self.lost:
-            return Point(None, f"{self.again}: no condition was pressed twice: the brush's repeatability is unknown.")
+            return Point(None, f"{self.again}: no condition was pressed twice, so the repeatability is unknown.")
         points, *_, measure, row = max(self.lost, key=lambda lost: lost[0])
         good = min((near for _, _, near, *_ in self.lost), key=(False, None, True).index)
         sure = " Whether this goal is met will be certain only with more repeated presses." if good is None else ""
@@ -136,8 +136,8 @@ def compare(request: CompareLoopRequest, progress: Progress = unseen) -> Written
         raise CalibrationError(where, f"has the source {source}, but the original has {first.header.source}")
     repeated = _replayed(second.header)
     if repeated != first.header.session_id:
-        what = "repeats no session" if repeated is None else f"repeats {repeated}"
-        raise CalibrationError(where, f"{what}, not {first.header.session_id}")
+        what = "" if repeated is None else f", but {repeated}"
+        raise CalibrationError(where, f"does not repeat {first.header.session_id}{what}")
     model, fit = BrushFit.model_of(request.fit, first)
     refused: list[Refused] = []
     originals, repetitions = (
@@ -146,7 +146,7 @@ def compare(request: CompareLoopRequest, progress: Progress = unseen) -> Written
     pairs = pair_up(originals, repetitions, model, refused)
     if not pairs:
         why = f": {refused[0][0]}: {refused[0][1]}" if refused else ""
-        raise CalibrationError(where, f"not one pair can be compared{why}")
+        raise CalibrationError(where, f"no pair of presses can be compared{why}")
     scores = score_pairs(pairs, originals)
     record = LoopRecord(
         source=source,
@@ -181,8 +181,8 @@ def pair_up(
     for press in repetitions:
         name, original = press.stroke.stroke_id, by_name.get(press.stroke.again_of or "")
         if original is None:
-            of = press.stroke.again_of or "no stroke"
-            refused.append((name, f"repeats {of}, of which no usable original exists"))
+            of = press.stroke.again_of or "an unnamed stroke"
+            refused.append((name, f"repeats {of}, whose original is missing or cannot be used"))
             continue
         try:
             images = simulated(model, press.condition.depth_mm, press.condition.tilt_deg)
@@ -268,6 +268,6 @@ def _trust(record: LoopRecord) -> Iterator[Point]:
     yield source_point(record.source)
     if record.in_sample:
         words = "The model that recovered depth and tilt was fitted to these same presses with their commanded values"
-        yield Point(None, f"{words}: recovered values near these prove nothing about it. Compare the marks.")
+        yield Point(None, f"{words}. Recovered values near these prove nothing about the model: compare the marks.")
     if record.refused:
         yield Point(False, f"{len(record.refused)} strokes are not compared; each is named below, with the reason.")

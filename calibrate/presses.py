@@ -242,7 +242,7 @@ def prepare_press(capture: Capture, calibration: Calibration | None) -> Prepared
     if calibration is not None and stroke.anchor_mm is not None:
         return prepared
     if prepared.anchor_px is None:
-        raise CaptureRefused(stroke.stroke_id, "has no touch point (start_x_px, start_y_px) to lay it on a model")
+        raise CaptureRefused(stroke.stroke_id, "has no touch point (start_x_px, start_y_px) to align it with a model")
     return _cropped(prepared, prepared.anchor_px)
 
 

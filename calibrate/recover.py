@@ -185,7 +185,7 @@ def _inverter(request: RecoverRequest, session: OpenSession) -> tuple[Inverter, 
         within = Range((max(low_mm, least_mm), high_mm), request.tilt_range_deg)
         return Inverter(model, within, px_mm=MM_PER_PX, anchor_sigma_mm=ANCHOR_SD_MM), fitted
     except ValueError as error:
-        raise CalibrationError(str(request.session), f"no press of this brush in the range: {error}") from None
+        raise CalibrationError(str(request.session), f"no depth and tilt that this brush can press: {error}") from None
 
 
 def _row(press: Press, inverter: Inverter, refused: list[Refused]) -> Row | None:

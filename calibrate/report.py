@@ -37,7 +37,7 @@ MAX_SEALED_BYTES = 256 * 1024 * 1024
 ORIGIN = {
     Source.LOOPBACK: "simulated brush, ink and camera; not a result on paper",
     Source.REAL: "ink on paper, pressed by the arm named below",
-    Source.IMPORT: "not collected by brushloop; scale and commands come from their table",
+    Source.IMPORT: "not collected by brushloop; scale and commands come from the import's table",
     Source.IMPORT_SIMULATED: "simulated ink, as declared when it was imported; not a result on paper",
 }
 """Where the ink comes from."""

@@ -23,8 +23,8 @@ Kind = Literal["press", "drag"]
 EFFECTIVE = "rig.effective.json"
 """The configuration in effect: rig.toml, with the changes that the environment made."""
 OTHER_KIND = {
-    "press": "holds drags, which `fit` and `validate` take: this needs presses",
-    "drag": "holds presses: this needs drags",
+    "press": "holds drags, but presses are needed here (`fit` and `validate` also take drags)",
+    "drag": "holds presses, but drags are needed here",
 }
 
 

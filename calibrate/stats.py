@@ -209,7 +209,7 @@ def odd_waits(waits: Mapping[K, float]) -> dict[K, str]:
     median = float(np.median(known))
     most_s = max(ODD_S, ODD_SPREADS * float(np.median(np.abs(known - median))))
     return {
-        key: f"touched the paper {wait:.1f} s after its dip, the others after {median:.1f} s"
+        key: f"touched the paper {wait:.1f} s after its dip, other strokes after {median:.1f} s"
         for key, wait in waits.items()
         if abs(wait - median) > most_s
     }

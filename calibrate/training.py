@@ -145,13 +145,13 @@ def _samples(file: GeneratorFile, captures: Captures | None) -> Iterator[dict[st
 def _trust(file: GeneratorFile, checks: NDArray[np.float64]) -> Iterator[Point]:
     """What to know of it; `checks` (k, 2) are step and MSE of each validation."""
     if file.config.tuning:
-        yield Point(None, "The generator was tuned on captures: others of the same kind are no independent test.")
+        yield Point(None, "The generator was tuned on captures: similar captures are no independent test of it.")
     else:
-        yield Point(None, "The network saw no real ink: on paper it equals at best the closed-form model it learned.")
+        yield Point(None, "The network saw no real ink: on paper, it at best equals the closed-form model it learned.")
     if len(checks) > 1:
         last, lowest = checks[-1], checks[np.argmin(checks[:, 1])]
         if last[1] > MUCH_ABOVE * lowest[1]:
-            words = f"was lowest at step {lowest[0]:.0f} and is {last[1] / lowest[1]:.1f} times that at the end"
+            words = f"was lowest at step {lowest[0]:.0f} and {last[1] / lowest[1]:.1f} times as high at the end"
             yield Point(False, f"The validation loss {words}: the network memorises its training strokes.")
         else:
             yield Point(True, f"The validation loss is at its lowest, or near it, at the end (step {last[0]:.0f}).")
@@ -198,7 +198,7 @@ def _facts(file: GeneratorFile, path: Path) -> Iterator[tuple[str, str]]:
         f"{report.get('steps')} steps of {config.batch}, seed {config.seed}, highest rate {config.learning_rate:g}: "
         f"{report.get('end')}; torch {report.get('torch')}",
     )
-    images = "captured strokes that were held out" if tuning else "exact images that it was not trained on"
+    images = "captured strokes that were held out" if tuning else "exact images kept out of the training"
     yield "judged by", f"{report.get('images')} {images}; {report.get('ssim_settings')}"
     for name, key, form in NUMBERS:
         if isinstance(value := report.get(key), int | float):

@@ -164,7 +164,7 @@ def cluster(address: str) -> Generator[Scheduler]:
     try:
         client: Any = untyped(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TypeError, ImportError) as error:
-        raise CalibrationError(where, f"no Dask scheduler there ({in_one_line(error)})") from None
+        raise CalibrationError(where, f"no Dask scheduler answers ({in_one_line(error)})") from None
     try:
         answers: dict[str, Any] = client.run(software, on_error="return")
         if not answers:

@@ -62,8 +62,8 @@ PARAMETERS = (
     Parameter("lam", "1", math.pi, 1.5, 0.3, 10.0, "dilation across the axis"),
     Parameter("h0_mm", "mm", 0.0, 2.0, -8.0, 12.0, "zero offset: the ink is that of a press deeper by this much"),
     Parameter("origin_mm", "mm", 0.0, 3.0, -15.0, 15.0, "the widest place, from the point of touch"),
-    Parameter("heel_gain", "1", 1.0, 4.0, 0.1, 15.0, "length of the heel side over O3A"),
-    Parameter("tip_gain", "1", 1.0, 0.5, 0.1, 3.0, "length of the tip side over O4O3"),
+    Parameter("heel_gain", "1", 1.0, 4.0, 0.1, 15.0, "ratio of the heel side's length to O3A"),
+    Parameter("tip_gain", "1", 1.0, 0.5, 0.1, 3.0, "ratio of the tip side's length to O4O3"),
     Parameter("origin_gain", "1", 0.0, 0.5, -1.5, 1.0, "shift of the widest place by depth"),
     Parameter("heel_power", "1", 0.5, 0.5, 0.1, 4.0, "sharpness of the heel"),
     Parameter("heel_round", "1", 2.0, 1.0, 0.6, 6.0, "roundness of the heel side"),
@@ -75,7 +75,7 @@ PARAMETERS = (
     Parameter("width_tilt", "1/deg", 0.0, 0.02, -0.1, 0.1, "growth of the width with tilt"),
     Parameter("length_tilt", "1/deg", 0.0, 0.02, -0.1, 0.1, "growth of the length with tilt"),
     Parameter("lean", "1", 1.0, 0.5, -2.0, 3.0, "share of H tan(alpha) by which the widest place moves with tilt"),
-    Parameter("heel_tilt", "1/deg", 0.0, 0.03, -0.09, 0.2, "growth of the heel side with tilt, beside the length's"),
+    Parameter("heel_tilt", "1/deg", 0.0, 0.03, -0.09, 0.2, "growth of the heel side with tilt, beyond length_tilt"),
 )
 NAMES = tuple(parameter.name for parameter in PARAMETERS)
 PRIOR = Path(__file__).with_name("prior.json")

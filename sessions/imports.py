@@ -65,7 +65,7 @@ def import_photographs(
     if out.exists():
         raise InputError(out, "exists already and is not overwritten: name another folder with --out")
     if not SESSION_ID.fullmatch(out.name):
-        raise InputError(out, "a session's name is letters, digits, '.', '_' and '-', at most 100 of them")
+        raise InputError(out, "a session's name consists of at most 100 letters, digits, '.', '_' and '-'")
     rows = _read_table(folder.resolve(), table, options)
     header = Header(
         session_id=out.name,
@@ -98,7 +98,7 @@ def _photograph(path: Path, stroke: Stroke, t_ns: int) -> CompressedImage:
         raise InputError(path, error.what) from None
     x, y = stroke.anchor_px or (0, 0)
     if not (0 <= x < width and 0 <= y < height):
-        raise InputError(path, f"is {width} x {height} pixels, without (start_x_px, start_y_px) = ({x:g}, {y:g})")
+        raise InputError(path, f"its {width} x {height} pixels do not show (start_x_px, start_y_px) = ({x:g}, {y:g})")
     return image_message(t_ns, data, "png" if data.startswith(PNG_START) else "jpeg")
 
 

@@ -202,7 +202,7 @@ def decode_line(raw: bytes, number: int) -> Entry:
             for name in ("seq", "session", "crc"):
                 del line[name]
         case _:
-            raise ValueError("has no number, session or event")
+            raise ValueError("lacks its number, session or event")
     try:
         return Entry(number, seq, session, parse_event(line))
     except ValueError as error:

@@ -87,7 +87,7 @@ def _repair_file(path: Path) -> Report:
     if file.header is None:
         raise SessionDamaged(path, "has lost its header; it cannot be repaired")
     if not file.session:
-        lost.append("certainty about the header, which does not match its CRC and is kept as it was read")
+        lost.append("proof that the header is right: it does not match its CRC, and was kept as it was read")
     strokes: dict[str, bool] = {}
     attached = {one.name: one.data for one in file.attachments() if one.name != HEADER_FILE}
     kept, counts = _replace_damaged(path, parse_header(file), _whole(file, strokes), attached)
@@ -156,7 +156,7 @@ class _FolderRepair:
             if what == UNKNOWN_PATCH and sheet not in self._state.doubtful_sheets:
                 self._log(events.Doubt(t_ns=self._now_ns(), sheet=sheet, file=name))
                 self._report.lost.append(
-                    f"which patch the press in {name} used: nothing more is pressed on sheet {sheet + 1}; "
+                    f"the patch number of the press in {name}: nothing more is pressed on sheet {sheet + 1}; "
                     f"continue with a fresh sheet and --sheet {sheet + 2}"
                 )
             self._report.did.append(f"put {name} aside: it {what}{self._move_aside(self._folder / name)}")

@@ -37,7 +37,7 @@ from brushloop.sessions.terminal import Progress, counted, unseen
 
 MARKING = (StepKind.PRESS, StepKind.SELF_CHECK)
 """Kinds of steps that use patches."""
-UNKNOWN_PATCH = "does not say which patch it pressed, on which sheet"
+UNKNOWN_PATCH = "does not say which patch of which sheet it pressed"
 
 
 @dataclass(slots=True)

@@ -147,7 +147,7 @@ def workers(most: int = MOST_WORKERS) -> Generator[Executor]:
         with ProcessPoolExecutor(processes, mp_context=spawn, initializer=_end_with_parent) as pool:
             yield pool
     except BrokenExecutor:
-        raise TwinStopped("a process that drew presses was ended (memory?): the same command continues") from None
+        raise TwinStopped("a drawing process was killed (too little memory?): repeat the command to continue") from None
 
 
 def _end_with_parent() -> None:
@@ -283,7 +283,7 @@ def twin_toml(twin: Twin, session_id: str, noise_gray: float | None) -> Iterator
     """
     plain = "".join(char if char.isprintable() and char not in '"\\' else "?" for char in session_id)
     yield f"# Made by `brushloop twin` ({made_by()}); press with it: brushloop sim --brush FILE."
-    yield "# Everything that it presses is simulated. Intervals hold about 95 %: docs/loopback-brush.md."
+    yield "# Everything that this brush presses is simulated. Intervals cover about 95 %: see docs/loopback-brush.md."
     yield f'name = "simulated bristle bundle (twin of {plain[:60]}, simulated)"'
     if noise_gray is None:
         yield "# The camera's noise was not measured: no two stills show the same view."
@@ -291,12 +291,12 @@ def twin_toml(twin: Twin, session_id: str, noise_gray: float | None) -> Iterator
         yield from ("", "[camera]", f"noise = {noise_gray:.2f}    # gray levels, from pairs of stills")
     if twin.head is not None:
         yield from ("", "[quality]")
-        yield f"head_mm = {twin.head.head_mm:g}    # where its marks begin behind the point of touch, in the middle"
-        yield f"misplaced_mm = {twin.head.misplaced_mm:g}    # the farthest from there, and a margin"
+        yield f"head_mm = {twin.head.head_mm:g}    # how far behind the point of touch marks begin: middle of the range"
+        yield f"misplaced_mm = {twin.head.misplaced_mm:g}    # half the range of where marks begin, with a margin"
     yield from ("", "[brush]")
     yield f"radius_mm = {twin.spec.radius_mm:g}    # as recorded with the session"
     yield f"length_mm = {twin.spec.length_mm:g}    # as recorded with the session"
-    yield f"seed = {twin.spec.seed}    # of the individuals tried, the one nearest to the captures"
+    yield f"seed = {twin.spec.seed}    # the simulated brush nearest to the captures, of those tried"
     for constant, fitted in twin.values.items():
         known = "not determined by these presses" if fitted.low is None else f"{fitted.low:.4g} to {fitted.high:.4g}"
         unit = f"{constant.unit}; " if constant.unit else ""
@@ -305,7 +305,7 @@ def twin_toml(twin: Twin, session_id: str, noise_gray: float | None) -> Iterator
         scores = f"CSIM {row.csim.avg:.2f} %, SSIM {row.ssim.avg:.2f} %, n = {row.csim.n}"
         yield f"# a third of the conditions left out in turn: {row.model}: {scores}"
     if twin.spread is None:
-        yield "# No condition has three captures: how presses differ is left as in the default brush."
+        yield "# No condition has three captures, so presses differ as those of the default brush do."
     else:
         yield (
             f"# two presses of a condition: CSIM {twin.spread.captured_percent:.2f} % captured, "

@@ -78,8 +78,8 @@ def _charuco(image: Gray, spec: BoardSpec, name: str) -> tuple[Floats, NDArray[n
     if len(foreign) > max(1, 0.1 * len(numbers)):
         raise CalibrationError(
             name,
-            f"shows markers up to number {numbers.max()}, a board of {spec.squares[0]} x {spec.squares[1]} squares has "
-            f"0 to {own.max()}: it is another board",
+            f"shows markers up to number {numbers.max()}, but a board of {spec.squares[0]} x {spec.squares[1]} squares "
+            f"has 0 to {own.max()}: it is another board",
         )
     total = (spec.squares[0] - 1) * (spec.squares[1] - 1)
     if len(ids) < MIN_CORNERS:

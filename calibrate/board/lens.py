@@ -165,10 +165,10 @@ class LensFile(Artefact):
         fx, fy, cx, cy = self.lens.matrix
         return [
             *(
-                f"{name}: {px:.3f} px, slanted by {self.slants_deg[name]:.0f} deg"
+                f"{name}: residual {px:.3f} px, slanted by {self.slants_deg[name]:.0f} deg"
                 for name, px in self.residuals_px.items()
             ),
-            *(f"{name}: {px:.3f} px, dropped: it does not fit the others" for name, px in self.dropped.items()),
+            *(f"{name}: residual {px:.3f} px, dropped: it does not fit the rest" for name, px in self.dropped.items()),
             *(f"{name}: {why}" for name, why in self.unusable.items()),
             f"fx {fx:.2f} px, fy {fy:.2f} px, centre {cx:.1f}, {cy:.1f} px, k1 {self.lens.distortion[0]:+.4f}",
             f"residual {self.rms_px:.3f} px over {len(self.residuals_px)} views, with the board at {self.ways} angles",
@@ -219,7 +219,7 @@ def fit_lens(
     warnings = [f"{view.name}: {flag}" for view in kept for flag in view.flags]
     if rms_px > RMS_LIMIT_PX:
         exceeds = f"residual {rms_px:.2f} px exceeds {RMS_LIMIT_PX:g} px"
-        warnings.insert(0, f"{exceeds}: is the board flat, sharp and still, and every photograph of one camera?")
+        warnings.insert(0, f"{exceeds}: is the board flat, sharp and still, and was only one camera used?")
     return LensFile(
         lens=lens,
         ways=int(ways.max()) + 1,

@@ -210,7 +210,7 @@ def fit_plane(pixels: Floats, paper_mm: Floats, lens: Lens, where: str, radial_t
     left = model.residuals(fitted.x, *corners)
     rms_px = float(np.sqrt(2.0 * np.mean(left**2)))
     if rms_px > WORST_RMS_PX:
-        raise CalibrationError(where, f"board residual {rms_px:.2f} px exceeds {WORST_RMS_PX} px: is it this board?")
+        raise CalibrationError(where, f"board residual {rms_px:.2f} px exceeds {WORST_RMS_PX} px: wrong or bent board?")
     free = left.size - fitted.x.size
     middle = pixels[kept].mean(axis=0)
     scale = model.log_scale(fitted.x, middle)

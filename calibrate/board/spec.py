@@ -106,7 +106,7 @@ def named_board(options: BoardOptions) -> Board:
     """The board that a command names. Raises `CalibrationError`."""
     checkerboard, charuco = options.checkerboard, options.charuco
     if bool(checkerboard) == bool(charuco):
-        what = "give one of --checkerboard (inner corners) and --charuco (squares), such as 9x6"
+        what = "give either --checkerboard (inner corners) or --charuco (squares), such as 9x6"
         raise CalibrationError("board", what)
     size, square_mm = (checkerboard or charuco).lower().split("x"), options.square_mm
     try:

@@ -81,7 +81,7 @@ class Drag:
         """The reason why the stroke can be measured, but neither fitted nor predicted; empty if it can."""
         if self.cut:
             return "is cut by the edge of its photograph"
-        return "" if self.ink is not None else "has no length_mm, no depth or no start (start_x_px, start_y_px)"
+        return "" if self.ink is not None else "lacks its length_mm, depth or start (start_x_px, start_y_px)"
 
 
 @dataclass(frozen=True)
@@ -246,7 +246,7 @@ def defects(mask: Mask) -> tuple[str, ...]:
         phrases.append(f"torn: {count - 1} parts, the largest holds {100 * areas.max() / areas.sum():.0f} % of the ink")
     covered = float(np.count_nonzero(ink)) / float(np.count_nonzero(outline(ink)))
     if covered < HOLLOW_SHARE:
-        phrases.append(f"hollow: ink covers {100 * covered:.0f} % of the outline")
+        phrases.append(f"hollow: ink covers {100 * covered:.0f} % of the area inside its outline")
     return tuple(phrases)
 
 

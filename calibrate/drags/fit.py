@@ -260,7 +260,7 @@ def adapt_drags(drags: Drags, prior: DragArtefact, strokes: int) -> DragArtefact
     """
     count = len(drags.sound)
     if not 1 <= strokes <= count:
-        raise CalibrationError("--strokes", f"{strokes}: allowed 1 to {count}, the usable strokes")
+        raise CalibrationError("--strokes", f"{strokes}, allowed: 1 to {count}, the number of usable strokes")
     images = np.sort(drags.sound[different(drags.commands[drags.sound], strokes)])
     drawings = _coarse(drags, images)
     # A prior that is narrower by the root of a weight counts as much as ink of that weight.
@@ -309,7 +309,7 @@ def _held_out(drags: Drags, progress: Progress) -> dict[str, tuple[float, float]
     conditions = drags.conditions
     order = np.random.default_rng(0).permutation(conditions.max() + 1)
     scores: dict[str, list[Floats]] = {}
-    for k in counted(range(FOLDS if len(order) >= FOLDS else 0), "fifths left out in turn", FOLDS, progress):
+    for k in counted(range(FOLDS if len(order) >= FOLDS else 0), "fifths of strokes left out in turn", FOLDS, progress):
         left = np.flatnonzero(np.isin(conditions, order[k::FOLDS]))
         others = np.setdiff1d(drags.sound, left)
         model = model_of(fit_values(_coarse(drags, others)))

@@ -214,12 +214,12 @@ def width_sentence(drags: Drags) -> str:
     """The line through the widths of a session, and how well it is known."""
     line = _line(drags)
     if line is None:
-        return "Width against depth: no fit (fewer than 3 whole strokes, or one depth only)."
+        return "No line was fitted to width and depth: fewer than 3 strokes are whole, or all have one depth."
     count = len(drags.widths())
     reach = student_95(count - 2) * line.stderr
     return (
-        f"Width at the middle against commanded depth: {line.slope:.3f} mm/mm (95 % {line.slope - reach:.3f} to "
-        f"{line.slope + reach:.3f}), {line.intercept:+.2f} mm at depth 0, r = {line.rvalue:.2f}, n = {count}."
+        f"Mid-stroke width grows by {line.slope:.3f} mm per mm of commanded depth (95 % {line.slope - reach:.3f} to "
+        f"{line.slope + reach:.3f}) from {line.intercept:+.2f} mm at depth 0; r = {line.rvalue:.2f}, n = {count}."
     )
 
 
@@ -247,7 +247,7 @@ def summary(validation: DragValidation) -> Iterator[Table | str]:
     """What is printed about a session: lines and tables."""
     drags, header = validation.drags, validation.header
     yield f"{header.session_id}: {source_note(header.source)}"
-    yield f"{len(drags.strokes)} strokes measured: {MEASURED} has length, width and area beside what was commanded"
+    yield f"{len(drags.strokes)} strokes measured: {MEASURED} has length, width and area beside the commanded values"
     yield width_sentence(drags)
     if means := validation.means():
         over = "from a fit to these strokes" if validation.scored[0].fitted else "from a fit to other strokes"
@@ -263,7 +263,7 @@ def summary(validation: DragValidation) -> Iterator[Table | str]:
 def fit_session(request: FitRequest, progress: Progress = unseen) -> Written:
     """Fit the drags of a session, or adapt a known brush to them, and put the fit to use. Raises `CalibrationError`."""
     if request.strokes is not None and request.prior is None:
-        raise CalibrationError("--strokes", "needs --prior, the fit that is adapted to so many strokes")
+        raise CalibrationError("--strokes", "needs --prior, the fit that is adapted to these few strokes")
     before = None if request.prior is None else DragArtefact.read(request.prior)
     drags = read_drags(request.session, progress)
     if before is None:
@@ -280,7 +280,7 @@ def fit_lines(drags: Drags, artefact: DragArtefact) -> Iterator[Any]:
     label = source_label(header.source, [header.brush])
     yield f"{source_note(header.source, header.brush)}; {len(artefact.fitted_strokes)} dragged strokes"
     yield from (f"left out: {name}: {why}" for name, why in drags.left_out)
-    yield f"depth at both ends: {drags.ends or 'as in the middle, because the table gives none for the ends'}"
+    yield f"depth at both ends: {drags.ends or 'as in the middle, because the table gives no depth at the ends'}"
     if artefact.prior:
         adapted = ", ".join(artefact.refitted)
         yield f"Adapted from the brush of {artefact.prior_session} (fit {artefact.prior}): {adapted}."

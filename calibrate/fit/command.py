@@ -200,7 +200,7 @@ def fit_press_session(request: FitRequest, progress: Progress = unseen, opened: 
     The session uses the fit from now on, and its page is written. Raises `CalibrationError`.
     """
     if request.prior is not None:
-        raise CalibrationError("--prior", "adapts a fit of drags, and this session holds presses")
+        raise CalibrationError("--prior", "adapts only fits of drags, but this session holds presses")
     session, presses, refused = read_for_fit(opened or request.session, progress)
     press = fit_presses(presses)
     held_out, _ = leave_condition_out(presses, press, progress=progress, store=session.store)
@@ -314,7 +314,7 @@ def _trust(result: FitResult) -> Iterator[Point]:
         yield Point(None, "No combination was pressed twice, so the repeatability of the brush is not known here.")
     else:
         span = "" if csim.below_interval is None else " (95 % {:.1f} to {:.1f})".format(*csim.below_interval)
-        words = f"On held-out presses the fit is {csim.below_ceiling:.1f} points of CSIM{span} below the ceiling"
-        words += f", over the {csim.below_n} of {csim.n} presses that have one" if csim.below_n < csim.n else ""
-        yield Point(is_near(csim.below_ceiling, csim.below_interval), f"{words}; {NEAR_POINTS:g} or less is near.")
+        words = f"On presses left out of the fit, its CSIM is {csim.below_ceiling:.1f} points{span} below the ceiling"
+        words += f", over the {csim.below_n} of {csim.n} presses with a ceiling" if csim.below_n < csim.n else ""
+        yield Point(is_near(csim.below_ceiling, csim.below_interval), f"{words}; up to {NEAR_POINTS:g} points is near.")
     yield Point(None, "The pictures above show presses that were fitted; judge the fit by the held-out scores.")

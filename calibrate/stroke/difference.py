@@ -58,7 +58,7 @@ def new_stroke(
     """
     if before.shape != after.shape:
         sizes = [f"{image.shape[1]} x {image.shape[0]} px" for image in (after, before)]
-        raise CaptureRefused(where, f"is {sizes[0]}, the photograph before it {sizes[1]}")
+        raise CaptureRefused(where, f"is {sizes[0]}, but the photograph before it is {sizes[1]}")
     shift = _shift(before, after)
     first, second = _reflectance(before), _reflectance(_moved(after, (-shift[0], -shift[1])))
     clean = first > DARK_SHARE
@@ -69,7 +69,7 @@ def new_stroke(
     mask = _grown(darker, core, rim, px_per_mm, near_px)
     area_mm2 = float(np.count_nonzero(mask)) / px_per_mm**2
     if area_mm2 < LEAST_MM2:
-        raise CaptureRefused(where, f"shows no new stroke: {area_mm2:.1f} mm2 of new ink, {LEAST_MM2:g} needed")
+        raise CaptureRefused(where, f"shows no new stroke: {area_mm2:.1f} mm2 of new ink, {LEAST_MM2:g} are needed")
     ink = float(np.quantile(darker[mask], 0.75))
     # Half way between paper and ink, so that the blur of the edge neither widens nor narrows the stroke.
     mask = mask & (darker >= max(rim, 0.5 * ink))

@@ -198,7 +198,7 @@ def prepare(
     kth = min(round(GATE_MM2 * PX_PER_MM**2), pixels.size - 1)
     contrast = 1.0 - float(np.partition(pixels, kth)[kth])
     if contrast < CONTRAST_GATE:
-        raise CaptureRefused(where, f"is blank: darkest ink {contrast:.2f} below paper, gate {CONTRAST_GATE}")
+        raise CaptureRefused(where, f"is blank: at most {contrast:.2f} darker than paper, {CONTRAST_GATE} is needed")
     otsu, _ = cv2.threshold(to_levels(reflectance[window]), 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
     ink = to_levels(reflectance) <= round(otsu)
     mask, others_mm2 = components(ink, anchor_px, join_mm, speck_share)
@@ -226,12 +226,12 @@ def _flags(raster: Gray, mask: Mask, others_mm2: Sequence[float]) -> tuple[str, 
     flags: list[str] = []
     saturated = float(np.count_nonzero(raster >= SATURATED)) / raster.size
     if saturated > MOST_SATURATED:
-        flags.append(f"saturated: {100 * saturated:.0f} % of the pixels are white, the light cannot be judged")
+        flags.append(f"saturated: {100 * saturated:.0f} % of the pixels are white, so the light cannot be judged")
     if touches_edge(mask):
         flags.append("cut: the stroke reaches the edge of its photograph or patch")
     others = [area for area in others_mm2 if area >= OTHER_MM2]
     if others:
-        flags.append(f"others: {len(others)} more strokes of {sum(others):.0f} mm2 in the crop")
+        flags.append(f"others: {len(others)} more strokes lie in the crop, {sum(others):.0f} mm2 in all")
     shrink = 16
     small = cast("Gray", cv2.resize(raster, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA))
     bright = np.count_nonzero(small > GLARE_ABOVE * light_surface(small))

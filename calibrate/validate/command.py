@@ -87,7 +87,7 @@ class ValidationOutput:
     def check(self) -> None:
         """Check the gates, once the report is written. Raises `GateMissed` if any is missed."""
         if self.gates and self.report is None:
-            raise CalibrationError("--gate", "applies to presses; these are drags")
+            raise CalibrationError("--gate", "applies to presses, but this session holds drags")
         if self.report is not None:
             check_gates(self.report, self.gates)
 
@@ -162,7 +162,7 @@ def one_source(sessions: Sequence[FittedSession]) -> Source:
     first = sessions[0]
     for other in sessions[1:]:
         if other.header.source != first.header.source:
-            what = f"has the source {other.header.source}, {first.recording.path.name} has {first.header.source}"
+            what = f"has the source {other.header.source}, but {first.recording.path.name} has {first.header.source}"
             raise CalibrationError(str(other.recording.path), f"{what}: validate them separately")
     return first.header.source
 
@@ -268,8 +268,8 @@ class Difference:
         what = "the same stroke" if self.by_stroke else "the average of the same (H, α)"
         test = self.changes[0].test
         yield (
-            f"Each pair is {what}; n = {test.n} in {test.groups} conditions. p: flipped signs of whole conditions, "
-            f"corrected by Holm's method for {len(self.changes)} series ({self.before.label})."
+            f"Each pair compares {what}; n = {test.n} in {test.groups} conditions. p comes from flipping the signs "
+            f"of whole conditions, corrected by Holm's method for {len(self.changes)} series ({self.before.label})."
         )
         if not self.by_stroke:
             yield "Two sessions also differ in things that were not meant to change: brush, ink, paper, zero touch."
@@ -291,7 +291,7 @@ def compare(request: DiffRequest, _progress: Progress = unseen) -> Difference:
     paths = report_path(request.before), report_path(request.after)
     old, new = (Report.read(path) for path in paths)
     if old.source != new.source:
-        what = f"has the source {new.source}, {paths[0]} has {old.source}: they cannot be compared"
+        what = f"has the source {new.source}, but {paths[0]} has {old.source}: they cannot be compared"
         raise CalibrationError(str(paths[1]), what)
     by_stroke = bool({s.recording_sha256 for s in old.sessions} & {s.recording_sha256 for s in new.sessions})
     first, last = (_scores(path, side, by_stroke=by_stroke) for path, side in zip(paths, (old, new), strict=True))

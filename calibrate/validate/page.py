@@ -280,7 +280,7 @@ def verdict(report: Report) -> str:
     if csim is None:
         return ""
     part = f" ({part})" if (part := part_with_ceiling(csim)) else ""
-    unseen = " from conditions that it has not seen" if report.shown == FITTED_HELD_OUT else ""
+    unseen = " of conditions that were left out of its fit" if report.shown == FITTED_HELD_OUT else ""
     avg = csim.avg if csim.below_avg is None else csim.below_avg
     says = f"{_label(report, report.shown)} predicts presses{unseen} with an average CSIM of {avg:.1f} %{part}"
     if csim.below_ceiling is None:
@@ -329,7 +329,7 @@ def _session(session: Session) -> Iterator[Point]:
         names = ", ".join(collected.left_out[:MAX_NAMED]) + (", ..." if len(collected.left_out) > MAX_NAMED else "")
         yield Point(False, f"{len(collected.left_out)}{of} strokes were left out during collection: {names}.")
     if collected is not None and collected.pressed_again:
-        takes = f"{len(collected.pressed_again)} of {collected.photographed} takes"
+        takes = f"{len(collected.pressed_again)} of {collected.photographed} photographed strokes"
         yield Point(None, f"{takes} did not count and were pressed again: the remaining strokes are a selection.")
     if collected is not None and collected.moved_mm > MOVED_MM:
         words = f"two zero touches differ by {collected.moved_mm:.2f} mm ({', '.join(collected.touches[:MAX_NAMED])})"
@@ -367,7 +367,7 @@ def terminal_lines(report: Report) -> Iterator[object]:
     for point in trust(report):
         yield f"{'•' if point.good is None else '✓' if point.good else '✗'} {point.text}"
     for press in report.refused[:MAX_REFUSED_IN_TERMINAL]:
-        used = "not used" if press[:2] in report.lost else "used, but not by every model"
+        used = "not used" if press[:2] in report.lost else "not compared with every model"
         yield f"{used}: {press.session_id} {press.stroke_id}: {press.why}"
     if len(report.refused) > MAX_REFUSED_IN_TERMINAL:
         yield f"and {len(report.refused) - MAX_REFUSED_IN_TERMINAL} more, in the report"

@@ -80,7 +80,7 @@ KINDS_OF_PRESS = (
         name=ANOTHER,
         label="another press",
         definition="A capture predicted by other captures of its condition, averaged: how well the brush repeats a "
-        "press. A model can do better, because only one of two presses strays from its image.",
+        "press. A model can do better, because both presses stray from their average image.",
         basis=PRESSES,
     ),
     ModelInfo(
@@ -225,7 +225,7 @@ def known_models(session: FittedSession, request: ValidateRequest) -> Sequence[M
     for file in request.generators or ([SHIPPED_GENERATOR] if brush == Brush() else []):
         model = load_generator(file, brush)
         if model.name in [known.name for known in models]:
-            raise CalibrationError(str(file), f"is a second {model.name}")
+            raise CalibrationError(str(file), f"is a second generator named {model.name}")
         basis = f"trained on exact images of {model.target.stroke_model.label}"
         basis += ", then tuned on captures" if model.fitted else ""
         models.append(_of_model(model, basis, sha256=file_sha256(file)))

@@ -107,7 +107,7 @@ class FootprintArtefact(SessionFit):
     @model_validator(mode="after")
     def _whole(self) -> Self:
         if set(self.values) != set(NAMES):
-            raise ValueError("values: of another version: fit the session again with `brushloop write fit`")
+            raise ValueError("values: made by another version; fit the session again with `brushloop write fit`")
         return self
 
 
@@ -248,7 +248,7 @@ def plan(request: PlanRequest, _progress: Progress = unseen) -> Written:
         raise CalibrationError("write plan", str(error)) from None
     wanted = read_wanted(request.what, request.data, patch)
     if fitted is None:
-        drawing, label, simulated = model, model.label, "CCD-BSM, marks laid over each other along the path"
+        drawing, label, simulated = model, model.label, "CCD-BSM, whose marks are laid over each other along the path"
     else:
         drawing, label = fitted.footprint(), "fitted footprint"
         simulated = f"the footprint fitted to {fitted.session_id}, {fitted.source}"
@@ -262,7 +262,7 @@ def plan(request: PlanRequest, _progress: Progress = unseen) -> Written:
 
 
 def _said(planned: Sequence[tuple[Figure, Image]], simulated: str) -> Iterator[str]:
-    yield f"simulated by {simulated}, without ink"
+    yield f"simulated without ink by {simulated}"
     for figure, first in planned:
         points = sum(len(stroke) for stroke in figure.commanded)
         scores = f"first plan {_likeness(figure, first)}; refined {_likeness(figure, figure.simulated)}"
@@ -302,7 +302,7 @@ def read_wanted(what: str, data: Path | None, patch: Patch) -> list[Figure]:
     if not 1 <= len(what) <= MAX_FIGURES or not what.isprintable() or any(c.isspace() for c in what):
         raise CalibrationError("character", f"expected 1 to {MAX_FIGURES} characters")
     if len(set(what)) != len(what):
-        raise CalibrationError("character", "a character occurs twice: the protocol's `repeats` writes it again")
+        raise CalibrationError("character", "a character occurs twice: set the protocol's `repeats` to write it again")
     figures = [_character(name, data, patch) for name in what]
     for figure in figures:
         if not figure.wanted.any():

@@ -115,8 +115,8 @@ def fit(request: FitFootprintRequest, progress: Progress = unseen) -> Written:
     )
     path = put_to_use(artefact, opened.recording.path.parent, FOLDER)
     words = (
-        f"the footprint of {count} strokes on {len(ink)} patches ({artefact.source}) draws them with CSIM "
-        f"{csim_percent:.1f} %, ink = 1"
+        f"the footprint fitted to {count} strokes on {len(ink)} patches ({artefact.source}) draws these strokes with "
+        f"a CSIM of {csim_percent:.1f} % (ink = 1)"
     )
     said = (*(f"left out: {stroke_id}: {why}" for stroke_id, why in refused), words, str(path))
     return Written(path, said, refused)

@@ -69,7 +69,7 @@ def parse_glyph(text: str) -> list[GlyphStroke]:
         field = ".".join(map(str, first["loc"]))
         raise ValueError(f"{field}: {first['msg']}" if field else first["msg"]) from None
     if len(file.strokes) != len(file.medians):
-        raise ValueError(f"medians: {len(file.medians)} for {len(file.strokes)} strokes")
+        raise ValueError(f"medians: holds {len(file.medians)}, expected {len(file.strokes)}, one for each stroke")
     strokes: list[GlyphStroke] = []
     for k, (path, points) in enumerate(zip(file.strokes, file.medians, strict=True)):
         median = np.array(points)

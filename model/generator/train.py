@@ -163,7 +163,7 @@ class _Training:
         is_blank = ink < BLANK_SHARE * wanted or 1 - ink < BLANK_SHARE * (1 - wanted)
         self.blanks = self.blanks + 1 if is_blank else 0
         if self.blanks >= BLANKS:
-            what = f"the generator draws {ink:.2%} ink where the targets hold {wanted:.2%}"
+            what = f"{ink:.2%} of the generator's pixels are ink, but {wanted:.2%} of the targets'"
             self._fail(f"{what}; train again in a new folder with a smaller learning_rate or a larger ink_weight")
 
     def _fail(self, what: str) -> None:

@@ -59,13 +59,13 @@ def test_a_camera_that_was_touched_before_the_last_view_of_the_board_is_said(tmp
     session = photographed(tmp_path / "moved", blank.board, photographs, sheet_mm=blank.sheet_mm)
     made = calibrate_session(CalibrateRequest(session))
     touched, unseen = made.moved
-    off_mm = off_px * made.calibration.mm_per_px
-    assert touched.startswith(f"3 min before the last view of the board, the board lay {off_px}.0 px ({off_mm:.2f}")
-    assert unseen.startswith("2 min before the last view of the board, the board is not seen: is blank")
+    lay = f"{off_px}.0 px ({off_px * made.calibration.mm_per_px:.2f}"
+    assert touched.startswith(f"3 min before the last photograph of the board, the board lay {lay}")
+    assert unseen.startswith("2 min before the last photograph of the board, the board is not seen: is blank")
 
 
 def test_what_has_no_board_cannot_be_calibrated(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match="holds no view of the board"):
+    with pytest.raises(CalibrationError, match="holds no photograph of the board"):
         calibrate_session(CalibrateRequest(photographed(tmp_path / "none", CALIBRATION.board, [])))
     with pytest.raises(CalibrationError, match="is an import and has its own scale"):
         calibrate_session(CalibrateRequest(imported_presses(tmp_path, [(11.0, 0.0)])))
@@ -144,11 +144,11 @@ def test_what_was_put_to_use_last_is_in_use_and_no_artefact_changes(tmp_path: Pa
     ("text", "message"),
     [
         (None, "is missing: calibrate or fit"),
-        ("", "holds no name of an artefact"),
-        ("../../secret.json", "holds no name of an artefact"),
-        ("0123456789abcdef.json\n0123456789abcdef.json", "holds no name of an artefact"),
+        ("", "does not hold the name of an artefact"),
+        ("../../secret.json", "does not hold the name of an artefact"),
+        ("0123456789abcdef.json\n0123456789abcdef.json", "does not hold the name of an artefact"),
         ("x" * 1000, "is larger than 256 bytes"),
-        ("0123456789abcdef.json", "names 0123456789abcdef.json, which is not there: calibrate"),
+        ("0123456789abcdef.json", "names 0123456789abcdef.json, which is missing: calibrate"),
     ],
     ids=["none", "empty", "elsewhere", "two", "long", "missing"],
 )

@@ -96,7 +96,7 @@ def test_another_session_is_predicted_stroke_by_stroke(session: Path, fitted: tu
     out = tmp_path / "report"
     output = said("validate", session, "--fit", fitted[0], "--out", out)
     page = (out / "report.html").read_text()
-    for words in ("bristle lag alone", "In sample", "No command was repeated", "captured and predicted ink"):
+    for words in ("bristle lag alone", "In sample", "No stroke was repeated", "captured and predicted ink"):
         assert words in page
     assert re.findall(r'<script|(?:src|href)="(?!data:image/)', page) == [], "it fetches nothing"
     assert "from a fit to these strokes" in output
@@ -120,7 +120,7 @@ def test_a_known_brush_is_adapted_to_few_strokes(session: Path, fitted: tuple[Pa
     assert "drift_x_mm" in output
     one = DragArtefact.read(path)
     assert one.parameters["drift_x_mm"].low is None  # a single stroke has no interval, not one of width zero
-    assert "allowed 1 to 6" in refused("fit", session, *options, "7")
+    assert "allowed: 1 to 6" in refused("fit", session, *options, "7")
 
 
 def test_an_edited_file_hostile_ink_and_presses_are_refused_with_one_line(
@@ -313,6 +313,6 @@ def test_the_slope_of_width_against_depth_has_its_interval(drags: Drags, monkeyp
     widths = np.array([[1.0, 3.0], [2.0, 3.6], [3.0, 3.9], [4.0, 4.5]])
     monkeypatch.setattr(Drags, "widths", lambda _: widths)
     # by hand: 2.4 / 5, and 4.303 standard errors of sqrt(0.018 / 2 / 5) on either side
-    assert "0.480 mm/mm (95 % 0.297 to 0.663), +2.55 mm at depth 0, r = 0.99, n = 4" in width_sentence(drags)
+    assert "0.480 mm per mm of commanded depth (95 % 0.297 to 0.663) from +2.55 mm" in width_sentence(drags)
     monkeypatch.setattr(Drags, "widths", lambda _: widths * [0.0, 1.0])
-    assert "no fit" in width_sentence(drags)
+    assert "No line was fitted" in width_sentence(drags)

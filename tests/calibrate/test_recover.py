@@ -91,7 +91,7 @@ def test_what_cannot_be_inverted_is_refused_and_writes_nothing(tmp_path: Path) -
         recovered(session(tmp_path / "drags", kind="drag"), tmp_path)
     with pytest.raises(CalibrationError, match="no stroke could be recovered: p0: is cut by the edge of its photo"):
         recovered(session(tmp_path, start_x_mm=8.0), tmp_path)
-    with pytest.raises(CalibrationError, match=r"no press of this brush in the range: depth_mm = \(2, 2\)"):
+    with pytest.raises(CalibrationError, match=r"no depth and tilt that this brush can press: depth_mm = \(2, 2\)"):
         recovered(tmp_path / "sessions" / "shots", tmp_path, depth_range_mm=(2.0, 2.0))
     with pytest.raises(CalibrationError, match=r"must end in \.csv"):
         recover(RecoverRequest(tmp_path, tmp_path / PROTOCOL))

@@ -226,8 +226,8 @@ def test_a_press_made_again_beats_the_other_press_of_its_condition_and_what_repe
     names = [(pair.original.stroke.stroke_id, pair.again.stroke.stroke_id) for pair in pairs]
     assert names == [("a-r01", "a-r01~1"), ("a-r02", "a-r02~1")]
     assert refused == {
-        "x~1": "repeats x, of which no usable original exists",
-        "y": "repeats no stroke, of which no usable original exists",
+        "x~1": "repeats x, whose original is missing or cannot be used",
+        "y": "repeats an unnamed stroke, whose original is missing or cannot be used",
         "b-r01": "was not pressed again",
     }
     scores = score_pairs(pairs, originals())

@@ -276,7 +276,7 @@ def test_a_finished_training_is_not_done_again_and_another_one_is_refused(
         run_training(tiny, tmp_path, pytest.fail)
 
 
-@pytest.mark.parametrize(("bias", "words"), [(-100.0, "draws 0.00% ink where .* ink_weight"), (100.0, "draws 100"),
+@pytest.mark.parametrize(("bias", "words"), [(-100.0, ": 0.00% of the .* ink_weight"), (100.0, "100.00% of the"),
                                              (math.nan, "step 1: the loss is no longer a number")])  # fmt: skip
 def test_blank_output_ends_the_training_with_advice(
     tmp_path: Path, tiny: TrainConfig, monkeypatch: pytest.MonkeyPatch, bias: float, words: str

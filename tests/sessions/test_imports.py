@@ -128,7 +128,7 @@ REFUSED = [
     (row('"a\n.png"'), "line 3: 'a\\n.png' holds control"),
     (row('"a.png"x'), "line 2: ',' expected after '\"'"),
     (row("cut.png"), "photos/cut.png: is not a complete PNG or JPEG image"),
-    (row().replace("1,1,1,1\n", "900,1,1,1\n"), "photos/a.png: is 24 x 24 pixels, without (start_x_px"),
+    (row().replace("1,1,1,1\n", "900,1,1,1\n"), "photos/a.png: its 24 x 24 pixels do not show (start_x_px"),
     ("file,größe_mm\n".encode("latin-1"), "photos/table.csv: is not UTF-8 text"),
 ]
 

@@ -259,5 +259,5 @@ def test_a_command_that_is_killed_leaves_no_process_behind(tmp_path: Path) -> No
 
 
 def test_a_worker_that_ends_first_stops_the_command_in_one_line() -> None:
-    with pytest.raises(TwinStopped, match="the same command continues"), workers(1) as pool:
+    with pytest.raises(TwinStopped, match="repeat the command to continue"), workers(1) as pool:
         pool.submit(os._exit, 1).result()

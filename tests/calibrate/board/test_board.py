@@ -126,7 +126,7 @@ def test_photographs_that_do_not_fit_are_dropped_by_name_or_leave_a_residual_tha
     assert fitted.lens.matrix[0] == pytest.approx(800.0, rel=0.005)
     [warning] = fit_lens([*renamed(views(7), "left"), *renamed(views(7, seed=1, lens=LONG), "right")]).warnings
     assert "exceeds 0.5 px" in warning
-    assert "of one camera" in warning
+    assert "only one camera" in warning
 
 
 def test_it_says_what_else_to_photograph() -> None:
@@ -190,7 +190,7 @@ def test_the_command_says_of_every_photograph_why_it_was_of_no_use(tmp_path: Pat
     assert f"{mirrored}: the photograph is mirrored" in why
     assert "not a complete PNG or JPEG" in refusal(torn)
     assert "inner_corners.1: Field required" in refusal(blank, options=("--checkerboard", "9"))
-    assert "give one of --checkerboard" in refusal(blank, options=())
+    assert "give either --checkerboard" in refusal(blank, options=())
 
 
 # The printed board

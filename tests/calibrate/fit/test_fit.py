@@ -202,5 +202,5 @@ def test_one_command_leads_from_photographs_to_a_fit_and_a_report(
     mean = {name: report.stat(name) for name in ("ccd-bsm", NAME)}
     assert mean[NAME].csim.avg > mean["ccd-bsm"].csim.avg + 5.0
 
-    with pytest.raises(CalibrationError, match="holds presses: this needs drags"):
+    with pytest.raises(CalibrationError, match="holds presses, but drags are needed here"):
         open_session(session, kind="drag")

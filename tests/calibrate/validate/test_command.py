@@ -114,7 +114,7 @@ def test_a_cluster_does_the_same_though_a_worker_dies_and_what_cannot_be_used_is
     assert jobs == "22 True", ran.stderr
     assert "has brushloop" in other_software
     assert "(work of tomorrow) is needed there" in other_software
-    assert "tcp://127.0.0.1:9: no Dask scheduler there" in nobody
+    assert "tcp://127.0.0.1:9: no Dask scheduler answers" in nobody
 
 
 def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

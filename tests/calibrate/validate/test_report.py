@@ -192,7 +192,7 @@ def test_what_was_left_out_selected_or_pressed_on_other_paper_stands_above_the_r
     assert "left out during" not in told()
     assert "8 planned, 8 photographed" in told()
     assert "2 of 8 planned strokes were left out during collection: a, b." in told(left_out=("a", "b"))
-    assert "1 of 8 takes did not count and were pressed again" in told(pressed_again=("a",))
+    assert "1 of 8 photographed strokes did not count and were pressed again" in told(pressed_again=("a",))
     touches = ("taught 1 mm", "jog 3 mm")
     assert "two zero touches differ by 2.00 mm (taught 1 mm, jog 3 mm)" in told(moved_mm=2.0, touches=touches)
 

@@ -208,7 +208,7 @@ class FakeEngine:
         raise CollectAborted("stopped; the same command resumes from here")
 
 
-LATE = "touched the paper 10.2 s after its dip, the others after 1.1 s"
+LATE = "touched the paper 10.2 s after its dip, other strokes after 1.1 s"
 
 
 class FakeBrowser(SessionBrowser):
