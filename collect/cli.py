@@ -28,8 +28,8 @@ rig_app = typer.Typer(
 
 PICTURES = (".png", ".svg", ".pdf", ".jpg")
 """Endings of a picture's file, which determine its format."""
-RigFile = Annotated[Path, typer.Argument(help="The rig: addresses, frames, limits.")]
-StepArm = Annotated[bool, typer.Option("--arm", help="Let the arm move where a step needs it, after a key press.")]
+RigFile = Annotated[Path, typer.Argument(help="The rig.toml: addresses, frames and limits of the rig.")]
+StepArm = Annotated[bool, typer.Option("--arm", help="Let the arm move in steps that need it, once you confirm.")]
 
 
 app.command("strokes")(command(CollectRequest, "collect.start:run", lambda run, request: run(request)))
@@ -49,7 +49,7 @@ def plan(
     config: Rig = RIG_FILE,
     protocol: Annotated[Path, typer.Option(help="The protocol to plan.")] = PROTOCOL_FILE,
     picture: Annotated[Path | None, typer.Option(help="Draw the sheets as a .png, .svg, .pdf or .jpg.")] = None,
-    arm: Annotated[bool, typer.Option("--arm", help="Plan for a run with --arm, self-check included.")] = False,
+    arm: Annotated[bool, typer.Option("--arm", help="Plan as for a run with --arm: with the self-check.")] = False,
     ask: Annotated[bool, typer.Option("--ask", help="Ask the controller if the arm reaches every pose.")] = False,
 ) -> None:
     """Check a protocol without moving the arm: print limits, sheets, dips, ink and time, and draw the sheets."""
@@ -77,7 +77,7 @@ def plan(
 
 def doctor(
     config: Rig = RIG_FILE,
-    report: Annotated[Path | None, typer.Option(help="Write a bug report without secrets, FILE.zip.")] = None,
+    report: Annotated[Path | None, typer.Option(help="Write a bug report without secrets to this .zip.")] = None,
 ) -> None:
     """Ask every configured device for its identity and its faults. Powers nothing and moves nothing."""
     import asyncio

@@ -221,7 +221,7 @@ def check_protocol(rig_path: Path, protocol_path: Path, rig: RigConfig, protocol
 def _check_sheet(rig_path: Path, path: Path, rig: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> None:
     if sheet.capacity == 0:
         where, field = (path, "cell_mm") if isinstance(protocol, WriteConfig) else (rig_path, "paper.cell_mm")
-        raise ConfigError(where, field, f"{sheet.cell_mm} does not fit on {rig.paper.size_mm}")
+        raise ConfigError(where, field, f"{sheet.cell_mm} mm does not fit on a sheet of {rig.paper.size_mm} mm")
     if rig.self_check.enabled:
         try:
             triangle_on((sheet.patch(0),))
@@ -234,7 +234,7 @@ def _check_brush(path: Path, brush: BrushConfig, strokes: Iterable[Planned], pat
     for stroke in strokes:
         for _, _, asked in marks_of(stroke, patch):
             bundle_mm = brush.length_mm * math.cos(math.radians(asked.tilt_deg))
-            bundle = f"the bundle at {asked.tilt_deg:g} deg"
+            bundle = f"the height of the bundle at a tilt of {asked.tilt_deg:g} deg"
             for name, most_mm in (("the rig's brush.max_depth_mm", brush.max_depth_mm), (bundle, bundle_mm)):
                 if asked.depth_mm > most_mm:
                     what = f"{asked.depth_mm:g} mm is deeper than {name} = {most_mm:.4g} mm allows"
@@ -319,7 +319,7 @@ async def ask_reach(rig_path: Path, config: RigConfig, poses: Iterable[PlannedPo
                         "paper",
                         f"the controller finds no joint solution for {name}: "
                         f"x = {pose.x_mm:.1f}, y = {pose.y_mm:.1f}, z = {pose.z_mm:.1f} mm, "
-                        "for robot.tcp_offset_mm. Move the paper nearer to the arm, or change its yaw",
+                        "with the tool of robot.tcp_offset_mm. Move the paper nearer to the arm, or change its yaw",
                     )
                 case other:
                     raise ProtocolViolation("robot", "inverseKinematics", f"no return code: {other!r}")

@@ -143,7 +143,7 @@ class ArmMoved(MotionError):
     """The arm is not where it was left; `moving` is True if it still moves."""
 
     condition = "Another client or a person moved the arm; nothing was sent to it."
-    remedy = "Nothing may stand in the way of the brush: the first motion is back along the tool axis."
+    remedy = "Clear the way of the brush: the first motion lifts it back along the tool axis."
 
     def __init__(self, device: str, op: str, off_mm: float, off_deg: float, *, moving: bool = False) -> None:
         self.moving = moving

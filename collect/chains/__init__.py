@@ -20,7 +20,7 @@ from brushloop.collect.engine import RIG_FILE, Arm, NewSheet, Rig, Tui
 class LoopRequest:
     """Recover every press from its image, press it again and compare both. Run the same command again to resume."""
 
-    session: Annotated[Path, Argument(help="The session whose presses are recovered and made again.")]
+    session: Annotated[Path, Argument(help="The session whose presses are recovered from their images and made again.")]
     config: Rig = RIG_FILE
     out: Annotated[Path | None, Option(help="Folder for the results; <session>/loop by default.")] = None
     presses: Annotated[int | None, Option(min=1, help="Use this many presses, spread evenly over the session.")] = None
@@ -34,7 +34,7 @@ class LoopRequest:
 class WritingRequest:
     """Plan characters, write them on the rig, compare with simulation and reference. Run it again to resume."""
 
-    what: Annotated[str, Argument(help="Characters; 字 子 永 are shipped.")]
+    what: Annotated[str, Argument(help="Characters to write; brushloop ships 字 子 永.")]
     config: Rig = RIG_FILE
     out: Annotated[Path, Option(help="Folder for the plan and the report.")] = Path("written")
     sessions: Annotated[Path, Option(help="Folder that holds sessions.")] = Path("sessions")
@@ -54,7 +54,7 @@ class DemoRequest:
     """Press, calibrate, press again and validate on the loopback rig. Run it again to continue where it stopped."""
 
     out: Annotated[Path, Option(help="Folder for everything that the demo makes.")] = Path("demo-run")
-    full: Annotated[bool, Option("--full", help="Press more and write a character, for all tables.")] = False
-    brush: Annotated[Path, Option(help="The rig's brush: `table2`, `loopback`, or a brush.toml.")] = Path("table2")
+    full: Annotated[bool, Option("--full", help="Press more and write a character, to fill all tables.")] = False
+    brush: Annotated[Path, Option(help="The simulated brush: `table2`, `loopback`, or a brush.toml.")] = Path("table2")
     show: Annotated[bool, Option("--open", help="Open the report in the browser at the end.")] = False
     verbose: Annotated[bool, Option("--verbose", help="Show the steps' output instead of writing demo.log.")] = False

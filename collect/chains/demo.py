@@ -109,7 +109,7 @@ class Demo:
                 self._rig.end()
         self._say_answer()
         session = self._session
-        say("", f"Done in {time.monotonic() - began_s:.0f} s, simulated: nothing here is a result on paper.")
+        say("", f"Done in {time.monotonic() - began_s:.0f} s. It was all simulated: nothing here is a result on paper.")
         say(f"Report: {_report(session)}", f"MCAP:   {session / f'{session.name}.mcap'}")
         if asked.show:
             webbrowser.open(_report(session).resolve().as_uri())
@@ -129,8 +129,8 @@ class Demo:
             say(f"  {label:30} {'█' * round(percent / 100 * BAR):{BAR}} {percent:.1f} %")
         if (shapes := report.stat("ccd-bsm", NORMAL)) is not None:
             say(
-                "These scores count size and place. The paper compares only shapes, scaled to one size. CCD-BSM as "
-                f"published then scores {shapes.csim.avg:.1f} %, and {TABLE_2['ccd-bsm'].csim[2]:.1f} % in the paper."
+                "Here, size and place count. The paper compares shapes scaled to one size: by that measure, CCD-BSM as "
+                f"published scores {shapes.csim.avg:.1f} %, and {TABLE_2['ccd-bsm'].csim[2]:.1f} % in the paper."
             )
         say(f"Does CCD-BSM predict this brush? {verdict(report)}")
 

@@ -41,7 +41,7 @@ def run_loop(request: LoopRequest) -> Path:
     header = recording.header
     if not header.source.imported and header.brush != rig.brush.name:
         # Another brush makes other marks: refused before anything moves.
-        was = f"{rig.brush.name!r}: the original was pressed with {header.brush!r}"
+        was = f"{rig.brush.name!r}, but the session was pressed with {header.brush!r}"
         raise ConfigError(request.config, "brush.name", was)
     if not (out / PROTOCOL).exists():
         check_fresh_sheet(root, request.sheet)  # now, not after minutes of fitting

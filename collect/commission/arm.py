@@ -158,23 +158,23 @@ class ArmStep(Step):
         if safety not in MOVING_ALLOWED:
             visit.say(
                 f"The safety mode is {safety}: the arm cannot be guided by hand until this mode has ended.",
-                "End the mode at the pendant: brushloop never does.",
+                "End this mode at the pendant; brushloop never does that.",
                 tone="warning",
             )
         as_set, (payload_kg, *cog_mm) = "as set on the pendant", settings.payload
         question = "The payload is 0 kg, but holder and brush have weight: the guided arm drifts. Go on with 0 kg?"
         if not payload_kg and not await visit.yes(question):
-            raise NotAccepted("the payload is 0 kg.", "Weigh holder, sensor and brush, and set it on the pendant.")
+            raise NotAccepted("the payload is 0 kg.", "Weigh holder, sensor and brush; set the weight on the pendant.")
         values = {
             "robot.kind": Taught("aubo-arcs", f"{name} answered"),
-            "robot.host": Taught(host, "typed, and answered"),
-            "robot.port": Taught(port, "answered"),
-            "robot.framing": Taught(framing, "the first that the controller answered"),
+            "robot.host": Taught(host, "typed; the controller answered there"),
+            "robot.port": Taught(port, "the controller answered there"),
+            "robot.framing": Taught(framing, "the first framing that the controller answered"),
             "robot.payload_kg": Taught(payload_kg, as_set, known="not weighed"),
             "robot.payload_cog_mm": Taught(cog_mm, as_set, known="not measured"),
         }
         if await answers(host, RTDE_PORT):
-            values["robot.rtde_port"] = Taught(RTDE_PORT, "answered, and sends poses")
+            values["robot.rtde_port"] = Taught(RTDE_PORT, "the controller answered there; it sends poses")
         if settings.collision_level:
             values["robot.collision_level"] = Taught(int(settings.collision_level), as_set)
         visit.keep(values)

@@ -54,7 +54,7 @@ def _line_named(line: str) -> str:
 
 
 ASK_PORT = Prompt("Serial line of the device, such as /dev/serial/by-id/usb-…", read=_line_named)
-DELIVERY = number_of("Delivery per revolution: weigh that of ten revolutions", 0.001, 10.0, "ml")
+DELIVERY = number_of("Ink per revolution: weigh the ink of ten revolutions, divide by ten", 0.001, 10.0, "ml")
 
 
 class BrushStep(Step):
@@ -80,7 +80,7 @@ class BrushStep(Step):
                 ml = await visit.value("ink.device.ml_per_revolution", DELIVERY)
                 device = ModbusPumpConfig(kind="modbus-pump", port=port, ml_per_revolution=ml)
             await self._primed(visit, device)
-            visit.keep({"ink.device.kind": Taught(device.kind, "answered on its line")})
+            visit.keep({"ink.device.kind": Taught(device.kind, "the device answered on this line")})
         await visit.value("ink.name", Prompt("Name of the ink, for the record", default="ink", read=str))
 
     async def _primed(self, visit: Visit, config: InkTable) -> None:
@@ -90,7 +90,7 @@ class BrushStep(Step):
             level = await device.level()
             gauge = "no gauge" if level is None else f"well {level:.0%} full"
             visit.say(f"{identity.model} {identity.firmware}: {gauge}")
-            while await visit.yes(f"Pump {PRIME_ML:g} ml, until the tube drips? The well must stand under the tube."):
+            while await visit.yes(f"Pump {PRIME_ML:g} ml, and repeat until the tube drips? Keep the well under it."):
                 visit.working(f"pumping {PRIME_ML:g} ml")
                 await device.dose(min(PRIME_ML, config.dose_ml))
                 level = await device.level()
@@ -162,7 +162,7 @@ class ForceStep(Step):
             await asyncio.sleep(REST_S)
             noise_n = float(np.std([sample.force_n for sample in samples], axis=0).max()) if samples else math.inf
             noise = f"noise {noise_n:.4f} N (limit: {MOST_NOISE_N:g} N)"
-            visit.say(f"{identity.model}: {len(samples) / REST_S:.0f} rounds/s, {noise}")
+            visit.say(f"{identity.model}: {len(samples) / REST_S:.0f} readings/s, {noise}")
             samples.clear()
             how = "Push the tip gently up with a finger, toward the flange, for a second; then take the finger away."
             await visit.brought("push-sensor 0", how)
@@ -184,7 +184,7 @@ class ForceStep(Step):
         points = inside_corners(notebook.get("paper.size_mm"), INSET_MM)
         lean_deg = PaperPlane(*notebook.get("aside.plane")).slope_deg
         widest_deg = min(max(math.ceil(10.0 * (lean_deg + LEAN_ROOM_DEG)) / 10.0, 1.0), 3.0)
-        leans = f"the sheet's lean of {lean_deg:.2f} deg and {LEAN_ROOM_DEG:g} deg more"
+        leans = f"the sheet leans by {lean_deg:.2f} deg; {LEAN_ROOM_DEG:g} deg were added"
         return {
             "touch.method": Taught(method, why),
             "touch.points_mm": Taught(points.tolist(), f"{INSET_MM:g} mm inside the sheet's corners"),

@@ -36,7 +36,7 @@ AWAY = {
     "clear-view": "Guide the arm to any place out of the camera's picture.",
     # Last, because the runs of the proof begin where the arm is left: it has to be within the limits.
     "park": "Now bring the arm to its waiting place: brush upright, above everything, out of the camera's picture, and "
-    f"{APART_MM:g} mm or more from the last place. Neither picture may show the arm: the two must agree.",
+    f"{APART_MM:g} mm or more from the last place. A picture is taken at both places; neither may show the arm.",
 }
 PARKED = "aside.parked"
 INK = ("well-rim", "well", "wash-rim", "wash-pot")
@@ -104,7 +104,7 @@ class PlacesStep(Step):
         places = tips(visit.notebook)
         if (apart_mm := math.dist(places["park 0"], places["clear-view 0"])) < APART_MM:
             raise NotAccepted(
-                f"the two places of the arm are only {apart_mm:.0f} mm apart: both pictures show the same.",
+                f"the two places are only {apart_mm:.0f} mm apart: an arm in both pictures would go unnoticed.",
                 f"Bring the arm to two places {APART_MM:g} mm or more apart; you are asked for both again.",
             )
         share = changed_share(*pictures)
@@ -136,7 +136,7 @@ class PlacesStep(Step):
         values = {
             "ink.well_mm": at(list(to_paper(paper, x, y))),
             "ink.dip_z_mm": at(dip_z_mm),
-            "motion.safe_z_mm": at(safe_mm, travel, "a stated clearance"),
+            "motion.safe_z_mm": at(safe_mm, travel, "a chosen clearance"),
             "motion.park_mm": at([park_x, park_y, max(park_z, safe_mm)], by_hand + lifted),
         }
         if "well-rim 1" in places:
@@ -224,7 +224,7 @@ class LimitsStep(Step):
             f"{BELOW_MM:g} mm below. Agreed?"
         ):
             raise NotAccepted(
-                "the box was not agreed.", "Teach the place again that makes the box too large: `brushloop rig teach`."
+                "the box was refused.", "Teach the place again that makes the box too large: `brushloop rig teach`."
             )
         try:
             count = await ask_reach(visit.rig_path, rig, _to_reach(rig))
@@ -233,7 +233,7 @@ class LimitsStep(Step):
                 f"the arm does not reach the whole sheet: {error.what}.",
                 "Move the board with the sheet nearer to the arm, and teach sheet and places again.",
             ) from None
-        visit.say(f"The controller finds joint angles for all {count} poses at and over the places of the tip.")
+        visit.say(f"The controller finds joint angles for all {count} poses at the places of the tip and above them.")
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """The smallest box around everything that the tip must reach, in the base frame."""

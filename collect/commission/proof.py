@@ -117,12 +117,12 @@ class ProofStep(Step):
         residuals = f"residuals up to {worst_mm:.3f} mm (limit: {rig.touch.residual_mm:g} mm)"
         known = f"{z_mm - by_hand_mm:+.2f} mm from the touch by hand; {residuals}"
         again = sum(capture.retake for capture in captures)
-        later = "by how much later than the arm itself the picture shows it leave"
+        later = "time from when the arm leaves until the picture shows it"
         visit.keep(
             {
                 HEIGHT: Taught(z_mm, how, sigma_mm, known),
                 "aside.plane": Taught([plane.z0_mm, plane.slope_x, plane.slope_y], how, sigma_mm),
-                "camera.latency_ms": Taught(delay_ms, later, known=f"trips differ by {jitter_ms:.0f} ms"),
+                "camera.latency_ms": Taught(delay_ms, later, known=f"measurements differ by {jitter_ms:.0f} ms"),
             }
         )
         visit.say(
@@ -164,6 +164,6 @@ def read_proof(session: Path) -> tuple[ZeroTouchResult, SelfCheckResult, list[Ca
         raise NotAccepted(
             f"{len(passed)} of {PRESSES} presses passed the quality checks "
             f"({', '.join(why) or 'the others were not made'}).",
-            "Look at their pictures above: ink, light, sheet; then run the proof again.",
+            "Check ink, light and sheet in the pictures above, then run the proof again.",
         )
     return state.results(ZeroTouchResult)[-1], state.results(SelfCheckResult)[-1], captures

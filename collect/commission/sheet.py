@@ -55,8 +55,8 @@ class SheetStep(Step):
     async def carry_out(self, visit: Visit) -> None:
         """Have the corners touched until the origin is known well enough. Raises `NotAccepted`, `StepError`."""
         visit.say(
-            "Take off plain paper that still covers the board. Leave the board in the middle of the picture and the "
-            "sheet on the board, with its edges along the squares; if they do not lie there yet, lay them there now.",
+            "Take off any plain paper that covers the board. See that the board lies in the middle of the picture, and "
+            "the sheet on the board with its edges along the squares.",
             "Touch each corner with the brush upright (hold a set square beside it), and hold still.",
             "The lower edge is the one with the print's name.",
         )
@@ -79,7 +79,7 @@ class SheetStep(Step):
             visit.say(
                 f"sheet: {width:.1f} x {height:.1f} mm, turned by {fit.yaw_deg:.2f} deg, leaning by "
                 f"{fit.plane.slope_deg:.2f} deg; origin ({x:.2f}, {y:.2f}) mm; residuals up to {fit.worst_mm:.2f} mm "
-                f"(above {LEAST_OUTLIER_MM:g} mm a touch slipped: esc goes back to it)",
+                f"(above {LEAST_OUTLIER_MM:g} mm, a touch slipped: press esc to go back to it)",
                 f"{reached} standard error of the sheet's origin: {fit.origin_sigma_mm:.2f} mm (goal: {GOOD_MM:g} mm)",
             )
             if (sigma_mm := fit.origin_sigma_mm) <= GOOD_MM:
@@ -101,13 +101,13 @@ class SheetStep(Step):
         touches = len(notebook.touched(BOARD)) + len(notebook.touched(SHEET))
         how = f"{touches} corners of board and sheet touched by hand"
         known = f"residuals up to {fit.worst_mm:.2f} mm"
-        leaning = f"the sheet leans by {plane.slope_deg:.2f} deg; not yet measured by touch"
+        leaning = f"the sheet leans by {plane.slope_deg:.2f} deg; not yet measured by zero touch"
         slopes = [plane.z0_mm, plane.slope_x, plane.slope_y]
         return {
             "paper.origin_mm": Taught(list(fit.origin_mm), how, sigma_mm, known),
             "paper.yaw_deg": Taught(fit.yaw_deg, how, fit.yaw_sigma_deg, known),
             "paper.size_mm": Taught(list(fit.size_mm), how, sigma_mm, known),
-            "paper.touch_point_mm": Taught(point, "beside every patch"),
+            "paper.touch_point_mm": Taught(point, "in the sheet's margin, beside every patch"),
             "paper.touch_z_mm": Taught(plane.touch_z_mm(*point), how, fit.depth_sigma_mm, leaning),
             "board.origin_mm": Taught(list(fit.board_origin_mm), how, sigma_mm, known),
             "aside.plane": Taught(slopes, how, fit.depth_sigma_mm, known),
@@ -188,7 +188,7 @@ def check_board(board: Corners, spec: BoardSpec) -> None:
         if left_mm <= max(LEAST_MM, EXPLAINED * off_mm.max()):
             raise NotAccepted(
                 f"the corners of the board fit only {how} (off by {off_mm.max():.1f} mm otherwise).",
-                "The name on the print is along its lower edge; seen from above, the corners follow counter-clockwise.",
+                "The print's name is along the lower edge. Seen from above, touch the corners counter-clockwise.",
             )
         listed = ", ".join(f"{name} {off:.1f}" for name, off in zip(CORNERS, off_mm, strict=True))
         raise NotAccepted(
@@ -256,14 +256,14 @@ def _check_straight(corners: Floats) -> None:
     along, up = lower_right - lower_left + upper_right - upper_left, upper_left - lower_left + upper_right - lower_right
     if along[0] * up[1] - along[1] * up[0] <= 0.0:
         raise NotAccepted(
-            "the corners of the sheet were named as in a mirror.", "Seen from above they follow counter-clockwise."
+            "the sheet's corners were touched clockwise, as in a mirror.", "Touch them counter-clockwise."
         )
     askew_deg = math.degrees(math.atan2(along[1] - up[0], along[0] + up[1]))
     if abs(askew_deg) > ASKEW_DEG:
         raise NotAccepted(
             f"the sheet lies turned by {askew_deg:+.1f} deg on its board.",
-            "Lay its edges along the squares, and touch the corners again; the lower left one is beside the print's "
-            "name, for board and sheet.",
+            "Lay its edges along the squares, and touch the corners again. The lower left corner of board and sheet is "
+            "the one beside the print's name.",
         )
 
 

@@ -176,7 +176,7 @@ class TipStep(Step):
         """Have the pin touched until the tip is known well enough. Raises `NotAccepted`."""
         visit.say(
             "Fix a pin upright, within reach from all sides. Power the arm and switch the pendant to hand guiding.",
-            "Touch the pin's point with the tip of the dry brush, leaning to another side each time, and hold still.",
+            "Touch the pin's point with the tip of the dry brush. Lean it to another side each time, and hold still.",
         )
         await self._pin(visit)
         visit.say(
@@ -217,7 +217,7 @@ class TipStep(Step):
         if (stray := stray_touch(list(touches.values()))) is not None:
             number, off_mm, limit_mm = stray
             name = list(touches)[number]
-            off = f"{off_mm:.1f} mm from the common point of the others (at most {limit_mm:.1f} mm)"
+            off = f"{off_mm:.1f} mm from the common point of the other touches (limit: {limit_mm:.1f} mm)"
             visit.say(f"Touch {int(name) + 1} lies {off}: it is left out.", tone="warning")
             visit.forget(f"pin {name}")
             return math.inf
@@ -253,7 +253,7 @@ class TipStep(Step):
             return False
         names, flanges = list(holds), list(holds.values())
         axis, square = find_axis(flanges), brush_square(find_axis(flanges[-1:]).rotation_deg)
-        wrong = {names[k]: f"is {off_deg:.1f} deg from the others" for k, off_deg in axis.strays.items()}
+        wrong = {names[k]: f"is {off_deg:.1f} deg from the other poses" for k, off_deg in axis.strays.items()}
         sure = axis.clear
         if square.verdict == "contradicts":
             wrong, sure = {names[-1]: f"would make the brush lean {square.value} (plausible: {square.allowed})"}, True

@@ -45,10 +45,10 @@ StepName = Literal["arm", "camera", "tip", "sheet", "places", "brush", "force", 
 STEPS: tuple[StepName, ...] = get_args(StepName)
 UNKNOWN = "not "
 """Beginning of the text for a value that was taken over without a measurement."""
-HEAD = "# Made by `brushloop rig new`. Each value: how it was obtained, how well it is known, when."
+HEAD = "# Made by `brushloop rig new`. Above each value: how it was obtained, how well it is known, when."
 UNPROVEN = "# NOT PROVEN: `brushloop rig teach proof --arm` has not been run since the last value was taught."
 PROVEN = "# Proven by a dry run, a touch, the self-check and a judged press"
-UNTRIED = "# No real cabinet has confirmed this software yet: docs/unconfirmed.md says where a difference would show."
+UNTRIED = "# This software has not driven a real cabinet yet: docs/unconfirmed.md lists what may differ."
 
 
 def now_utc() -> str:

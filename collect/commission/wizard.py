@@ -90,7 +90,7 @@ class Wizard:
                 visit.say(describe(error), *(["Check power, cable and address."] if unhelpful else []), tone="trouble")
                 await visit.ask(choice_of("How do you want to go on?", (AGAIN,), AGAIN.key), back=False)
         except LeftOff:
-            raise CollectAborted("stopped; the same command resumes from there") from None
+            raise CollectAborted("stopped; run the same command again to resume") from None
         except WentBack:
             visit.back()
 

@@ -14,10 +14,10 @@ from typing import Annotated
 from typer import Option
 
 RIG_FILE, PROTOCOL_FILE = Path("rig.toml"), Path("protocol.toml")
-Rig = Annotated[Path, Option(help="The rig: addresses, frames, limits.")]
+Rig = Annotated[Path, Option(help="The rig.toml: addresses, frames and limits of the rig.")]
 Arm = Annotated[bool, Option("--arm", help="Let real hardware move.")]
 Tui = Annotated[bool | None, Option("--tui/--no-tui", help="Show the screen, by default in any terminal.")]
-NewSheet = Annotated[int | None, Option(min=1, help="Confirm that the session's sheet N is in place; may be repeated.")]
+NewSheet = Annotated[int | None, Option(min=1, help="Confirm that sheet N is in place; repeating it is harmless.")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,11 +33,11 @@ class CollectRequest:
     """The operator has looked at the robot cell."""
     dry_run_mm: Annotated[
         float | None,
-        Option("--dry-run", help="Make every move, this many mm higher: nothing is pressed, dipped or kept."),
+        Option("--dry-run", help="Make every move this many mm higher; nothing is pressed, dipped or kept."),
     ] = None
     on_screen: Tui = None
     """A screen shows run and camera, and can answer questions."""
-    guided: Annotated[bool, Option("--set-up", help="On the screen: accept or repeat each step of the set-up.")] = False
+    guided: Annotated[bool, Option("--set-up", help="Ask on the screen if each set-up step is good enough.")] = False
     live: Annotated[bool, Option("--live", help="Let a Foxglove viewer on this machine watch the run.")] = False
     live_port: Annotated[int, Option(min=0, max=65535, help="Port of --live; 0 takes any free one.")] = 8765
     resume: str | None = None

@@ -62,7 +62,7 @@ async def mark(context: StepContext, step: PressStep) -> PressResult:
     await look_at_sheet(context)
     if run.left_ink_ns is None or run.rig.clock.now_ns() - run.left_ink_ns > STALE_INK_S * 1e9:
         # Resumed, paused, or the last press failed: the brush may have dried or lost its ink since its dip.
-        context.recorder.log("dip again before the press")
+        context.recorder.log("the brush may be dry: dip again before the press")
         await fill_brush(context)
     context.recorder.listeners.append(touched)
     for number in range(1 if drawn is None else len(drawn.strokes)):

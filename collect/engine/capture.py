@@ -142,8 +142,8 @@ def _check_view(before: BoardResult, image: Gray, plane: Plane, paper: PaperConf
     height_px, width_px = image.shape
     if (size_px := before.size_px) != (width_px, height_px):
         raise NeedsOperator(
-            f"the camera gives {width_px} x {height_px} px, and gave {size_px[0]} x {size_px[1]} px when the session "
-            "began: set it back (camera.locked in rig.toml), or start a new session with --new."
+            f"the camera gives pictures of {width_px} x {height_px} px; when the session began, they had {size_px[0]} "
+            f"x {size_px[1]} px. Set the size back (camera.locked in rig.toml), or start a new session with --new."
         )
     seen_mm = plane.to_paper(np.array(before.sheet_px))
     moved_mm = float(np.linalg.norm(seen_mm - _corners_mm(paper), axis=1).max())
@@ -170,7 +170,7 @@ async def look_at_sheet(context: StepContext) -> None:
         inked = await uninterrupted(_inked_patches, run, image, {patch.index for patch in context.patches})
     if inked:
         raise NeedsOperator(
-            f"patches of sheet {sheet + 1} that should be blank hold ink ({len(inked)}), first: {inked[0]} "
+            f"ink on patches of sheet {sheet + 1} that should be blank, {len(inked)} in all. The first: {inked[0]} "
             f"Put in a blank sheet, or sheet {sheet + 1} of this session."
         )
     run.looked_at_sheet = sheet
@@ -195,7 +195,7 @@ async def _fresh_frame(context: StepContext) -> Frame:
         run.progress.log("measuring the camera's delay: the arm goes over the sheet and back, two to six times")
     frame = await photographer.photograph()
     if photographer.delay is not known:
-        measured = f"camera delay: {photographer.delay}; refused above {run.rig.config.camera.max_delay_ms:g} ms"
+        measured = f"camera delay: {photographer.delay}; limit {run.rig.config.camera.max_delay_ms:g} ms"
         context.recorder.log(measured)
         run.progress.log(measured)
     return frame

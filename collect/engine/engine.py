@@ -201,7 +201,7 @@ class Engine:
                 await self._stopper
             if self._stop_failure is not None and not isinstance(self._stop_failure, NotConnected):
                 raise self._stop_failure from None
-            raise CollectAborted("stopped; the same command resumes from here") from None
+            raise CollectAborted("stopped; run the same command again to resume") from None
 
     async def _session(self) -> None:
         run = self._run

@@ -119,8 +119,8 @@ def find_resumable(opening: Opening) -> Path | None:
     if folders:
         newest = folders[-1]
         way_out = (
-            f"Resume it with --config {newest / 'rig.toml'} --protocol {newest / 'protocol.toml'}, each beside the "
-            "files that it names, in the same environment; or start a new session with --new."
+            f"Resume it with --config {newest / 'rig.toml'} --protocol {newest / 'protocol.toml'}. Each must be beside "
+            "the files that it names, and the environment variables the same. Or start a new session with --new."
         )
         what = ["was begun with another configuration:", *differences(newest, opening.snapshots), way_out]
         raise ConfigError(newest, "", "\n".join(what))

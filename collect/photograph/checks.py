@@ -75,7 +75,7 @@ class Verdict:
         failed = [check for check in self.checks if not check.passed]
         if not failed:
             return ""
-        others = f" Also: {', '.join(check.name for check in failed[1:])}." if failed[1:] else ""
+        others = f" Also failed: {', '.join(check.name for check in failed[1:])}." if failed[1:] else ""
         return failed[0].reason + others
 
 
@@ -110,9 +110,9 @@ class Photograph:
         # The paper is neither dark nor saturated.
         level, limits, reason = measure.paper_level(self.image), self.limits, ""
         if level < limits.dark_level:
-            reason = f"The picture is too dark: paper at {level:.0f} of 255. Turn the light on or expose longer."
+            reason = f"The picture is too dark ({level:.0f} of 255 on the paper). Turn the light on or expose longer."
         if level >= limits.bright_level:
-            reason = f"The picture is too bright: paper at {level:.0f} of 255. Expose shorter or dim the light."
+            reason = f"The picture is too bright ({level:.0f} of 255 on the paper). Expose shorter or dim the light."
         limit = limits.dark_level if level < 0.5 * (limits.dark_level + limits.bright_level) else limits.bright_level
         checks = [_check(Failure.EXPOSURE, level, "of 255", limit, reason, passed=not reason)]
         # Edges are sharp where the picture has most contrast; there is none where a bare sheet fills it.
@@ -219,9 +219,9 @@ def neighbour(ink: Ink, limits: QualityConfig) -> Check:
     """The patch holds no ink but the press's own."""
     area_mm2 = ink.before_mm2 + ink.beside_mm2
     source = (
-        "a stroke of the next patch reaches into it. Leave this patch out and make the patches larger"
+        "a neighbouring stroke reaches into this patch. Leave this patch out; next session, use larger patches"
         if ink.before_mm2 > ink.beside_mm2
-        else "something dripped, or lies apart from the stroke. Wipe the brush on the rim after a dip"
+        else "ink dripped, or something lies beside the stroke. Wipe the brush on the rim after each dip"
     )
     reason = f"{area_mm2:.1f} mm^2 of ink in the patch do not belong to the stroke: {source}."
     return _check(Failure.NEIGHBOUR, area_mm2, "mm^2", limits.foreign_mm2, reason)
@@ -265,4 +265,4 @@ def judge_mark(mark: Mark, depth_mm: float, limits: QualityConfig) -> Iterator[C
     yield _check(Failure.BENT, mark.bent_deg, "deg", limits.bent_deg, reason)
 
 
-_WHERE = "Check the sheet's origin, that the sheet has not slipped, and that the brush is tight."
+_WHERE = "Check the sheet's origin, and whether the sheet slipped or the brush is loose."

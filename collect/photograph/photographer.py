@@ -88,7 +88,7 @@ class CameraDelay:
 
     def __str__(self) -> str:
         delay_ms, resolution_ms, spread_ms = (1e3 * v for v in (self.delay_s, self.resolution_s, self.spread_s))
-        trips = f"{len(self.looks)} trips, which differ by {spread_ms:.0f} ms"
+        trips = f"{len(self.looks)} measurements, which differ by {spread_ms:.0f} ms"
         return f"{delay_ms:.0f} ± {resolution_ms:.0f} ms (from {trips})"
 
 
@@ -219,7 +219,7 @@ class Photographer:
         late_s = max(shown_s, default=parked_s) - parked_s
         if late_s > self._config.max_delay_ms / 1e3:
             self.forget()
-            raise self._too_late(f"{1e3 * late_s:.0f} ms at least")
+            raise self._too_late(f"at least {1e3 * late_s:.0f} ms")
         if late_s > delay.bound_s + max(GROWN_SHARE * delay.bound_s, GROWN_S):
             self.delay = None  # it has grown, or was measured wrongly: the next photograph measures it again
         elif late_s > delay.bound_s:
@@ -332,6 +332,6 @@ class Photographer:
 
 def _in_picture(seconds: float) -> BadPicture:
     return BadPicture(
-        f"{seconds:g} s after the arm parked, something still moves or stays in the picture: the arm, a hand or a "
-        "shadow; or camera or sheet was moved. Clear the view; at motion.park_mm the arm must be out of the picture."
+        f"{seconds:g} s after the arm parked, something still moves or stays in the picture (the arm, a hand or a "
+        "shadow), or camera or sheet was moved. Clear the view. At motion.park_mm, the arm must be out of the picture."
     )

@@ -61,7 +61,7 @@ def _stroke_id(ident: str) -> str:
     if not 1 <= len(ident) <= MAX_ID:
         raise ValueError(f"a name has 1 to {MAX_ID} characters")
     if not ident.isprintable() or any(c in ' /\\<>:"|?*' for c in ident) or ident[0] in ".-~":
-        what = 'a name has no spaces, control characters, slashes or any of < > : " | ? *, and begins with no . - ~'
+        what = 'a name may not contain spaces, control characters, slashes or < > : " | ? *, nor begin with . - or ~'
         raise ValueError(what)
     return ident
 
@@ -117,7 +117,7 @@ class RoundsConfig(StrokesConfig):
     def _bounded(self) -> Self:
         strokes = len(self.round(1)) * self.repeats
         if strokes > MAX_STROKES:
-            raise ValueError(f"{strokes} strokes with repeats, at most {MAX_STROKES}")
+            raise ValueError(f"{strokes} strokes with all repeats; at most {MAX_STROKES} are allowed")
         distinct([stroke.stroke_id for stroke in self.planned()])
         return self
 
@@ -203,7 +203,7 @@ def _with_rows(
         return cast("object", values)
     table = cast("dict[str, object]", values)
     if name in table:
-        raise ValueError(f"{name}: a file is named too: give only one of the two")
+        raise ValueError(f"{name} and file are both given: give only one of them")
     return table | {name: [item(each) for each in info.context(table["file"], row)]}
 
 
@@ -334,7 +334,7 @@ class WriteConfig(RoundsConfig):
                             f"patch of {self.cell_mm[0]:g} x {self.cell_mm[1]:g} mm"
                         )
         if points > MAX_POINTS:
-            raise ValueError(f"{points} points in all, at most {MAX_POINTS}")
+            raise ValueError(f"{points} points in all; at most {MAX_POINTS} are allowed")
         return self
 
     def round(self, repeat: int) -> list[Planned]:

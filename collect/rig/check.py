@@ -162,7 +162,7 @@ def brush_square(rotation_deg: tuple[float, float, float]) -> Check:
     No measurement gives exactly zero: there the brush was only taken as square.
     """
     if not any(rotation_deg):
-        remedy = "Hold the brush upright: brushloop rig teach tip."
+        remedy = "Measure it with the brush held upright: brushloop rig teach tip."
         return unmeasured("brush to the flange's axis", "assumed to be square", remedy)
     about_x, about_y, _ = map(math.radians, rotation_deg)
     lean_deg = math.degrees(math.acos(max(-1.0, min(1.0, math.cos(about_x) * math.cos(about_y)))))
@@ -201,10 +201,10 @@ def _tool_and_sheet(config: RigConfig) -> Iterator[Check]:
     # Corners must be seen on all sides of the sheet.
     far_mm = [o + s - p for o, s, p in zip(board.origin_mm, size_mm(board), config.paper.size_mm, strict=True)]
     rim_mm = min(*(-o for o in board.origin_mm), *far_mm)
-    remedy = "The sheet lies in the middle of a board that is larger than it: print a larger one, or teach the sheet."
+    remedy = "The board must show on all sides of the sheet: print a larger board, or teach the sheet again."
     yield within("board around the sheet", rim_mm, 8.0, math.inf, "mm", remedy)
     if force is not None:
-        remedy = "A soft brush pushes with less than 3 N when it is pressed flat: force.max_n."
+        remedy = "Set force.max_n: a soft brush that is pressed flat pushes with less than 3 N."
         yield within("force ceiling", force.max_n, 0.2, 30.0, "N", remedy)
 
 
@@ -244,17 +244,17 @@ def _places(config: RigConfig) -> Iterator[Check]:
 def _not_measured(config: RigConfig) -> Iterator[Check]:
     robot, camera, touch = config.robot, config.camera, config.touch
     if not robot.payload_kg:
-        yield unmeasured("payload", "the pendant's", "Weigh holder, brush and sensor: robot.payload_kg.")
+        yield unmeasured("payload", "the pendant's", "Weigh holder, brush and sensor, and set robot.payload_kg.")
     if robot.collision_level is None:
-        yield unmeasured("collision level", "the pendant's", "robot.collision_level sets it; 9 is the most sensitive.")
+        yield unmeasured("collision level", "the pendant's", "Set robot.collision_level; 9 is the most sensitive.")
     if unlocked := [name for name, value in camera.locked.model_dump().items() if value is None]:
-        remedy = "They may drift: set camera.locked, or lock them in the program that serves the stream."
+        remedy = "Unlocked settings may drift: set camera.locked, or lock them in the program that serves the stream."
         yield unmeasured("camera settings", f"not locked: {', '.join(unlocked)}", remedy)
     if camera.optics is None:
         yield unmeasured("lens", "not calibrated", "brushloop camera intrinsics makes camera.lens_file.")
     if touch.method == "taught" or len(touch.points_mm) < 3:
         value = "taught by hand" if touch.method == "taught" else "fewer than three touch points: assumed level"
-        yield unmeasured("height and slope of the paper", value, "Touch three or more points, far apart: [touch].")
+        yield unmeasured("height and slope of the paper", value, "Set [touch] to three or more points, far apart.")
     if config.self_check.enabled is False:
         remedy = "Enable [self_check]: three marks before a session show a mirrored or turned sheet."
         yield unmeasured("self-check", "switched off", remedy)

@@ -185,7 +185,7 @@ class TouchConfig(Config):
     def _points(self) -> TouchConfig:
         if self.method == "camera" and len(self.points_mm) < 3:
             # Over the length of a row, a sheet that leans by 1 deg changes its height by more than a fine step.
-            raise ValueError(f"points_mm has {len(self.points_mm)} points: by camera three are needed")
+            raise ValueError(f"points_mm has {len(self.points_mm)} points; zero touch by camera needs three")
         return self
 
 
@@ -324,7 +324,7 @@ def _override(values: dict[str, Any], path: tuple[str, ...], name: str) -> None:
         table[path[-1]] = json.loads(text) if text.startswith(("[", "{")) else text
     except (ValueError, RecursionError):
         shown = text if len(text) <= 80 else f"{text[:77]}..."
-        raise ConfigError(variable, ".".join(path), f"is not JSON, as [40.0, 24.0] is (given: {shown!r})") from None
+        raise ConfigError(variable, ".".join(path), f"is not JSON, such as [40.0, 24.0] (given: {shown!r})") from None
 
 
 def load_rig(path: Path) -> RigConfig:

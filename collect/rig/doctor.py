@@ -131,15 +131,15 @@ async def _force(config: ForceTable, clock: Clock) -> Finding:
         newest = sensor.latest()
         rate_hz = 1e9 * (newest.stamp.seq - first.seq) / max(newest.stamp.host_ns - first.host_ns, 1)
         finding.latency_ms = (clock.now_ns() - newest.stamp.host_ns) / 1e6
-        force_n, dropped = math.hypot(*newest.force_n), sensor.assembler
-        finding.notes = f"{rate_hz:.0f} rounds/s, {force_n:.3f} N at rest, not zeroed yet"
-        if dropped.torn or dropped.refused or sensor.bus_errors:
-            finding.problem = f"{dropped.torn} broken, {dropped.refused} refused rounds, {sensor.bus_errors} bus errors"
+        force_n, lost = math.hypot(*newest.force_n), sensor.assembler
+        finding.notes = f"{rate_hz:.0f} readings/s, {force_n:.3f} N at rest, not zeroed yet"
+        if lost.torn or lost.refused or sensor.bus_errors:
+            finding.problem = f"{lost.torn} broken, {lost.refused} refused readings, {sensor.bus_errors} bus errors"
             finding.remedy = "Check wiring, shielding and termination."
         elif force_n > config.max_n:
             ceiling = f"above the ceiling force.max_n = {config.max_n:g} N"
             finding.problem = f"{force_n:.2f} N while nothing presses, {ceiling}"
-            finding.remedy = "Remove what touches the brush; the bias at each start takes off the weight of the holder."
+            finding.remedy = "Remove what touches the brush. The holder's weight is subtracted at each start."
 
     return await _asked(finding, sensor, look)
 
@@ -165,7 +165,7 @@ async def _robot(config: RigConfig, clock: Clock) -> Finding:
         finding.notes = "; ".join([*notices, f"{mode}, safety {safety}"])
         if safety not in MOVING_ALLOWED:
             finding.problem = f"safety mode is {safety}"
-            finding.remedy = "End the mode at the pendant: brushloop never does."
+            finding.remedy = "End this mode at the pendant; brushloop never does that."
         elif mode not in (RobotMode.POWER_OFF, RobotMode.IDLE, RobotMode.RUNNING):
             finding.problem, finding.remedy = f"robot mode is {mode}", "Look at the pendant."
 

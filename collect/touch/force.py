@@ -108,7 +108,7 @@ def find_contact(readings: Sequence[Reading], spring: Spring | None = None) -> C
     least = 2 if spring is None else 1
     rises = (pull > 0.0) & (stretch > 1e-12) & ((heights[None, :] < joins[:, None]).sum(axis=1) >= least)
     if not rises.any():
-        raise StepError("no contact: the force does not rise over two of these heights")
+        raise StepError("no contact: the force does not rise over at least two of the heights")
     squares = np.where(rises, -(pull**2) / np.where(rises, stretch, 1.0), np.inf)
     best = int(np.argmin(squares))
     contact, stiffness = float(joins[best]), float(pull[best] / stretch[best])

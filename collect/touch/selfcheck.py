@@ -134,7 +134,7 @@ def judge(commanded_mm: Floats, found_mm: Floats, config: SelfCheckConfig) -> Se
     if np.linalg.det(linear) < 0.0:
         name = max(MIRRORS, key=lambda n: float((np.array(MIRRORS[n]) * linear).sum()))
         raise _refused(
-            f"the marks are {name}", found, "Check paper.origin_mm, paper.yaw_deg, the board's origin and the mounting"
+            f"the marks are {name}", found, "Check paper.origin_mm, paper.yaw_deg, board origin and camera mounting"
         )
     turn = math.atan2(linear[1, 0] - linear[0, 1], linear[0, 0] + linear[1, 1])
     if abs(math.degrees(turn)) > config.turn_deg:

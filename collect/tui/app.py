@@ -34,7 +34,7 @@ LEAVE = yes_or_no(
 )
 NOT_PARKED = yes_or_no(
     "The arm is not parked: it rests where it was stopped, perhaps with the brush down. "
-    "The next run begins by lifting it. Quit all the same?",
+    "The next run begins by lifting the brush. Quit all the same?",
     "quit, and leave the arm where it is",
     "back to this screen",
 )

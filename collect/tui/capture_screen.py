@@ -115,7 +115,7 @@ class CaptureScreen(Screen[None], inherit_bindings=False):
         checks = () if self._capture.verdict is None else self._capture.verdict.checks
         lines = [checks_content(checks), Content(""), Content.styled(plain(self._model), "bold")]
         if (csim := self._capture.likeness) is not None:
-            lines.append(labelled("CSIM", f"{100.0 * csim:.1f} % in mm"))
+            lines.append(labelled("CSIM", f"{100.0 * csim:.1f} % at true size"))
         if not self._images:
             lines.append(Content("no picture, as the board is not seen in this photograph"))
         if "difference" in self._images:

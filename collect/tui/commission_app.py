@@ -46,8 +46,8 @@ from brushloop.collect.tui.widgets import (
 )
 
 AT_WORK = yes_or_no("A step is running: stop it and leave?", "stop and leave", "go on")
-STOPPED = "stopped: look at the arm. The same command resumes from there"
-DONE = "This is done. q leaves."
+STOPPED = "stopped: look at the arm. Run the same command again to resume"
+DONE = "Finished: press q to leave."
 TYPING_STOP = "ctrl-c: software stop; red button: emergency stop; ctrl-q: leave, all is kept"
 TONES: dict[Tone, tuple[str, str]] = {
     "finding": ("", ""),
@@ -95,7 +95,7 @@ class CommissionScreen(Screen[None], inherit_bindings=False):
 
     AUTO_FOCUS = "#found"
     HELP = f"""
-Every value is kept, and the same command resumes. Escape takes back the last answer or touch.
+Every value is kept: run the same command again to resume. Escape takes back the last answer or touch.
 Page up and page down show earlier and later results.
 
 {SOFTWARE_STOP} While you type, s is a letter, and only ctrl-c stops.

@@ -270,7 +270,7 @@ class ReviewScreen(Screen[None]):
         elif capture is not None:
             self._remark(capture, bad=capture.counts, note=capture.note)
             if capture.counts and self._review.open:
-                self.notify(f"{capture.press.stroke_id}: pressed again after the planned strokes")
+                self.notify(f"{capture.press.stroke_id} is pressed again after the planned strokes")
 
     def action_note(self) -> None:
         """Let the operator type a note."""

@@ -130,13 +130,13 @@ Sheet: · blank, ● counts, ! does not count, × cut short, △ self-check
         HELP_KEY,
         Binding("enter", "app.begin_again", "Resume the session"),
         Binding("enter", "enlarge", "Large", tooltip="the last capture"),
-        Binding("tab", "next_pane", "Pane", tooltip="overview, last capture, camera, where not all fit"),
+        Binding("tab", "next_pane", "Pane", tooltip="overview, last capture and camera in turn, if not all fit"),
         Binding("v", "app.review", "Review", tooltip="look through the captures and mark them"),
-        Binding("r", "request('RETAKE')", "Retake", tooltip="the current stroke, once photographed; r takes it back"),
+        Binding("r", "request('RETAKE')", "Retake", tooltip="the current stroke, once photographed; r undoes this"),
         Binding("k", "request('SKIP')", "Skip", tooltip="the current stroke"),
         Binding("n", "request('NEW_SHEET')", "New sheet", tooltip="before the next stroke"),
         Binding("j", "request('JOG')", "Jog", tooltip="find the paper again before the next stroke"),
-        Binding("b", "mark_last", "Bad", tooltip="the last capture: pressed again at the end; b takes it back"),
+        Binding("b", "mark_last", "Bad", tooltip="the last capture: it is pressed again at the end; b undoes this"),
     ]
 
     keys_depend_on = reactive((State.IDLE, True, False), bindings=True)
@@ -242,7 +242,7 @@ Sheet: · blank, ● counts, ! does not count, × cut short, △ self-check
         except SessionError as error:
             self.notify(plain(str(error)), severity="error", timeout=20)
             return
-        mark = "marked bad: pressed again after the planned strokes" if bad else "marked good again"
+        mark = "marked bad; it is pressed again after the planned strokes" if bad else "marked good again"
         self.notify(f"{last.press.stroke_id}: {mark}")
 
     def action_enlarge(self) -> None:
@@ -322,7 +322,7 @@ def live_content(now: Snapshot) -> Content:
     rows = _live_rows(now)
     if now.picture is not None:
         blur_px = now.picture.blur_px
-        focus = "no edge in view, so blur unknown"
+        focus = "no edge in view: the blur is unknown"
         if blur_px is not None:
             focus = f"blur {blur_px:.1f} px  {'✓ sharp' if blur_px < SHARP_PX else '! turn the lens'}"
         rows.append(("Focus", focus))
@@ -414,7 +414,7 @@ def _note_content(now: Snapshot) -> Content:
         following = SOFTWARE_STOP if now.state is State.DONE or now.rest_unknown else on
         return Content.assemble((f" {OVER} ", "bold reverse"), f"  {following}")
     if now.state is State.STOPPING:
-        return Content.styled(" not seen at rest yet: press the red button if it moves ", "bold reverse")
+        return Content.styled(" the arm was not seen at rest yet: press the red button if it moves ", "bold reverse")
     if now.requests:
         asked = ", ".join(now.requests)
         return Content.assemble((f" asked: {asked} ", "bold reverse"), f" {SHORT_STOP}")

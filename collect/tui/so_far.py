@@ -95,7 +95,7 @@ def fit_so_far(folder: Path) -> tuple[float, str] | None:
     }
     perfect = f"; a perfect model: {scores[CEILING]:.1f} %" if CEILING in scores else ""
     worst = condition_text(Condition(*min(alike, key=lambda at: alike[at])))
-    words = f"from {len(presses)} presses{perfect}\nleast known, so pressing it teaches most: {worst}"
+    words = f"from {len(presses)} presses{perfect}\npressing this condition again teaches most: {worst}"
     return scores[FITTED], words
 
 

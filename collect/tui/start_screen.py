@@ -52,7 +52,7 @@ RESTS_S = 0.3
 BESIDE_COLUMNS = 6
 """Columns beside the text about a session: its border, its padding and its scroll bar."""
 SIGNS = {"open": ("▶", "bold $text-warning"), "damaged": ("!", "bold $text-error")}
-GOES_ON = "The arm first lifts and parks; then the run continues there. No stroke is made twice."
+GOES_ON = "The arm first lifts the brush and parks; then the run goes on. No stroke is made twice."
 
 
 @dataclass(slots=True)
@@ -269,7 +269,7 @@ def first_steps_content(browser: SessionBrowser) -> Content:
 No session yet. First steps:
 
 {rig} 1  The rig: {plain(str(browser.config))}
-`brushloop rig new` writes it step by step, `brushloop sim --write-rig rig.toml --rate 20` without an arm.
+`brushloop rig new` writes it step by step; without an arm, `brushloop sim --write-rig rig.toml --rate 20` does.
 
 {protocol} 2  What to press: {plain(str(browser.protocol))}
 Press e for one of the examples, or for a file of your own.

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 SOFTWARE_STOP = "s is a software stop. The red button is the emergency stop."
 SHORT_STOP = "s: software stop; red button: emergency stop"
-STOP = Binding("s", "app.stop", "STOP", tooltip="Stop the arm at once, on every screen and over every question")
+STOP = Binding("s", "app.stop", "STOP", tooltip="Stop the arm at once, on every screen and during every question")
 """Shown first on every screen while the arm may move. The app takes this key and ctrl-c before any screen sees them."""
-HELP_KEY = Binding("question_mark", "app.help", "Help", key_display="?", tooltip="Every key of this screen, on and off")
+HELP_KEY = Binding("question_mark", "app.help", "Help", key_display="?", tooltip="Show or hide this screen's keys")
 
 
 def app_of(node: DOMNode) -> App[None]:

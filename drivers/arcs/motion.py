@@ -84,7 +84,7 @@ async def until_settled(
         if idle_since is not None and now - idle_since > RESTS_ELSEWHERE_S:
             raise _not_arrived(f"the arm rests {off_mm:.2f} mm and {off_deg:.2f} deg from the target")
         if late and now - nearer_at > STUCK_S:
-            raise _not_arrived(f"no rest after {allowed_s:.1f} s, {off_mm:.2f} mm and {off_deg:.2f} deg off the target")
+            raise _not_arrived(f"still {off_mm:.2f} mm and {off_deg:.2f} deg from the target after {allowed_s:.1f} s")
         await asyncio.sleep(POLL_S)
 
 
@@ -263,7 +263,7 @@ class OwnPath:
             self._ids.add(running)
         self._most = min(self._most, self._lines - max(len(self._ids) - 1, 0))
         if size > self._most:
-            what = f"the controller holds {size} lines, at most {self._most} of ours are left"
+            what = f"the controller holds {size} lines, but at most {self._most} of those sent can be left"
             raise PathDisturbed(DEVICE, "sequence", what)
         self._most = size
 

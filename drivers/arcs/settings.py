@@ -122,7 +122,7 @@ async def make_ready(controller: Controller, table: ArcsTable) -> Settings:
     wanted = await read_back(controller)
     if wanted.operational_mode not in ("Automatic", "Disabled"):
         what, condition = f"operational mode is {wanted.operational_mode}", "Nothing was set or powered."
-        remedy = "Turn it to Automatic on the pendant; no software here does that."
+        remedy = "Set the mode to Automatic on the pendant; brushloop never does that."
         raise MotionError(DEVICE, "power on", what, condition=condition, remedy=remedy)
     offset = [*(mm / 1e3 for mm in table.tcp_offset_mm), *map(math.radians, table.tcp_rotation_deg)]
     commands: dict[str, dict[str, object]] = {"setTcpOffset": {"offset": offset}}

@@ -136,7 +136,7 @@ class ForceTable(BaseModel, frozen=True, extra="forbid"):
         most_ms = MOST_STALE_LOOPBACK_MS if self.channel == LOOPBACK_CHANNEL else MOST_STALE_MS
         if self.stale_ms > most_ms:
             raise ValueError(
-                f"stale_ms = {self.stale_ms:g}: must be from 20 to {most_ms:g}; no force is felt that long"
+                f"stale_ms = {self.stale_ms:g}: must be from 20 to {most_ms:g}; for that long, no force is noticed"
             )
         return self
 
@@ -174,7 +174,7 @@ class SriM8123:
                     await asyncio.sleep(RECEIVE_S)
         except TimeoutError:
             dropped = self.assembler
-            what = f"no complete round in {CONNECT_S:g} s ({dropped.torn} broken, {dropped.refused} refused)"
+            what = f"no complete reading in {CONNECT_S:g} s ({dropped.torn} broken, {dropped.refused} refused)"
             remedy = "Check power, wiring, termination and bit rate."
             raise DeviceTimeout(DEVICE, "connect", what, remedy=remedy) from None
         # The board has no identification. No real board can be on a virtual bus or on the loopback rig's bus.
@@ -215,7 +215,7 @@ class SriM8123:
             self._averaged = None
         self.latest()
         if len(rounds) < MIN_BIAS_ROUNDS:
-            what = f"{len(rounds)} rounds in {seconds:g} s, {MIN_BIAS_ROUNDS} are needed"
+            what = f"{len(rounds)} readings in {seconds:g} s; {MIN_BIAS_ROUNDS} are needed"
             raise DeviceTimeout(DEVICE, "bias", what, remedy="Average for longer.")
         axes = list(zip(*rounds, strict=True))
         for name, values in zip(AXES, axes, strict=True):

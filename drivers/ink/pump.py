@@ -193,7 +193,7 @@ class ModbusPump(InkDevice):
         )
         if code:
             what = f"refused with {code} ({EXCEPTIONS.get(code, 'unknown')})"
-            raise InkRefused(DEVICE, op, what, condition=condition, remedy="Is this the pump's register map?")
+            raise InkRefused(DEVICE, op, what, condition=condition, remedy="Does the pump have other registers?")
 
     async def _refuse_echo(self) -> None:
         """Send a stop with a wrong CRC, which no device answers, and raise if the adapter returns it.
@@ -208,6 +208,6 @@ class ModbusPump(InkDevice):
             )
         except (DeviceTimeout, ProtocolViolation):
             return
-        what = "the line echoes, so a confirmation would mean nothing"
+        what = "the serial line echoes what is sent: a confirmation would prove nothing"
         remedy = "Switch off local echo on the RS-485 adapter."
         raise ProtocolViolation(DEVICE, "connect", what, remedy=remedy)

@@ -114,12 +114,12 @@ class InkStation(InkDevice):
                 return Identity(MODEL, firmware, kind == "loopback")
             case _:
                 what = f"identifies as {answer!r}, expected {MODEL} with protocol {PROTOCOL}"
-                remedy = "Check that the path is that of the ink station, and its firmware."
+                remedy = "Check that this is the port of the ink station, and check its firmware."
                 raise ProtocolViolation(DEVICE, "connect", what, remedy=remedy)
 
     async def _give(self, volume_ml: float) -> None:
         """Return when the ink is in the well. A dose that was sent cannot be interrupted, which is why it is small."""
-        unknown = f"Between 0 and {volume_ml:.3f} ml may be in the well."
+        unknown = f"It is unknown how much of {volume_ml:.3f} ml reached the well."
         answer = await self._ask(f"dose {volume_ml:.3f}", takes_s=volume_ml * DOSE_S_PER_ML, condition=unknown)
         given_ml = number_of(answer)
         if abs(given_ml - volume_ml) > max(2 * SMALLEST_ML, 0.05 * volume_ml):

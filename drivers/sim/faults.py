@@ -112,7 +112,7 @@ class Fault(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
         if self.on is not None and self.device is not Device.ROBOT:
             raise ValueError(f"on = {self.on!r}: only the robot has methods")
         if self.by_itself and self.nth != 1:
-            raise ValueError(f"nth = {self.nth} counts nothing here: {self.kind} of {self.device} waits for no request")
+            raise ValueError(f"nth = {self.nth} has no effect: {self.kind} of {self.device} does not wait for requests")
         return self
 
     @property

@@ -178,7 +178,7 @@ async def test_a_bus_that_is_off_or_gone_is_a_lost_connection_that_says_what_to_
 @pytest.mark.parametrize(
     ("interface", "channel", "ends"),
     [
-        ("virtual", "nobody", pytest.raises(DeviceTimeout, match=r"no complete round in 0.2 s .*termination")),
+        ("virtual", "nobody", pytest.raises(DeviceTimeout, match=r"no complete reading in 0.2 s .*termination")),
         ("socketcan", "can9", pytest.raises(ConnectionLost, match="cannot open socketcan can9")),
         ("no-such-interface", "can9", pytest.raises(ConnectionLost, match="cannot open no-such-interface can9")),
     ],

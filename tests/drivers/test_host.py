@@ -69,7 +69,7 @@ async def station(line: InstrumentServer) -> AsyncIterator[InkStation]:
 
 async def test_a_pulled_cable_is_a_lost_connection_at_once(line: InstrumentServer, station: InkStation):
     line.next_fault = lambda: "unplug"
-    with pytest.raises(ConnectionLost, match=r"may be in the well.*Check cable") as lost:
+    with pytest.raises(ConnectionLost, match=r"reached the well.*Check cable") as lost:
         await station.dose(1.0)
     assert lost.value.op == "dose"
     with pytest.raises(ConnectionLost, match="cannot open"):

@@ -178,7 +178,7 @@ def test_presses_that_cannot_be_made_again_are_refused_before_anything_is_comput
     with pytest.raises(ConfigError, match="would press on the sheet that is in place"):
         run_loop(LoopRequest(session, rig))
     rig.write_text(RIG.replace("simulated bristle bundle", "goat hair"), encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"brush\.name: 'goat hair, seed 1': the original was pressed with"):
+    with pytest.raises(ConfigError, match=r"brush\.name: 'goat hair, seed 1', but the session was pressed with"):
         run_loop(LoopRequest(session, rig, sheet=1))
 
 

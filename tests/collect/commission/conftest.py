@@ -121,7 +121,7 @@ class InLab(Person):
             "R:": str(brush.radius_mm),
             "L:": str(brush.length_mm),
             "Deepest press": str(facts.max_depth_mm),
-            "Delivery per revolution": "0.1",
+            "Ink per revolution": "0.1",
             "Serial line of the device": lab.ink_path,
             "CAN bus": lab.can_bus,
         }

@@ -23,8 +23,8 @@ from brushloop.sessions.store import SessionStore
 
 GRID = 'kind = "grid"\ndepths_mm = [11.0, 20.0]\ntilts_deg = [0.0]\nrepeats = 2\n'
 WAY_OUT = (
-    "Resume it with --config sessions/grid-01/rig.toml --protocol sessions/grid-01/protocol.toml, each beside the "
-    "files that it names, in the same environment; or start a new session with --new."
+    "Resume it with --config sessions/grid-01/rig.toml --protocol sessions/grid-01/protocol.toml. Each must be beside "
+    "the files that it names, and the environment variables the same. Or start a new session with --new."
 )
 
 

@@ -197,7 +197,7 @@ def test_ink_on_a_patch_that_should_be_blank_is_seen_before_the_brush_is_dipped(
     ink_ml = world.well.ml
     world.paper.lay(world.brush.press(13.0, 0.0, ink_load=1.0, press_seed=5), 31.0, 67.0, 0.0)
     world.version += 1
-    with pytest.raises(NeedsOperator, match=r"patches of sheet 1 that should be blank"):
+    with pytest.raises(NeedsOperator, match=r"ink on patches of sheet 1 that should be blank"):
         sharp_lab.run()
     assert not sharp_lab.presses
     assert world.well.ml == ink_ml

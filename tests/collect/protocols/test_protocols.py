@@ -192,15 +192,15 @@ def load(folder: Path, protocol: str, csv: str | bytes | None = None):
         (LIST, "depth_mm\n", r"p.csv: has no rows"),
         (LIST, b"depth_mm\n\xff\n", r"p.csv: is not UTF-8 at byte 9"),
         (LIST, 'depth_mm\n"11', r"p.csv: line 2: is not CSV"),
-        (LIST, "depth_mm,stroke_id\n11,a/b\n", r"line 2: stroke_id: a name has no .*slashes"),
+        (LIST, "depth_mm,stroke_id\n11,a/b\n", r"line 2: stroke_id: a name may not .*slashes"),
         (LIST, "depth_mm,stroke_id\n11,\x1b[2J\n", r"line 2: stroke_id: .*control"),
         (LIST + "repeats = 2\n", "depth_mm,stroke_id\n11,a\n12,a-r02\n", r"'a-r02' occurs twice"),
         (LIST, None, r"p.csv: no such file"),
         (LIST.replace("p.csv", "../p.csv"), None, r"protocol.toml: file: must be the name, without folder"),
-        (LIST + "presses = []\n", "depth_mm\n11\n", r"presses: a file is named too"),
+        (LIST + "presses = []\n", "depth_mm\n11\n", r"presses and file are both given"),
         (REPLAY, "stroke_id,depth_mm\na,11\n,12\n", r"every press that repeats one of old needs its stroke_id"),
-        (REPLAY.replace("old", "a b"), "stroke_id,depth_mm,tilt_deg\na,11,0\n", r"of: a name has no spaces"),
-        (WRITE + 'file = "p.csv"\n' + POINTS, None, r"figures.0.strokes.0: points: a file is named too"),
+        (REPLAY.replace("old", "a b"), "stroke_id,depth_mm,tilt_deg\na,11,0\n", r"of: a name may not contain spaces"),
+        (WRITE + 'file = "p.csv"\n' + POINTS, None, r"figures.0.strokes.0: points and file are both given"),
         (WRITE + 'file = "p.csv"\n', "x_mm,y_mm,depth_mm\n1,1,3\n70,1,3\n", r"the point \[70, 1\] lies outside"),
         (WRITE + 'file = "p.csv"\n', "x_mm,y_mm,depth_mm\n1,1,3\n1.5,1,3\n", r"point 2 is less than 1 mm from"),
         (WRITE + POINTS.replace("5.0,", "-1.0,"), None, r"nothing would be drawn"),
@@ -247,11 +247,11 @@ def test_rows_and_bytes_are_bounded_and_what_is_no_file_is_not_read(tmp_path: Pa
 
 
 def test_strokes_and_points_are_bounded_over_the_whole_protocol(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"12000 strokes with repeats, at most 10000"):
+    with pytest.raises(ConfigError, match=r"12000 strokes with all repeats; at most 10000"):
         load(tmp_path, LIST + "repeats = 1000\n", "depth_mm\n" + "11\n" * 12)
     rows = "".join(f"{1 + k % 50},{1 + k // 50 % 50},5\n" for k in range(900))
     figures = "".join(f'[[figures]]\nname = "f{k}"\n[[figures.strokes]]\nfile = "p.csv"\n' for k in range(12))
-    with pytest.raises(ConfigError, match=r"10800 points in all, at most 10000"):
+    with pytest.raises(ConfigError, match=r"10800 points in all; at most 10000"):
         load(tmp_path, f'kind = "write"\ncell_mm = [60.0, 60.0]\n{figures}', "x_mm,y_mm,depth_mm\n" + rows)
 
 

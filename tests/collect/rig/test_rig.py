@@ -44,7 +44,7 @@ def rig_file(tmp_path: Path, old: str = "", new: str = "") -> Path:
         ("[robot]", "[robot", r"is not TOML"),
         ("port = 30004", f"port = {'9' * 10_000}", r"is not TOML"),
         ("stale_ms = 100.0", "stale_ms = 3000.0", r"force: stale_ms = 3000: must be from 20 to 2000;"),
-        ("[motion]", '[touch]\nmethod = "camera"\npoints_mm = [[4.0, 4.0]]\n[motion]', r"touch: .*by camera three are"),
+        ("[motion]", '[touch]\nmethod = "camera"\npoints_mm = [[4.0, 4.0]]\n[motion]', r"touch: .*by camera needs"),
         ("[motion]", "[quality]\ndark_level = 200.0\nbright_level = 150.0\n[motion]", r"quality: .*dark_level"),
         ("[motion]", WIPE.replace("322.0", "120.0") + "[motion]", r"ink.wipe.rim_mm = .* lies on the sheet"),
         ("[motion]", WIPE.replace("130.0", "250.0") + "[motion]", r"ink.wipe.z_mm = 250 must lie in"),
@@ -114,7 +114,7 @@ def test_the_loopback_rig_contradicts_nothing_a_contradiction_ends_with_code_5_a
     [
         ("[0.0, 0.0, 180.0]", "[0.0, 0.0, 0.18]", "tool length", "0.18 m are 180 mm"),
         ("square_mm = 12.0\nmarker_mm = 9.0", "square_mm = 0.012\nmarker_mm = 0.009", "square of the board", "12 mm"),
-        ("squares = [26, 20]", "squares = [22, 16]", "board around the sheet", "print a larger one"),
+        ("squares = [26, 20]", "squares = [22, 16]", "board around the sheet", "print a larger board"),
         ("well_mm = [-75.0", "well_mm = [505.0", "inside the box, well", "Outside the box"),
         ("x_mm = [200.0, 640.0]", "x_mm = [200.0, 940.0]", "room in the box", "little more"),
         ("park_mm = [250.0, -230.0", "park_mm = [250.0, -100.0", "park beside the board", "in the picture"),
@@ -175,7 +175,7 @@ async def test_whatever_is_wrong_is_reported_with_a_remedy_and_every_other_devic
     wired_lab.rig.arcs.cabinet.safety_stop()
     findings = await examine(load_rig(wired_lab.folder / "rig.toml"), Clock())
     assert not any(finding.well for finding in findings)
-    problems = ("board corners found", "no complete round", "no reply", "ProtectiveStop")
+    problems = ("board corners found", "no complete reading", "no reply", "ProtectiveStop")
     remedies = ("into view", "wiring", "", "pendant")
     for finding, answers, problem, remedy in zip(findings, (True, False, False, True), problems, remedies, strict=True):
         assert finding.answers is answers
@@ -205,7 +205,7 @@ def test_a_rig_in_order_is_reported_with_all_that_was_answered_and_left_as_it_wa
     assert robot["latency_ms"] > 0.0
     assert "PowerOff, safety Normal, simulated" in robot["notes"]
     assert camera["notes"].startswith("board: ")
-    assert "rounds/s" in force["notes"]
+    assert "readings/s" in force["notes"]
     assert (ink["identity"], ink["firmware"], ink["notes"]) == ("ink-station", "1.0.0", "well 71% full, simulated")
     assert document["versions"]["brushloop"]
     assert document["versions"]["numpy"]

@@ -205,7 +205,7 @@ class FakeEngine:
     def join(self) -> None:
         self.calls.append("join")
         assert self.finished
-        raise CollectAborted("stopped; the same command resumes from here")
+        raise CollectAborted("stopped; run the same command again to resume")
 
 
 LATE = "touched the paper 10.2 s after its dip, other strokes after 1.1 s"

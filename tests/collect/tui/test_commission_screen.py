@@ -121,7 +121,7 @@ async def test_a_stop_key_stops_what_is_at_work_and_ends_the_screen(
         await pilot.press(key)
         await until(lambda: not app.is_running, "the end of the screen")
     assert moves == ["at work", "stopped"]
-    with pytest.raises(CollectAborted, match=r"look at the arm\. The same command resumes"):
+    with pytest.raises(CollectAborted, match=r"look at the arm\. Run the same command again"):
         app.steps.outcome.result()
 
 

@@ -366,7 +366,7 @@ async def test_a_line_that_comes_after_the_last_check_is_not_begun(
     else:
         await below(cabinet, at_mm)
         sends_aside(arm, cabinet)
-    with pytest.raises(PathDisturbed, match=r"holds \d lines, at most \d of ours are left.*nother client"):
+    with pytest.raises(PathDisturbed, match=r"holds \d lines, but at most \d of those sent can be left.*nother client"):
         await press
     assert all(math.hypot(p.x_mm - X_MM, p.y_mm - Y_MM) < 0.5 for p in passed if p.z_mm < 219.9), "in the paper"
     assert cabinet.queued == 0

@@ -284,7 +284,7 @@ def test_a_fault_strikes_the_requests_that_its_conditions_name(
     [
         ({"kind": "loud"}, "kind = 'loud' is not one of robot's: deaf, drop,"),
         ({"device": "telemetry", "on": "moveLine"}, "only the robot has methods"),
-        ({"kind": "emergency-stop", "nth": 2}, "counts nothing here"),
+        ({"kind": "emergency-stop", "nth": 2}, "has no effect"),
         ({"a\nb\x1b[31m": 1}, "Extra inputs are not permitted"),
     ],
 )
