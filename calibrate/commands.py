@@ -47,7 +47,7 @@ def finish(work: Callable[[Request, Progress], Printable], request: Request) -> 
     result = show_work(work, request)
     getattr(result, "check", bool)()
     if left_out := getattr(result, "left_out", ()):
-        raise StrokesLeftOut(f"finished, but {len(left_out)} strokes could not be used and were left out")
+        raise StrokesLeftOut(f"finished, but strokes could not be used and were left out: {len(left_out)}")
 
 
 def command(request: type[Any], work: str, carry_out: Callable[[Any, Any], object] = finish) -> Callable[..., None]:

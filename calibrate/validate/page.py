@@ -326,11 +326,11 @@ def _session(session: Session) -> Iterator[Point]:
         )
     if collected is not None and collected.left_out:
         of = "" if collected.planned is None else f" of {collected.planned} planned"
-        names = ", ".join(collected.left_out[:MAX_NAMED]) + (", ..." if len(collected.left_out) > MAX_NAMED else "")
-        yield Point(False, f"{len(collected.left_out)}{of} strokes were left out during collection: {names}.")
+        words = f"{len(collected.left_out)}{of} strokes were left out during collection"
+        yield Point(False, f"{words}: {', '.join(collected.left_out[:MAX_NAMED])}.")
     if collected is not None and collected.pressed_again:
-        takes = f"{len(collected.pressed_again)} of {collected.photographed} photographed strokes"
-        yield Point(None, f"{takes} did not count and were pressed again: the remaining strokes are a selection.")
+        words = f"{len(collected.pressed_again)} of {collected.photographed} photographed strokes were pressed again"
+        yield Point(None, f"{words}, after a failed check or on request. Only the new presses are compared.")
     if collected is not None and collected.moved_mm > MOVED_MM:
         words = f"two zero touches differ by {collected.moved_mm:.2f} mm ({', '.join(collected.touches[:MAX_NAMED])})"
         yield Point(False, f"{words}: presses with the same H do not have the same depth.")

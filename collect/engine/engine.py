@@ -201,7 +201,7 @@ class Engine:
                 await self._stopper
             if self._stop_failure is not None and not isinstance(self._stop_failure, NotConnected):
                 raise self._stop_failure from None
-            raise CollectAborted("stopped; run the same command again to resume") from None
+            raise CollectAborted("stopped; the session can be resumed with the same command") from None
 
     async def _session(self) -> None:
         run = self._run
@@ -277,8 +277,8 @@ class Engine:
             above_mm = tip_mm[2] - config.paper.touch_z_mm
             where = f"{abs(above_mm):.1f} mm {'above' if above_mm > 0.0 else 'below'} the height of the paper"
             error.add_note(
-                f"The brush may be down: its tip was last seen {where}. Clear the way above it, then start the same "
-                "command again, which first lifts the brush along its axis; or lift it with the pendant."
+                f"The brush may be down: its tip was last seen {where}. Clear the way above it: a resumed "
+                "run first lifts the brush along its axis. Or lift it with the pendant."
             )
         self.control.end(state)
         self._run.progress.over(describe(error))

@@ -131,7 +131,7 @@ class Run(RunContext):
 
     async def _park(self) -> None:
         await self._retreat()
-        raise CollectAborted("parked on request; run the same command again to resume")
+        raise CollectAborted("parked on request; the session can be resumed with the same command")
 
     async def _new_sheet(self) -> None:
         sheet = self.store.state.sheet

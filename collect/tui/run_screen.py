@@ -86,7 +86,7 @@ class RunScreen(Screen[None], inherit_bindings=False):
 
     AUTO_FOCUS = "#log-pane"
     HELP = """
-Grid: ✓ complete, ▶ now, › next, ! has bad takes, × left out
+Grid: ✓ complete, ▶ now, › next, ! has takes that do not count, × left out
 
 Sheet: · blank, ● counts, ! does not count, × cut short, △ self-check
 """
@@ -132,7 +132,7 @@ Sheet: · blank, ● counts, ! does not count, × cut short, △ self-check
         Binding("enter", "enlarge", "Large", tooltip="the last capture"),
         Binding("tab", "next_pane", "Pane", tooltip="overview, last capture and camera in turn, if not all fit"),
         Binding("v", "app.review", "Review", tooltip="look through the captures and mark them"),
-        Binding("r", "request('RETAKE')", "Retake", tooltip="the current stroke, once photographed; r undoes this"),
+        Binding("r", "request('RETAKE')", "Retake", tooltip="this or the next stroke, once photographed; r undoes it"),
         Binding("k", "request('SKIP')", "Skip", tooltip="the current stroke"),
         Binding("n", "request('NEW_SHEET')", "New sheet", tooltip="before the next stroke"),
         Binding("j", "request('JOG')", "Jog", tooltip="find the paper again before the next stroke"),

@@ -205,7 +205,7 @@ class FakeEngine:
     def join(self) -> None:
         self.calls.append("join")
         assert self.finished
-        raise CollectAborted("stopped; run the same command again to resume")
+        raise CollectAborted("stopped; the session can be resumed with the same command")
 
 
 LATE = "touched the paper 10.2 s after its dip, other strokes after 1.1 s"

@@ -168,7 +168,7 @@ async def test_a_day_at_the_rig(lab: Lab) -> None:
         # resume: asked first; board seen and paper touched again, not checked again; then, on a fresh sheet, to the end
         await operator.press("enter")
         await operator.sees(RunScreen)
-        await operator.is_asked("Resume ", "stopped; run")
+        await operator.is_asked("Resume ", "stopped; the")
         assert operator.engine.snapshot().strokes_done == now.strokes_done, "nothing looks lost while it is asked"
         await operator.answers("g", "Resume ", "g  resume")
         await operator.accepts("Camera, board, scale")
