@@ -221,7 +221,7 @@ class LimitsStep(Step):
         if not await visit.yes(
             f"The tip will stay in this box of the base frame: x {x_mm}, y {y_mm}, z {z_mm}. It is the smallest "
             f"box around sheet, well, wipe, pot and park position, with {MARGIN_MM:g} mm beside and above them, and "
-            f"{BELOW_MM:g} mm below. Agreed?"
+            f"{BELOW_MM:g} mm below the deepest press and the dip. Agreed?"
         ):
             raise NotAccepted(
                 "the box was refused.", "Teach the place again that makes the box too large: `brushloop rig teach`."
