@@ -115,7 +115,7 @@ class Recovered:
             )
         for name, flag in NOT_INFORMATIVE.items():
             if vague := self._flagged(flag):
-                yield f"warning: {vague} presses do not determine {name}: intervals cover most of the commanded range"
+                yield f"warning: {vague} presses hardly determine {name}: its interval covers most of the range"
         if 2 * (bound := self._flagged(Flag.AT_BOUND)) > many:
             yield f"warning: {bound} presses lie at a limit of H or alpha: first fit this brush (`brushloop fit`)"
         for stroke_id, why in self.left_out:
