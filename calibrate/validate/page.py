@@ -326,8 +326,8 @@ def _session(session: Session) -> Iterator[Point]:
         )
     if collected is not None and collected.left_out:
         of = "" if collected.planned is None else f" of {collected.planned} planned"
-        words = f"{len(collected.left_out)}{of} strokes were left out during collection"
-        yield Point(False, f"{words}: {', '.join(collected.left_out[:MAX_NAMED])}.")
+        names = ", ".join(collected.left_out[:MAX_NAMED]) + (", ..." if len(collected.left_out) > MAX_NAMED else "")
+        yield Point(False, f"{len(collected.left_out)}{of} strokes were left out during collection: {names}.")
     if collected is not None and collected.pressed_again:
         words = f"{len(collected.pressed_again)} of {collected.photographed} photographed strokes were pressed again"
         yield Point(None, f"{words}, after a failed check or on request. Only the new presses are compared.")

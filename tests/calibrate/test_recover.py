@@ -46,13 +46,17 @@ def photograph(depth_mm: float, tilt_deg: float, start_x_mm: float = START[0]) -
     return np.rint(230.0 * (1.0 - 0.92 * ink)).astype(np.uint8)
 
 
-def session(folder: Path, *, kind: Literal["press", "drag"] = "press", start_x_mm: float = START[0]) -> Path:
+def session(
+    folder: Path, *, kind: Literal["press", "drag"] = "press", start_x_mm: float = START[0], mirrored: bool = False
+) -> Path:
     photos = folder / "photos"
-    photos.mkdir()
+    photos.mkdir(parents=True)
     lines = ["file,depth_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
     for k, (height, tilt) in enumerate(PRESSES):
-        cv2.imwrite(str(photos / f"p{k}.png"), photograph(height, tilt, start_x_mm))
-        lines.append(f"p{k}.png,{height},{tilt},{PX},{start_x_mm * PX},{START[1] * PX}")
+        image = photograph(height, tilt, start_x_mm)
+        cv2.imwrite(str(photos / f"p{k}.png"), image[:, ::-1] if mirrored else image)
+        x_mm = image.shape[1] / PX - start_x_mm if mirrored else start_x_mm
+        lines.append(f"p{k}.png,{height},{tilt},{PX},{x_mm * PX},{START[1] * PX}")
     return imported(photos, lines, folder / "sessions" / "shots", kind)
 
 
@@ -91,6 +95,8 @@ def test_what_cannot_be_inverted_is_refused_and_writes_nothing(tmp_path: Path) -
         recovered(session(tmp_path / "drags", kind="drag"), tmp_path)
     with pytest.raises(CalibrationError, match="no stroke could be recovered: p0: is cut by the edge of its photo"):
         recovered(session(tmp_path, start_x_mm=8.0), tmp_path)
+    with pytest.raises(CalibrationError, match="p0: lies to the right of its touch point"):
+        recovered(session(tmp_path / "turned", mirrored=True), tmp_path)
     with pytest.raises(CalibrationError, match=r"no depth and tilt that this brush can press: depth_mm = \(2, 2\)"):
         recovered(tmp_path / "sessions" / "shots", tmp_path, depth_range_mm=(2.0, 2.0))
     with pytest.raises(CalibrationError, match=r"must end in \.csv"):

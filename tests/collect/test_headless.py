@@ -48,7 +48,8 @@ def test_a_signal_stops_the_run_and_the_same_command_goes_on_where_no_other_has_
         at_each_mark(lab, patch, signal.SIGTERM)
         ran = lab.command()
     assert ran.returncode == 4, ran.stderr
-    assert ran.stderr.splitlines()[-1].startswith("brushloop: stopped; the session can be resumed")
+    last = ran.stderr.splitlines()[-1]
+    assert last.startswith("brushloop: stopped; the session can be resumed with the same command")
     assert "Traceback" not in ran.stderr
     assert lab.at_rest
 
@@ -83,7 +84,8 @@ def test_where_nobody_watches_any_more_the_step_ends_and_the_arm_parks(
     lab.write_protocol(repeats=10)
     ran = lab.command()
     assert (ran.returncode, ran.stdout) == (4, "")
-    assert ran.stderr.splitlines()[-1].startswith("brushloop: parked on request; the session can be resumed")
+    last = ran.stderr.splitlines()[-1]
+    assert last.startswith("brushloop: parked on request; the session can be resumed with the same command")
     assert lab.rig.faults.phase() is Phase.PARKED
     assert not lab.state.cut
 

@@ -150,7 +150,7 @@ async def test_an_arm_that_was_stopped_or_failed_is_left_where_it_is(
 
 
 class Operator(Asker):
-    """Jogs down in large steps, then smaller ones, until the tip touches; or to the goes no lower, and then says
+    """Jogs down in large steps, then smaller ones, until the tip touches; or until it goes no lower, and then says
     `at_the_end`."""
 
     def __init__(self, bench: Bench, at_the_end: str = "") -> None:
@@ -216,7 +216,7 @@ FEW, MANY = [(4.0, 4.0), (70.0, 4.0), (36.0, 36.0)], [*((x, 4.0) for x in (4.0, 
 async def test_no_touch_leaves_what_was_checked(
     tmp_path: Path, method: str, points_mm: list[tuple[float, float]]
 ) -> None:
-    """An operator jogs to the goes no lower at each point: touches that each find the paper lower do not add up."""
+    """An operator jogs as low as the tip goes at each point: touches that each find the paper lower do not add up."""
     bench = Bench(tmp_path, (0.5, -0.5), paper_z_mm=119.4)
     touch: dict[str, Any] = {"method": method, "residual_mm": 9.0, "touches": 1, "points_mm": points_mm}
     config = bench.rig.config.model_copy(update={"touch": TouchConfig.model_validate(touch)})
