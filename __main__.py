@@ -109,10 +109,12 @@ COMMANDS: tuple[tuple[str, str, type[Any], str], ...] = (
     ("analyse", EVERY_DAY, commands.AnalyseRequest, "calibrate.notebook:analyse"),
     ("calibrate", RESEARCH, commands.CalibrateRequest, "calibrate.calibrated:calibrate_session"),
     ("camera board", "", commands.PrintRequest, "calibrate.board.spec:print_board"),
+    ("camera sheet", "", commands.SheetRequest, "calibrate.board.sheet:print_sheet"),
     ("camera intrinsics", "", commands.LensRequest, "calibrate.calibrated:calibrate_lens"),
     ("fit", RESEARCH, commands.FitRequest, "calibrate.fit.command:fit"),
     ("recover", RESEARCH, commands.RecoverRequest, "calibrate.recover:recover"),
     ("repress compare", "", commands.CompareLoopRequest, "calibrate.loop:compare"),
+    ("sessions import", "", commands.ImportRequest, "calibrate.imports:import_session"),
     ("sessions export", "", commands.ExportRequest, "calibrate.export:export"),
     ("train generator", "", commands.TrainRequest, "calibrate.training:train"),
     ("train tune", "", commands.TuneRequest, "calibrate.training:tune"),
@@ -127,7 +129,9 @@ COMMANDS: tuple[tuple[str, str, type[Any], str], ...] = (
 )
 """Commands of analysis: name, where the help lists it, what it takes, and the function that does it."""
 
-camera = typer.Typer(help="Make a printable board, and calibrate the lens by photographs of it.", no_args_is_help=True)
+camera = typer.Typer(
+    help="Print a board or a sheet, and calibrate the lens by photographs of the board.", no_args_is_help=True
+)
 groups = {"sessions": brushloop.sessions.cli.app, "camera": camera}
 app.add_typer(brushloop.collect.cli.app, name="collect", rich_help_panel=EVERY_DAY)
 app.add_typer(groups["sessions"], name="sessions", rich_help_panel=EVERY_DAY)

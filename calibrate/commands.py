@@ -12,7 +12,7 @@ from dataclasses import MISSING, dataclass, field, fields
 from importlib import import_module
 from inspect import Parameter, Signature
 from pathlib import Path
-from typing import Annotated, Any, Protocol, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Protocol, TypeVar, get_args, get_origin, get_type_hints
 
 from typer import Argument, Option
 from typer.core import TyperGroup
@@ -184,6 +184,30 @@ class ExportRequest:
 
 
 @dataclass(frozen=True, slots=True)
+class ImportRequest:
+    """Turn photographs and a table of what was pressed into a session that every later command accepts."""
+
+    photographs: Annotated[Path, Argument(help="Folder of photographs, or the scan of a sheet of `camera sheet`.")]
+    csv: Annotated[Path, Option(help="Table with a column `file` (or `box`), px_per_mm, and one for each parameter.")]
+    out: Annotated[Path | None, Option(help="New session folder; sessions/<name of the photographs> by default.")] = (
+        None
+    )
+    kind: Annotated[
+        Literal["press", "drag"], Option(help="press (vertical presses) or drag (strokes along the paper).")
+    ] = "press"
+    px_per_mm: Annotated[float | None, Option(min=0.01, max=1e4, help="Scale, where the table has none.")] = None
+    measured_mm: Annotated[
+        tuple[float, float] | None, Option(help="A sheet's print, measured between its marks: mm across, mm along.")
+    ] = None
+    licence: Annotated[str, Option(help="Licence of the photographs, kept in the recording.")] = ""
+    origin: Annotated[str, Option(help="Source of the photographs, kept in the recording.")] = ""
+    brush: Annotated[str, Option(help="Description of the brush.")] = ""
+    brush_radius_mm: Annotated[float, Option(min=0.5, max=50.0, help="Radius R of the brush, in mm.")] = 6.0
+    brush_length_mm: Annotated[float, Option(min=5.0, max=500.0, help="Length L of the brush, in mm.")] = 48.0
+    simulated: Annotated[bool, Option("--simulated", help="The ink was simulated; reports say so.")] = False
+
+
+@dataclass(frozen=True, slots=True)
 class RecoverRequest:
     """Recover depth and tilt of every captured press; writes a CSV and a protocol that presses them again."""
 
@@ -300,6 +324,14 @@ class PrintRequest(BoardOptions):
 
     out: Annotated[Path, Argument(help="PDF to create.")]
     page: Annotated[str, Option(help="Size of the page: a4, a3, a2 or letter.")] = "a4"
+
+
+@dataclass(frozen=True, slots=True)
+class SheetRequest:
+    """Write a printable sheet with numbered boxes for presses made by hand, and the table to fill in beside it."""
+
+    out: Annotated[Path, Argument(help="PDF to create; the table has the same name and ends in .csv.")]
+    page: Annotated[str, Option(help="Size of the page: a4, letter or a3.")] = "a4"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,6 +1,6 @@
-"""`brushloop sessions ...`: inspect, check, repair, import and merge recordings.
+"""`brushloop sessions ...`: inspect, check and repair recordings.
 
-`export` needs calibrations for its crops: the front door adds it from `calibrate/commands.py`.
+`import` and `export` need what is in `calibrate`: the front door adds them from `calibrate/commands.py`.
 
 Heavy imports wait until a command runs. Additional exit codes: 3 repaired, but something is lost; 6 damaged.
 """
@@ -8,7 +8,7 @@ Heavy imports wait until a command runs. Additional exit codes: 3 repaired, but 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -108,34 +108,3 @@ def close(session: Annotated[Path, typer.Argument(help="The folder of a session 
     finally:
         store.release()
     say(f"Closed: {final}")
-
-
-@app.command("import")
-def import_(
-    folder: Annotated[Path, typer.Argument(help="Folder of photographs.")],
-    csv: Annotated[Path, typer.Option(help="Table with a `file` column, px_per_mm, and one column per parameter.")],
-    out: Annotated[Path | None, typer.Option(help="New session folder; sessions/<folder's name> by default.")] = None,
-    kind: Annotated[
-        Literal["press", "drag"], typer.Option(help="press (vertical presses) or drag (strokes along the paper).")
-    ] = "press",
-    px_per_mm: Annotated[float | None, typer.Option(min=0.01, max=1e4, help="Scale, where the table has none.")] = None,
-    licence: Annotated[str, typer.Option(help="Licence of the photographs, kept in the recording.")] = "",
-    origin: Annotated[str, typer.Option(help="Source of the photographs, kept in the recording.")] = "",
-    brush: Annotated[str, typer.Option(help="Description of the brush.")] = "",
-    brush_radius_mm: Annotated[float, typer.Option(min=0.5, max=50.0, help="Radius R of the brush, in mm.")] = 6.0,
-    brush_length_mm: Annotated[float, typer.Option(min=5.0, max=500.0, help="Length L of the brush, in mm.")] = 48.0,
-    simulated: Annotated[bool, typer.Option("--simulated", help="The ink was simulated; reports say so.")] = False,
-) -> None:
-    """Turn a folder of photographs with a parameter table into a session that every later command accepts."""
-    import time
-    from importlib.metadata import version
-
-    from brushloop.sessions.imports import ImportOptions, import_photographs
-
-    options = ImportOptions(kind, px_per_mm, licence, origin, brush, brush_radius_mm, brush_length_mm, simulated)
-    target = out or Path("sessions") / folder.resolve().name
-    software = f"brushloop {version('brushloop')}"
-    with shown() as progress:
-        path = import_photographs(folder, csv, target, options, software, time.time_ns, progress=progress)
-    size = f"Brush: R = {brush_radius_mm:g} mm, L = {brush_length_mm:g} mm (--brush-radius-mm, --brush-length-mm)"
-    say(f"Imported into {path}", *([size] if kind == "press" else []), f"Next: brushloop analyse {path.parent}")

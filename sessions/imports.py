@@ -1,7 +1,7 @@
 """Import photographs: a folder of images and a table of what was commanded become a session.
 
 The table has one line per photograph and columns named `quantity_unit`. It is checked before a photograph is read; a
-refused import leaves nothing behind.
+refused import leaves nothing behind. The boxes of a printed sheet are photographs that the table names by their `box`.
 """
 
 from __future__ import annotations
@@ -39,6 +39,8 @@ class ImportOptions:
     """`press` for vertical presses, `drag` for strokes with travel along the paper."""
     px_per_mm: float | None = None
     """Scale for tables without px_per_mm columns."""
+    start_px: tuple[float, float] | None = None
+    """Photographs of a printed sheet's boxes: where every stroke starts. The table then has a column `box`."""
     licence: str = ""
     origin: str = ""
     brush: str = ""
@@ -66,7 +68,7 @@ def import_photographs(
         raise InputError(out, "exists already and is not overwritten: name another folder with --out")
     if not SESSION_ID.fullmatch(out.name):
         raise InputError(out, "a session's name consists of at most 100 letters, digits, '.', '_' and '-'")
-    rows = _read_table(folder.resolve(), table, options)
+    rows = read_table(folder.resolve(), table, options)
     header = Header(
         session_id=out.name,
         source=Source.IMPORT_SIMULATED if options.simulated else Source.IMPORT,
@@ -102,7 +104,7 @@ def _photograph(path: Path, stroke: Stroke, t_ns: int) -> CompressedImage:
     return image_message(t_ns, data, "png" if data.startswith(PNG_START) else "jpeg")
 
 
-def _read_table(folder: Path, path: Path, options: ImportOptions) -> list[tuple[Path, Stroke]]:
+def read_table(folder: Path, path: Path, options: ImportOptions) -> list[tuple[Path, Stroke]]:
     """Read and check every line of the table, without opening a photograph. Raises `InputError` for line and column.
 
     `folder` is that of the photographs, with links resolved.
@@ -116,17 +118,18 @@ def _read_table(folder: Path, path: Path, options: ImportOptions) -> list[tuple[
     try:
         names = _texts(next(lines, list[str]()))
         _check_columns(names, options)
+        file, ending = ("file", "") if options.start_px is None else ("box", ".png")
         for cells in filter(any, lines):
             if len(cells) != len(names):
                 raise ValueError(f"{len(cells)} fields, expected {len(names)}")
             fields = dict(zip(names, _texts(cells), strict=True))
-            image = _image(folder, fields["file"])
+            image = _image(folder, fields[file] + ending)
             name = fields.get("name", image.relative_to(folder).with_suffix("").as_posix())
             if "name" in fields and not 0 < len(name) <= MAX_NAME_CHARS:
                 raise ValueError(f"column `name`: {name[:80]!r}, allowed: 1 to {MAX_NAME_CHARS} characters")
             if name in rows:
                 raise ValueError(f"stroke {name} appears twice")
-            values = {column: _value(column, fields[column]) for column in names if column not in ("file", "name")}
+            values = {column: _value(column, fields[column]) for column in names if column not in (file, "name")}
             rows[name] = image, _stroke(name, len(rows), values, options)
     except (ValueError, csv.Error) as error:
         raise InputError(path, f"line {max(lines.line_num, 1)}: {error}") from None
@@ -146,12 +149,14 @@ def _texts(cells: list[str]) -> list[str]:
 
 def _check_columns(names: list[str], options: ImportOptions) -> None:
     """Raise `ValueError` for columns that are missing or not distinct."""
-    if "file" not in names:
-        raise ValueError(f"column `file` is missing; found: {', '.join(names)[:200] or 'none'}")
+    file = "file" if options.start_px is None else "box"
+    if file not in names:
+        raise ValueError(f"column `{file}` is missing; found: {', '.join(names)[:200] or 'none'}")
     if "px_per_mm" not in names and "px_per_mm_x" not in names and options.px_per_mm is None:
         raise ValueError("column `px_per_mm` (or px_per_mm_x and px_per_mm_y) is missing; or give --px-per-mm")
     required = [name for pair in PAIRS for name in pair if not set(pair).isdisjoint(names)]
-    for name in (*(PRESSED if options.kind == "press" else ()), *required):
+    pressed = PRESSED if options.start_px is None else PRESSED[:2]
+    for name in (*(pressed if options.kind == "press" else ()), *required):
         if name not in names:
             raise ValueError(f"column `{name}` is missing")
     for name in names:
@@ -180,7 +185,7 @@ def _stroke(name: str, still: int, values: dict[str, float], options: ImportOpti
             still=still,
             depth_mm=values.get("depth_mm"),
             tilt_deg=values.get("tilt_deg"),
-            anchor_px=pair(*PAIRS[1]),
+            anchor_px=pair(*PAIRS[1]) or options.start_px,
             px_per_mm=pair("px_per_mm", "px_per_mm") or pair(*PAIRS[0]) or scale,
             commanded={name: value for name, value in values.items() if name not in SPECIAL},
         )
