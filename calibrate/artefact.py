@@ -9,7 +9,7 @@ import hashlib
 import re
 from importlib.metadata import version
 from pathlib import Path
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -39,6 +39,9 @@ class Frozen(BaseModel):
 
 class Artefact(Frozen):
     """Base class of artefacts, which are saved under the hash of their canonical JSON."""
+
+    FOLDER: ClassVar[str] = FOLDER
+    """The folder of a session in which artefacts of this kind are put to use."""
 
     @property
     def digest(self) -> str:
@@ -98,9 +101,9 @@ class FittedValue(Frozen):
         return f"{self.value:.2f} ({interval})"
 
 
-def put_to_use(artefact: Artefact, session: Path, folder: str = FOLDER) -> Path:
-    """Save an artefact in `folder` of a session and point to it; returns its path. Raises OSError."""
-    path = artefact.save(session / folder)
+def put_to_use(artefact: Artefact, session: Path) -> Path:
+    """Save an artefact in its folder of a session and point to it; returns its path. Raises OSError."""
+    path = artefact.save(session / artefact.FOLDER)
     write_whole(path.with_name(POINTER), path.name + "\n")
     return path
 

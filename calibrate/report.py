@@ -19,9 +19,11 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from brushloop.calibrate.artefact import Frozen
+from brushloop.calibrate.compare import shown
 from brushloop.calibrate.errors import CalibrationError, invalid
 from brushloop.calibrate.files import write_whole
 from brushloop.sessions.disk import read_bounded
+from brushloop.sessions.messages import encode_png
 from brushloop.sessions.records import Header, Source
 
 Image = NDArray[np.float32]
@@ -73,7 +75,8 @@ def _templates() -> Any:
     templates: Any = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    templates.globals["brush_and_size"] = brush_and_size
+    templates.globals |= {"brush_and_size": brush_and_size, "shown": shown, "image_uri": image_uri}
+    templates.globals |= {"ink_uri": ink_uri, "overlay_uri": overlay_uri}
     return templates
 
 
@@ -132,9 +135,7 @@ def data_uri(data: bytes, kind: str = "png") -> str:
 
 def image_uri(image: NDArray[np.uint8]) -> str:
     """An (h, w) gray or (h, w, 3) BGR image as a PNG data URI."""
-    import cv2
-
-    return data_uri(cv2.imencode(".png", image)[1].tobytes())
+    return data_uri(encode_png(image))
 
 
 def photograph_uri(image: NDArray[np.uint8]) -> str:

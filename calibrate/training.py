@@ -18,17 +18,7 @@ from brushloop.calibrate.compare import FINE, Image, averaged, brush_of
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.files import Written, write_whole
 from brushloop.calibrate.presses import Refused, prepare_press
-from brushloop.calibrate.report import (
-    BLUE,
-    ORANGE,
-    Point,
-    chart_uri,
-    ink_uri,
-    overlay_uri,
-    picture_grid,
-    source_label,
-    write_page,
-)
+from brushloop.calibrate.report import BLUE, ORANGE, Point, chart_uri, picture_grid, source_label, write_page
 from brushloop.calibrate.session import OpenSession
 from brushloop.calibrate.stroke.preprocess import PX_PER_MM, Prepared
 from brushloop.calibrate.validate.command import one_source, open_session
@@ -138,7 +128,8 @@ def _samples(file: GeneratorFile, captures: Captures | None) -> Iterator[dict[st
         yield {
             "name": ", ".join(f"{name} {value:.3g}" for name, value in zip(INPUTS, values, strict=True)),
             "csim": 100.0 * csim(target, drawn) if target.any() and drawn.any() else 0.0,
-            "images": {"target": ink_uri(target), "network": ink_uri(drawn), "difference": overlay_uri(target, drawn)},
+            "target": target,
+            "drawn": drawn,
         }
 
 

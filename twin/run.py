@@ -10,10 +10,10 @@ import contextlib
 import multiprocessing
 import os
 import threading
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
-from dataclasses import dataclass, field, replace
-from itertools import count, pairwise
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from shlex import quote
 from typing import ClassVar
 
@@ -29,27 +29,14 @@ from brushloop.calibrate.fit.heldout import BEZIER, Predicted, held_out_scores
 from brushloop.calibrate.presses import read_for_fit
 from brushloop.calibrate.report import source_note
 from brushloop.calibrate.scores import Stat
-from brushloop.calibrate.work import Store, key_of
+from brushloop.calibrate.work import Store
 from brushloop.drivers.sim.brush.spec import BrushSpec, SoundHead
 from brushloop.model.presses import DepthTilt, Grid, Presses, image_of, refit_bezier
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.terminal import Progress, unseen
 from brushloop.twin.brush import HERE, SHAPE, SPREAD, Constant, Images, Vector, draw, place_at, with_values
-from brushloop.twin.search import (
-    COARSE_MM,
-    FEWEST_REPEATS,
-    FINE_MM,
-    Solution,
-    Spread,
-    Target,
-    choose_individual,
-    covariance,
-    fit_spread,
-    of_parts,
-    search,
-    start,
-)
+from brushloop.twin.search import FEWEST_REPEATS, Searches, Solution, Spread, Target, covariance, fit_spread, of_parts
 
 MOST_WORKERS = 8
 MOST_SD = 0.7
@@ -172,7 +159,7 @@ def fit_twin(presses: Presses, pool: Executor, progress: Progress = unseen, stor
     size = BrushSpec(radius_mm=presses.radius_mm, length_mm=presses.length_mm, seed=0)
     target = Target(size, tuple(groups), grid, means)
     parts = parts_of(target.conditions)
-    searches = _Searches(pool, store, progress, (1 + len(parts)) * (2 + len(COARSE_MM) + 1))
+    searches = Searches(pool, store, progress, 1 + len(parts))
     solution = searches.coarse(target)
     repeats = {condition: ink for condition, ink in groups.items() if len(ink) >= FEWEST_REPEATS}
     spread: Spread | None = None
@@ -199,39 +186,6 @@ def fit_twin(presses: Presses, pool: Executor, progress: Progress = unseen, stor
     held_out = tuple(held_out_scores(predicted, (TWIN, BEZIER)))
     values = {constant: fitted_value(constant, scales, error) for constant, scales, error in found}
     return Twin(spec, values, spread, held_out, sound_head(spec, target.conditions, grid))
-
-
-@dataclass(frozen=True, slots=True)
-class _Searches:
-    """The searches of one twin; passes that the store holds, as those of an interrupted run, are not repeated."""
-
-    pool: Executor
-    store: Store | None
-    progress: Progress
-    total: int
-    """Passes of all searches."""
-    _done: Iterator[int] = field(default_factory=lambda: count(1))
-
-    def coarse(self, target: Target) -> Solution:
-        solution = self._pass(choose_individual, target, start())
-        for blur_mm in COARSE_MM:
-            solution = self._pass(search, target, solution, blur_mm)
-        return solution
-
-    def fine(self, target: Target, solution: Solution) -> Solution:
-        return self._pass(search, target, self._pass(choose_individual, target, solution), FINE_MM)
-
-    def _pass(self, work: Callable[..., Solution], target: Target, solution: Solution, *blur_mm: float) -> Solution:
-        place = target.grid.x_mm, target.grid.y_mm, target.mean
-        key = key_of("twin", made_by(), blur_mm, target.base, target.conditions, *place, solution.seed, solution.point)
-        if self.store is not None and (kept := self.store.get(key)) is not None:
-            result = Solution(kept["point"], int(kept["seed"]))
-        else:
-            result = work(target, solution, self.pool, *blur_mm)
-            if self.store is not None:
-                self.store.put(key, {"point": result.point, "seed": np.array(result.seed)})
-        self.progress("twin: passes of the search", next(self._done), self.total)
-        return result
 
 
 def _predicted(presses: Presses, held: list[DepthTilt], there: Solution, target: Target) -> Iterator[Predicted]:

@@ -12,33 +12,23 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import combinations
+from itertools import combinations, count
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from brushloop.calibrate.artefact import made_by
+from brushloop.calibrate.work import Store, key_of
 from brushloop.drivers.sim.brush.spec import BrushSpec
-from brushloop.model.presses import Grid
+from brushloop.model.presses import DepthTilt, Grid
 from brushloop.model.similarity import csim
-from brushloop.twin.brush import (
-    HERE,
-    SHAPE,
-    SPREAD,
-    STILL,
-    DepthTilt,
-    Images,
-    Place,
-    Vector,
-    draw,
-    place_at,
-    search_bounds,
-    with_values,
-)
+from brushloop.sessions.terminal import Progress
+from brushloop.twin.brush import SHAPE, SPREAD, STILL, Images, Place, Vector, draw, place_at, search_bounds, with_values
 
 IMAGE_SD = 0.12
 """Standard deviation that the fit assumes for a blurred pixel. It is large because neighbouring pixels deviate
@@ -112,7 +102,7 @@ class Solution:
 def start() -> Solution:
     """The default brush, but with a trail faint enough for the search to see whether there is more of it or less."""
     scales = [one.scales(STARTS.get(one.name, one.default)) for one in SHAPE]
-    return Solution(np.array([*scales, *HERE]), INDIVIDUALS[0])
+    return Solution(np.array([*scales, 0.0, 0.0, 0.0]), INDIVIDUALS[0])
 
 
 def off(target: Target, seed: int, blur_mm: float, point: Vector) -> Vector:
@@ -183,6 +173,41 @@ def choose_individual(target: Target, solution: Solution, workers: Executor) -> 
     residuals = partial(off, target, blur_mm=FINE_MM, point=solution.point)
     squares = [float(one @ one) for one in workers.map(residuals, INDIVIDUALS, chunksize=4)]
     return Solution(solution.point, INDIVIDUALS[int(np.argmin(squares))])
+
+
+@dataclass(frozen=True, slots=True)
+class Searches:
+    """The searches of one twin; passes that the store holds, as those of an interrupted run, are not repeated."""
+
+    pool: Executor
+    store: Store | None
+    progress: Progress
+    many: int
+    """Number of searches, each with a coarse and a fine part."""
+    _done: Iterator[int] = field(default_factory=lambda: count(1))
+
+    def coarse(self, target: Target) -> Solution:
+        """From the default brush to where the detail decides."""
+        solution = self._pass(choose_individual, target, start())
+        for blur_mm in COARSE_MM:
+            solution = self._pass(search, target, solution, blur_mm)
+        return solution
+
+    def fine(self, target: Target, solution: Solution) -> Solution:
+        """From there to the end, with the individual chosen anew."""
+        return self._pass(search, target, self._pass(choose_individual, target, solution), FINE_MM)
+
+    def _pass(self, work: Callable[..., Solution], target: Target, solution: Solution, *blur_mm: float) -> Solution:
+        place = target.grid.x_mm, target.grid.y_mm, target.mean
+        key = key_of("twin", made_by(), blur_mm, target.base, target.conditions, *place, solution.seed, solution.point)
+        if self.store is not None and (kept := self.store.get(key)) is not None:
+            result = Solution(kept["point"], int(kept["seed"]))
+        else:
+            result = work(target, solution, self.pool, *blur_mm)
+            if self.store is not None:
+                self.store.put(key, {"point": result.point, "seed": np.array(result.seed)})
+        self.progress("twin: passes of the search", next(self._done), self.many * (3 + len(COARSE_MM)))
+        return result
 
 
 def covariance(target: Target, solution: Solution, workers: Executor) -> NDArray[np.float64]:

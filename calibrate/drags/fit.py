@@ -15,7 +15,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import cv2
 import numpy as np
@@ -32,7 +32,6 @@ from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.messages import decode_gray
 from brushloop.sessions.terminal import Progress, counted, unseen
 
-FOLDER = "dragfit"
 PREDICTED, LAG = "predicted", "bristle lag alone"
 SPREAD_MM = 0.9
 """Scale of the logistic: an edge that varies by 1.6 mm (standard deviation)."""
@@ -217,6 +216,8 @@ def captured_distance(masks: NDArray[np.bool_], mm_per_px: float) -> Floats:
 
 class DragArtefact(SessionFit):
     """The fitted drag model on disk. Equal inputs give an equal file."""
+
+    FOLDER: ClassVar[str] = "dragfit"
 
     mm_per_px: Annotated[float, Field(ge=MM_PER_PX, le=MM_PER_PX)]
     """Scale of the grid: ink on another grid is refused."""

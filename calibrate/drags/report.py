@@ -19,30 +19,10 @@ from rich.table import Table
 from brushloop.calibrate.artefact import made_by, put_to_use
 from brushloop.calibrate.commands import FitRequest
 from brushloop.calibrate.drags import Drags, read_drags
-from brushloop.calibrate.drags.fit import (
-    FOLDER,
-    LAG,
-    PREDICTED,
-    DragArtefact,
-    adapt_drags,
-    fit_drags,
-    model_of,
-    predicted,
-)
+from brushloop.calibrate.drags.fit import LAG, PREDICTED, DragArtefact, adapt_drags, fit_drags, model_of, predicted
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written
-from brushloop.calibrate.report import (
-    BLUE,
-    ORANGE,
-    chart_uri,
-    image_uri,
-    overlay_uri,
-    picture_grid,
-    render,
-    source_label,
-    source_note,
-    write_files,
-)
+from brushloop.calibrate.report import BLUE, ORANGE, about, chart_uri, picture_grid, render, source_note, write_files
 from brushloop.calibrate.stats import CEILING, ceiling_values, pair_means, student_95
 from brushloop.model.drag import Floats
 from brushloop.model.similarity import binary_scores, inked_window
@@ -167,13 +147,13 @@ def write_drags(validation: DragValidation, folder: Path, command: str) -> Path:
     step = max(1, -(-len(drags.strokes) // MAX_THUMBNAILS))
     page = render(
         "drags.html.j2",
+        **about(header),
         header=header,
-        note=source_note(header.source, header.brush),
         provenance=(("validated with", made_by()), ("command", command)),
         drags=drags,
         width=width_sentence(drags),
         plot=_plot(drags) if drags.strokes else "",
-        thumbnails=[(drag.stroke.stroke_id, image_uri(drag.thumbnail)) for drag in drags.strokes[::step]],
+        thumbnails=drags.strokes[::step],
         means=validation.means(),
         validation=validation,
         worst=list(_worst(validation)),
@@ -203,11 +183,11 @@ def drags_csv(drags: Drags) -> str:
     return csv_text([*head, "cut", "flags", "source"], rows)
 
 
-def _worst(validation: DragValidation) -> Iterator[tuple[Predicted, str]]:
-    """The strokes with the lowest CSIM among those scored, the worst first, and their overlays."""
+def _worst(validation: DragValidation) -> Iterator[tuple[Predicted, NDArray[np.float32], NDArray[np.float32]]]:
+    """The strokes with the lowest CSIM among those scored, the worst first, and the images of their overlays."""
     for stroke in sorted(validation.scored, key=lambda stroke: stroke.scores[PREDICTED][0])[:MAX_WORST]:
         window = inked_window(stroke.ink, stroke.captured > 0.5, 0)
-        yield stroke, overlay_uri(stroke.captured[window], stroke.ink[window].astype(np.float32))
+        yield stroke, stroke.captured[window], stroke.ink[window].astype(np.float32)
 
 
 def width_sentence(drags: Drags) -> str:
@@ -270,15 +250,14 @@ def fit_session(request: FitRequest, progress: Progress = unseen) -> Written:
         artefact = fit_drags(drags, progress)
     else:
         artefact = adapt_drags(drags, before, request.strokes or len(drags.placed))
-    path = put_to_use(artefact, drags.session.recording.path.parent, FOLDER)
+    path = put_to_use(artefact, drags.session.recording.path.parent)
     return Written(path, (*fit_lines(drags, artefact), f"Fit: {path}"), drags.left_out)
 
 
 def fit_lines(drags: Drags, artefact: DragArtefact) -> Iterator[Any]:
     """What is printed about a fit: lines and tables."""
-    header = drags.session.header
-    label = source_label(header.source, [header.brush])
-    yield f"{source_note(header.source, header.brush)}; {len(artefact.fitted_strokes)} dragged strokes"
+    label, note = about(drags.session.header).values()
+    yield f"{note}; {len(artefact.fitted_strokes)} dragged strokes"
     yield from (f"left out: {name}: {why}" for name, why in drags.left_out)
     yield f"depth at both ends: {drags.ends or 'as in the middle, because the table gives no depth at the ends'}"
     if artefact.prior:

@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from pydantic import model_validator
@@ -25,19 +25,7 @@ from brushloop.calibrate.files import Written
 from brushloop.calibrate.fit.fit import SPREAD_MM, Floats, fit_presses
 from brushloop.calibrate.fit.heldout import FITTED, leave_condition_out
 from brushloop.calibrate.presses import Refused, read_for_fit
-from brushloop.calibrate.report import (
-    COLOURS,
-    Point,
-    about,
-    chart_uri,
-    framed,
-    ink_uri,
-    picture_grid,
-    source_label,
-    source_note,
-    source_point,
-    write_page,
-)
+from brushloop.calibrate.report import COLOURS, Point, about, chart_uri, framed, picture_grid, source_point, write_page
 from brushloop.calibrate.scores import Stat
 from brushloop.calibrate.session import OpenSession
 from brushloop.calibrate.stats import NEAR_POINTS, is_near, student_95
@@ -58,6 +46,8 @@ SMOOTH_POINTS = 24
 
 class BrushFit(SessionFit):
     """A fitted brush, with its strokes and software. Equal inputs give an equal file."""
+
+    FOLDER: ClassVar[str] = FITS
 
     radius_mm: float
     length_mm: float
@@ -153,9 +143,8 @@ class FitResult:
         """What the command prints: lines and tables."""
         from rich.table import Table
 
-        header = self.session.header
-        label = source_label(header.source, [header.brush])
-        yield f"{source_note(header.source, header.brush)}; {len(self.presses)} presses fitted"
+        label, note = about(self.session.header).values()
+        yield f"{note}; {len(self.presses)} presses fitted"
         for name, why in self.left_out:
             yield f"left out: {name}: {why}"
         if self.sizes:
@@ -216,7 +205,7 @@ def fit_press_session(request: FitRequest, progress: Progress = unseen, opened: 
         ends_mm=press.ends.tolist(),
         csim_percent={row.model: row.csim.avg for row in held_out},
     )
-    path = put_to_use(fit, session.recording.path.parent, FITS)
+    path = put_to_use(fit, session.recording.path.parent)
     result = FitResult(session, presses, refused, fit, sizes_of(presses), held_out, path)
     _write_page(result, press)
     return result
@@ -259,7 +248,7 @@ def _picture(
         "depth_mm": f"{condition[0]:g}",
         "tilt_deg": f"{condition[1]:g}",
         "presses": len(numbers),
-        "ink": ink_uri(ink.mean(axis=0).astype(np.float32)[SHOWN_ROWS]),
+        "ink": ink.mean(axis=0).astype(np.float32)[SHOWN_ROWS],
         "fitted": _path(press, condition),
         "published": _path(published, condition),
         "csim": f"{100.0 * np.mean(alike):.1f}" if alike else "",
@@ -286,7 +275,7 @@ def _chart(presses: Presses, press: FittedPress, header: Header) -> str:
     smooth = np.linspace(float(depths.min()), float(depths.max()), SMOOTH_POINTS).tolist()
     sizes = np.array([measure(ink, presses.grid) for ink in presses.ink])
     drawn = {tilt: np.array([_fitted(press, depth, tilt, presses.grid.x_mm) for depth in smooth]) for tilt in shown}
-    figure, [axes] = picture_grid(1, 2, (9.6, 3.6), source_label(header.source, [header.brush]))
+    figure, [axes] = picture_grid(1, 2, (9.6, 3.6), about(header)["label"])
     seen = {"length": sizes[:, 0] + sizes[:, 1], "width": sizes[:, 2]}
     for column, (axis, (what, measured)) in enumerate(zip(axes, seen.items(), strict=True)):
         for tilt, colour in zip(shown, COLOURS, strict=False):

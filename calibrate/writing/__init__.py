@@ -9,7 +9,7 @@ import base64
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field, PlainSerializer, PlainValidator, ValidationError, model_validator
@@ -93,6 +93,8 @@ class PlannedBy(Frozen):
 
 class FootprintArtefact(SessionFit):
     """A fitted footprint on disk. Equal inputs give an equal file."""
+
+    FOLDER: ClassVar[str] = "footprint"
 
     values: dict[str, Annotated[float, Field(allow_inf_nan=False)]]
     images: int

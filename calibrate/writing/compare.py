@@ -33,18 +33,7 @@ from brushloop.calibrate.compare import (
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.files import Written
 from brushloop.calibrate.presses import Refused, prepare_patch
-from brushloop.calibrate.report import (
-    Sealed,
-    about,
-    data_uri,
-    ink_uri,
-    overlay,
-    overlay_uri,
-    picture_grid,
-    render,
-    save_picture,
-    write_files,
-)
+from brushloop.calibrate.report import Sealed, about, data_uri, overlay, picture_grid, render, save_picture, write_files
 from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.calibrate.stats import Floats, Summary, pair_means, summarise
 from brushloop.calibrate.stroke.preprocess import Prepared
@@ -299,8 +288,6 @@ def write_written(written: WritingComparison, folder: Path, command: str) -> Pat
         paper_rows=PAPER_ROWS,
         rounds=[[*each.figure.rounds, round_of(each, plan.cell_mm)] for each in written.characters],
         phases=[str(phase) for phase in Phase],
-        ink_uri=ink_uri,
-        overlay_uri=overlay_uri,
         ssim_settings=SSIM_SETTINGS,
         picture=data_uri(picture),
         header=header.model_copy(update={"protocol": ""}),  # the plan, point by point

@@ -71,7 +71,6 @@ LEAST_GAIN_PERCENT = 0.2
 """A round that gains less CSIM than this has not helped: two writings of one plan differ by about as much."""
 WORSE = 0.5
 """Factor on the correction in each phase that became worse."""
-FOLDER = "footprint"
 MM_PER_PX = 0.5
 LEAST = 3
 """Least number of strokes: fewer do not distinguish the discs."""
@@ -113,7 +112,7 @@ def fit(request: FitFootprintRequest, progress: Progress = unseen) -> Written:
         strokes=count,
         csim_percent=csim_percent,
     )
-    path = put_to_use(artefact, opened.recording.path.parent, FOLDER)
+    path = put_to_use(artefact, opened.recording.path.parent)
     words = (
         f"the footprint fitted to {count} strokes on {len(ink)} patches ({artefact.source}) draws these strokes with "
         f"a CSIM of {csim_percent:.1f} % (ink = 1)"

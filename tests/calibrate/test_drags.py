@@ -14,7 +14,6 @@ import pytest
 from brushloop.calibrate.artefact import current
 from brushloop.calibrate.drags import MM_PER_PX, Drag, Drags, along_axis, commanded_path, defects, read_drags
 from brushloop.calibrate.drags.fit import (
-    FOLDER,
     FOLDS,
     LAG,
     PREDICTED,
@@ -66,7 +65,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def fit_command(session: Path, *more: str) -> tuple[Path, str]:
     """The artefact that `brushloop fit` writes for drags, and what it prints."""
-    output, path = said("fit", session, *more), current(session, FOLDER)
+    output, path = said("fit", session, *more), current(session, DragArtefact.FOLDER)
     assert path is not None
     return path, output
 

@@ -141,9 +141,8 @@ def test_the_shape_is_found_with_hairs_that_stray_as_those_of_the_captures(monke
         strays.append((blur_mm, target.base.strand_mm))
         return found  # how a search finds its way is tested above
 
-    for name, value in {"COARSE_MM": (1.0,), "FINE_MM": 0.5, "search": counted}.items():
-        monkeypatch.setattr(f"brushloop.twin.run.{name}", value)
-    monkeypatch.setattr("brushloop.twin.search.INDIVIDUALS", range(1))
+    for name, value in {"COARSE_MM": (1.0,), "FINE_MM": 0.5, "search": counted, "INDIVIDUALS": range(1)}.items():
+        monkeypatch.setattr(f"brushloop.twin.search.{name}", value)
     condition = (3.0, 0.0)
     brush = replace(BrushSpec(), strand_mm=0.5)
     captured = draw(brush, HERE, [condition], GRID, repeats=4)[0]
@@ -180,10 +179,10 @@ def test_a_session_gets_a_twin_and_a_run_that_was_broken_off_goes_on(
 
     cut: list[bool] = []
     in_this_process = partial(nullcontext, ONE_THREAD)
-    short = {"COARSE_MM": (1.0,), "FINE_MM": 0.5, "workers": in_this_process, "VOTES": 1, "search": counted}
-    for name, value in short.items():
+    for name, value in {"workers": in_this_process, "VOTES": 1}.items():
         monkeypatch.setattr(f"brushloop.twin.run.{name}", value)
-    monkeypatch.setattr("brushloop.twin.search.INDIVIDUALS", range(2))
+    for name, value in {"COARSE_MM": (1.0,), "FINE_MM": 0.5, "search": counted, "INDIVIDUALS": range(2)}.items():
+        monkeypatch.setattr(f"brushloop.twin.search.{name}", value)
     command = "twin", session, "--out", out
     with pytest.raises(PowerCut):
         said(*command)
