@@ -113,14 +113,15 @@ class LoopRecord(Sealed):
         """The result in one sentence."""
         if not self.lost:
             return Point(None, f"{self.again}: no condition was pressed twice, so the repeatability is unknown.")
-        points, *_, measure, row = max(self.lost, key=lambda lost: lost[0])
+        points, interval, _, measure, row = max(self.lost, key=lambda lost: lost[0])
         good = min((near for _, _, near, *_ in self.lost), key=(False, None, True).index)
-        sure = " Whether this goal is met will be certain only with more repeated presses." if good is None else ""
+        span = " (95 % interval: {:.1f} to {:.1f})".format(*interval) if interval else ""
+        sure = ", which this interval neither confirms nor excludes: press more of them again" if good is None else ""
         return Point(
             good,
             f"Compared with their originals, the presses repeated in {self.again} score up to {max(0.0, points):.1f} "
-            f"points of {measure.upper()} lower than other presses of the same depth and tilt do ({row.alignment}, "
-            f"{row.tone}). The goal is at most {self.goal_points:g} point of CSIM and of SSIM.{sure}",
+            f"points of {measure.upper()}{span} lower than other presses of the same depth and tilt do "
+            f"({row.alignment}, {row.tone}). The goal is at most {self.goal_points:g} point{sure}.",
         )
 
 

@@ -61,7 +61,8 @@ def collect(request: CollectRequest, *, chained: bool = False) -> Snapshot:
     folder = Path(now.folder)
     say(f"recorded: {folder / folder.name}.mcap")
     if not chained and not isinstance(opening.protocol, WriteConfig):  # characters are analysed with their plan
-        say(f"next:     brushloop analyse {folder}")
+        report = folder / "validation" / "report.html"
+        say(f"report:   {report}" if report.exists() else f"next:     brushloop analyse {folder}")
     return now
 
 

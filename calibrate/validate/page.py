@@ -7,6 +7,7 @@ The page is one self-contained file, and every figure shows its source in the pi
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,15 @@ from brushloop.calibrate.report import (
 )
 from brushloop.calibrate.scores import MEASURES, Stat
 from brushloop.calibrate.stats import CEILING, NEAR_POINTS, Floats, Summary, is_near
-from brushloop.calibrate.validate.run import BEZIER_REFITTED, FITTED_HELD_OUT, HELD_OUT, PRESSES, ModelInfo, Outcome
+from brushloop.calibrate.validate.run import (
+    BEZIER_REFITTED,
+    FITTED_HELD_OUT,
+    HELD_OUT,
+    NOT_PREDICTED,
+    PRESSES,
+    ModelInfo,
+    Outcome,
+)
 from brushloop.calibrate.validate.tables import (
     NORMAL,
     STRICT,
@@ -303,6 +312,8 @@ def trust(report: Report) -> Iterator[Point]:
         yield Point(lost <= MUCH_REFUSED * strokes, words)
     else:
         yield Point(True, "Every stroke that counted was used.")
+    for model, count in Counter(press.why.split()[0] for press in report.refused if NOT_PREDICTED in press.why).items():
+        yield Point(None, f"{model} does not predict {count} of {strokes} strokes: its row averages the others only.")
     for session in report.sessions:
         for point in _session(session):
             yield Point(point.good, f"{session.header.session_id}: {point.text}")

@@ -122,7 +122,7 @@ async def zero_touch(context: StepContext, step: ZeroTouchStep) -> ZeroTouchResu
             f"{moved_mm:+.2f} mm from the height that was known before"
         )
     if step.index > 0:
-        text = f"The paper lies {moved_mm:+.2f} mm from its earlier height. From now on, H counts from the new height."
+        text = f"You found the paper {moved_mm:+.2f} mm from its earlier height. Shall H count from the new height?"
         choices = (Choice("g", "good, use the new height"), Choice("k", "keep the old height"))
         if await run.asker.ask(Prompt(text, choices, "k")) != "g":
             raise StepError("the new height was not accepted.")

@@ -334,7 +334,7 @@ class Progress:
             strokes_done=len(kept),
             strokes_planned=len(plan),
             grid=self._grid(kept, bad, left_out, at_work=at_work),
-            voids=len(state.cut),
+            voids=sum(begin.press is not None for begin, _ in state.cut),
             given_up=len(left_out),
             eta_s=self._eta_s(times_ns),
             ink_level=ink_level,

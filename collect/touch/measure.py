@@ -102,7 +102,7 @@ async def _jogged(
     while True:
         rests_mm = await procedures.lower(*point, z_mm, config.speed_mm_s)
         question = (
-            f"{name.capitalize()}. Jog until the tip just touches the paper. "
+            f"{name.capitalize()}. Jog until the tip just touches the paper at ({point[0]:g}, {point[1]:g}) mm. "
             f"The tip is {rests_mm - reach.expected_z_mm:+.2f} mm from the expected height."
         )
         if z_mm <= reach.lowest_z_mm + ROUNDING_MM:

@@ -78,7 +78,7 @@ KINDS: dict[Device, frozenset[str]] = {
     Device.INK: frozenset({"deaf", "mute", "garbage", "late", "unplug"}),
     Device.FORCE: frozenset({"silence", "no-second", "nan", "bus-error", "bus-off", "stuck"}),
 }
-"""What each kind does is in docs/faults.md."""
+"""What each kind does is in docs/loopback-controller.md."""
 
 
 class Fault(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):

@@ -167,10 +167,10 @@ def test_the_paper_is_found_again_by_jog_and_a_jog_that_is_given_up_or_not_taken
     answer(engine, "+0.00 mm", "t")
     answer(engine, "+2.00 mm", "1")  # as it was requested
     answer(engine, "+1.00 mm", "t")
-    answer(engine, "lies +1.", "g")
+    answer(engine, "paper +1.", "g")
     engine.control.toggle(OperatorRequest.JOG)
     answer(engine, "Touch 1 of 1.", "t")
-    answer(engine, "lies +1.", "k")
+    answer(engine, "paper +1.", "k")
     engine.control.toggle(OperatorRequest.JOG)
     answer(engine, "Touch 1 of 1.", "x")
     wait_for_end(engine)
