@@ -28,6 +28,8 @@ PRESSED = ("depth_mm", "tilt_deg", *PAIRS[1])
 """Columns that presses need."""
 SPECIAL = {"px_per_mm", "depth_mm", "tilt_deg", *PAIRS[0], *PAIRS[1]}
 """Columns of numbers that become fields of a stroke; all others are kept in `commanded`."""
+EARLIER_NAMES = {"height_mm": "depth_mm"}
+"""Columns of tables that were made when the depth was called a height, such as those of the bristle simulation."""
 MAX_NAME_CHARS = 100
 
 
@@ -116,7 +118,7 @@ def read_table(folder: Path, path: Path, options: ImportOptions) -> list[tuple[P
     lines = csv.reader(io.StringIO(text, newline=""), strict=True)
     rows: dict[str, tuple[Path, Stroke]] = {}
     try:
-        names = _texts(next(lines, list[str]()))
+        names = [EARLIER_NAMES.get(name, name) for name in _texts(next(lines, list[str]()))]
         _check_columns(names, options)
         file, ending = ("file", "") if options.start_px is None else ("box", ".png")
         for cells in filter(any, lines):

@@ -94,6 +94,14 @@ def test_a_table_may_come_from_a_spreadsheet(make, photos, out, run):
     assert capture.stroke.px_per_mm == (10.0, 20.0)
 
 
+def test_a_depth_may_be_called_a_height_as_the_shared_photographs_of_presses_do(make, photos, out, run):
+    row = {"file": "a.png", "px_per_mm": "12.5", "height_mm": "13", "tilt_deg": "5"} | START
+    make.photographs(photos, row)
+    run()
+    [capture] = Recording(out).captures()
+    assert (capture.stroke.depth_mm, capture.stroke.commanded) == (13.0, {})
+
+
 def test_what_a_killed_import_left_is_cleared_away(rows, out, run):
     stage = out.with_name(".from-elsewhere.partial")
     stage.mkdir(parents=True)
