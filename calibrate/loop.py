@@ -115,13 +115,13 @@ class LoopRecord(Sealed):
             return Point(None, f"{self.again}: no condition was pressed twice, so the repeatability is unknown.")
         points, interval, _, measure, row = max(self.lost, key=lambda lost: lost[0])
         good = min((near for _, _, near, *_ in self.lost), key=(False, None, True).index)
-        span = " (95 % interval: {:.1f} to {:.1f})".format(*interval) if interval else ""
-        sure = ", which this interval neither confirms nor excludes: press more of them again" if good is None else ""
+        span = "" if interval is None else "; 95 % interval: {:.1f} to {:.1f}".format(*interval)
+        sure = "" if good is not None else ", which is not certain yet: press more of them again"
         return Point(
             good,
-            f"Compared with their originals, the presses repeated in {self.again} score up to {max(0.0, points):.1f} "
-            f"points of {measure.upper()}{span} lower than other presses of the same depth and tilt do "
-            f"({row.alignment}, {row.tone}). The goal is at most {self.goal_points:g} point{sure}.",
+            f"Recovered presses, pressed again ({self.again}), score {max(0.0, points):.1f} points of {measure.upper()} "
+            f"lower than other presses of the same depth and tilt, in the worst of all comparisons "
+            f"({row.alignment}, {row.tone}{span}). The goal is at most {self.goal_points:g} point{sure}.",
         )
 
 

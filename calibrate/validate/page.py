@@ -45,6 +45,7 @@ from brushloop.calibrate.validate.run import (
     Outcome,
 )
 from brushloop.calibrate.validate.tables import (
+    MISSING,
     NORMAL,
     STRICT,
     Report,
@@ -322,6 +323,8 @@ def trust(report: Report) -> Iterator[Point]:
         yield Point(False, words)
     if _csim(report, FITTED_HELD_OUT) is None:
         yield Point(None, "No model was calibrated to this brush: run “brushloop fit”, then validate again.")
+    if _csim(report, "ccd-bsmg") is None:
+        yield Point(None, f"CCD-BSMG is {MISSING['ccd-bsmg']}.")
     for loop in report.loops:
         yield loop.answer
 

@@ -157,7 +157,7 @@ USAGE = (
 
 
 class ControlServer(LoopbackServer):
-    """Live control of one rig, by requests that are in docs/loopback-controller.md: `async with ControlServer(rig, path):`.
+    """Live control of one rig, described in docs/loopback-controller.md: `async with ControlServer(rig, path):`.
 
     The socket at `path` is its owner's alone; one of a rig that has ended is replaced. Raises `RigRefused`.
     """
