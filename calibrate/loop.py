@@ -119,8 +119,8 @@ class LoopRecord(Sealed):
         sure = "" if good is not None else ", which is not certain yet: press more of them again"
         return Point(
             good,
-            f"Recovered presses, pressed again ({self.again}), score {max(0.0, points):.1f} points of {measure.upper()} "
-            f"lower than other presses of the same depth and tilt, in the worst of all comparisons "
+            f"Recovered presses, pressed again ({self.again}), score {max(0.0, points):.1f} points of "
+            f"{measure.upper()} lower than other presses of the same depth and tilt, in the worst of all comparisons "
             f"({row.alignment}, {row.tone}{span}). The goal is at most {self.goal_points:g} point{sure}.",
         )
 
