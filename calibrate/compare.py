@@ -75,6 +75,9 @@ class Polarity(StrEnum):
 Key = tuple[Alignment, Tone]
 KEYS: tuple[Key, ...] = tuple(itertools.product(Alignment, Tone))
 """Every way in which two images are compared."""
+STRICT: Key = (Alignment.MM, Tone.BINARY)
+NORMAL: Key = (Alignment.SIZE_NORMALISED, Tone.BINARY)
+"""The comparison where size and place count, and that of the paper."""
 MM_BINARY, MM_GRAY = (KEYS.index((Alignment.MM, tone)) for tone in Tone)
 SHOWN_ROWS = slice(32, 96)
 """Rows to show: the middle half of a field, as a press is at most half as thick as the field is high."""
@@ -192,20 +195,13 @@ def similarity(
 
     NaN where one is blank. If size-normalised, the others are shifted to best overlap.
     """
-    few = (others[k : k + AT_ONCE] for k in range(0, len(others), AT_ONCE))
-    return np.concatenate([_similarity(captured, images, alignment, polarity) for images in few])
-
-
-def _similarity(
-    captured: NDArray[Any], others: NDArray[Any], alignment: Alignment, polarity: Polarity
-) -> NDArray[np.float64]:
-    if alignment is Alignment.SIZE_NORMALISED:
-        others = best_shift(others, captured)
-    blank = ~(others.any(axis=(1, 2)) & captured.any())
-    if polarity is Polarity.PAPER:
-        captured, others = 1.0 - captured, 1.0 - others
-    scores = csim_and_ssim(captured, others)
-    scores[blank] = np.nan
+    scores = np.empty((len(others), 2))
+    fixed = 1.0 - captured if polarity is Polarity.PAPER else captured
+    for few in (slice(k, k + AT_ONCE) for k in range(0, len(others), AT_ONCE)):
+        moved = best_shift(others[few], captured) if alignment is Alignment.SIZE_NORMALISED else others[few]
+        blank = ~(moved.any(axis=(1, 2)) & captured.any())
+        scores[few] = csim_and_ssim(fixed, 1.0 - moved if polarity is Polarity.PAPER else moved)
+        scores[few][blank] = np.nan
     return scores
 
 

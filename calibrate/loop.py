@@ -14,26 +14,15 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from brushloop.calibrate.artefact import made_by
 from brushloop.calibrate.commands import CompareLoopRequest
-from brushloop.calibrate.compare import (
-    KEYS,
-    MM_PER_PX,
-    ROBOT_WRITING,
-    TABLE_1,
-    Alignment,
-    Key,
-    Pixels,
-    Tone,
-    shown,
-    simulated,
-)
+from brushloop.calibrate.compare import KEYS, MM_PER_PX, ROBOT_WRITING, STRICT, TABLE_1, Key, Pixels, simulated
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written
 from brushloop.calibrate.fit.command import BrushFit
 from brushloop.calibrate.presses import Press, Refused, read_presses, too_thin, uncommanded
-from brushloop.calibrate.report import Point, Sealed, about, ink_uri, overlay_uri, render, source_point, write_files
+from brushloop.calibrate.report import Point, Sealed, about, render, source_point, write_files
 from brushloop.calibrate.scores import MEASURES, Scores, Stat, scores_csv, similarities, statistics
 from brushloop.calibrate.session import OpenSession, open_session
-from brushloop.calibrate.stats import Floats, Interval, Summary, is_near
+from brushloop.calibrate.stats import Interval, Summary, is_near
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.similarity import SSIM_SETTINGS
 from brushloop.sessions.disk import check_writable
@@ -48,7 +37,6 @@ AGAIN, ANOTHER, SIMULATED = "re-pressed", "another press", "recovered, simulated
 """What is compared with an original: its repetition, other originals of its condition, the model's image of it."""
 GOAL_POINTS = 1.0
 """Points by which re-pressed strokes may score below the originals' own repeatability."""
-HEADLINE = (Alignment.MM, Tone.BINARY)
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,7 +222,7 @@ def write_loop(
     The sessions are the original and the one that pressed it again.
     """
     header = sessions[0].header
-    percent = 100.0 * scores.of_key(AGAIN, HEADLINE)
+    percent = 100.0 * scores.of_key(AGAIN, STRICT)
     worst_first: list[int] = percent[:, 0].argsort(kind="stable").tolist()
     page = render(
         "loop.html.j2",
@@ -245,24 +233,12 @@ def write_loop(
         beside=(TABLE, record.FILE),
         tables=[(key, record.rows(key)) for key in KEYS],
         paper=TABLE_1[ROBOT_WRITING],
-        rows=[_shown(pairs[k], percent[k]) for k in worst_first],
+        rows=[(pairs[k], percent[k]) for k in worst_first],
         ssim_settings=SSIM_SETTINGS,
         sessions=sessions,
     )
     write_files(folder, {TABLE: scores_csv(scores), record.FILE: record.to_json(), PAGE: page})
     return folder / PAGE
-
-
-def _shown(pair: Pair, percent: Floats) -> dict[str, Any]:
-    """A pair in the page: its CSIM and SSIM, (2,), and its pictures."""
-    original, drawn, again = map(shown, (pair.original.images, pair.simulated, pair.again.images))
-    images = {
-        "original": ink_uri(original),
-        "recovered, simulated": ink_uri(drawn),
-        "pressed again": ink_uri(again),
-        "original and pressed again": overlay_uri(original, again),
-    }
-    return {"original": pair.original, "again": pair.again, "percent": percent, "images": images}
 
 
 def _trust(record: LoopRecord) -> Iterator[Point]:

@@ -13,36 +13,14 @@ from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from brushloop.calibrate.compare import (
-    ANCHOR_MM,
-    FIELD_MM,
-    KEYS,
-    Image,
-    Pixels,
-    brush_of,
-    captured,
-    covered,
-    field_around,
-    field_grid,
-)
+from brushloop.calibrate.compare import ANCHOR_MM, FIELD_MM, KEYS, brush_of, captured, covered, field_around, field_grid
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.report import source_label
 from brushloop.calibrate.session import Calibration, OpenSession, open_session
-from brushloop.calibrate.stroke.preprocess import (
-    BACKGROUND_MM,
-    NOT_IN_FIELD,
-    PX_PER_MM,
-    Gray,
-    Measured,
-    Prepared,
-    cut_out,
-    measure,
-    on_window,
-    prepare,
-    rectify_by,
-    rescale,
-)
+from brushloop.calibrate.stroke import preprocess
+from brushloop.calibrate.stroke.preprocess import PX_PER_MM, Gray, Measured, Prepared
 from brushloop.calibrate.work import Arrays, Scheduler, key_of, threads
 from brushloop.model.presses import Presses
 from brushloop.sessions.errors import SessionDamaged
@@ -67,9 +45,9 @@ class Press:
     source: str
     """Label of its recording."""
     stroke: Stroke
-    images: Pixels
+    images: NDArray[np.uint8]
     """(len(KEYS), 128, 128): what is compared."""
-    coverage: Image
+    coverage: NDArray[np.float32]
     """(128, 128) share of each pixel of the millimetre field that is ink."""
     anchor_mm: tuple[float, float]
     """The zero-touch point, from the field's left and top edge."""
@@ -180,7 +158,7 @@ def prepare_job(job: tuple[Capture, Calibration | None]) -> Arrays:
         "images": captured(prepared),
         "coverage": covered(prepared),
         "anchor_mm": np.array(prepared.anchor_px) / PX_PER_MM,
-        "measured": np.array(astuple(measure(prepared.mask))),
+        "measured": np.array(astuple(preprocess.measure(prepared.mask))),
         "cut": np.array(prepared.cut),
     }
 
@@ -214,22 +192,22 @@ def rectified(capture: Capture, calibration: Calibration | None) -> tuple[Gray, 
         if stroke.kind == "drag" and stroke.cell_mm is not None:
             window = x_mm, y_mm, _, tall_mm = stroke.cell_mm
             left_mm, top_mm = stroke.anchor_mm[0] - x_mm, y_mm + tall_mm - stroke.anchor_mm[1]
-        raster = rectify_by(image, calibration, window, capture.where)
-        patch_px = None if stroke.cell_mm is None else on_window(stroke.cell_mm, window)
+        raster = preprocess.rectify_by(image, calibration, window, capture.where)
+        patch_px = None if stroke.cell_mm is None else preprocess.on_window(stroke.cell_mm, window)
         anchor = (left_mm * PX_PER_MM, top_mm * PX_PER_MM)
-        return raster, prepare(raster, anchor, capture.where, patch_px)
+        return raster, preprocess.prepare(raster, anchor, capture.where, patch_px)
     if stroke.px_per_mm is None:
         raise CaptureRefused(stroke.stroke_id, "has neither a calibration nor a scale of its own")
     anchor_px = stroke.anchor_px
     if anchor_px is not None and stroke.kind == "press":
-        around, (left_mm, top_mm) = 0.5 * BACKGROUND_MM, ANCHOR_MM
+        around, (left_mm, top_mm) = 0.5 * preprocess.BACKGROUND_MM, ANCHOR_MM
         right_mm, bottom_mm = FIELD_MM - left_mm, FIELD_MM - top_mm
         reach_mm = (left_mm + around, top_mm + around, right_mm + around, bottom_mm + around)
-        image, anchor_px = cut_out(image, anchor_px, stroke.px_per_mm, reach_mm, capture.where)
-    raster = rescale(image, stroke.px_per_mm, capture.where)
+        image, anchor_px = preprocess.cut_out(image, anchor_px, stroke.px_per_mm, reach_mm, capture.where)
+    raster = preprocess.rescale(image, stroke.px_per_mm, capture.where)
     scale_x, scale_y = (PX_PER_MM / scale for scale in stroke.px_per_mm)
     anchor = None if anchor_px is None else (anchor_px[0] * scale_x, anchor_px[1] * scale_y)
-    return raster, prepare(raster, anchor, capture.where)
+    return raster, preprocess.prepare(raster, anchor, capture.where)
 
 
 def prepare_press(capture: Capture, calibration: Calibration | None) -> Prepared:
@@ -259,7 +237,7 @@ def _cropped(prepared: Prepared, anchor_px: tuple[float, float]) -> Prepared:
     window = slice(top + side, top + 2 * side), slice(left + side, left + 2 * side)
     mask, soft = (np.pad(part, side)[window] for part in (prepared.mask, prepared.soft))
     if not mask.any():
-        raise CaptureRefused("anchor", NOT_IN_FIELD)
+        raise CaptureRefused("anchor", preprocess.NOT_IN_FIELD)
     cut = prepared.cut or bool(np.count_nonzero(mask) < np.count_nonzero(prepared.mask))
     return replace(prepared, mask=mask, soft=soft, anchor_px=(anchor_px[0] - left, anchor_px[1] - top), cut=cut)
 
@@ -272,5 +250,5 @@ def prepare_patch(capture: Capture, calibration: Calibration) -> Prepared:
     cell_mm = capture.stroke.cell_mm
     if cell_mm is None:
         raise CaptureRefused(capture.stroke.stroke_id, "has no patch")
-    raster = rectify_by(capture.image(), calibration, cell_mm, capture.where)
-    return prepare(raster, None, capture.where, join_mm=math.hypot(*cell_mm[2:]), speck_share=SPECK_SHARE)
+    raster = preprocess.rectify_by(capture.image(), calibration, cell_mm, capture.where)
+    return preprocess.prepare(raster, None, capture.where, join_mm=math.hypot(*cell_mm[2:]), speck_share=SPECK_SHARE)

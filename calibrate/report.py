@@ -19,14 +19,13 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from brushloop.calibrate.artefact import Frozen
-from brushloop.calibrate.compare import shown
+from brushloop.calibrate.compare import Image, shown
 from brushloop.calibrate.errors import CalibrationError, invalid
 from brushloop.calibrate.files import write_whole
 from brushloop.sessions.disk import read_bounded
 from brushloop.sessions.messages import encode_png
 from brushloop.sessions.records import Header, Source
 
-Image = NDArray[np.float32]
 PAPER = "#fbf9f4"
 """Background of charts and picture files."""
 COLOURS = BLUE, ORANGE, *_ = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00"
@@ -198,9 +197,14 @@ def picture_grid(rows: int, columns: int, size: tuple[float, float], title: str 
 
 
 def chart_uri(figure: Any) -> str:
-    """A figure of `picture_grid` as a PNG data URI; the same figure gives the same bytes."""
+    """A figure of `picture_grid` as a PNG data URI, with a legend if lines are labelled.
+
+    The same figure gives the same bytes.
+    """
     for axis in figure.axes:
         axis.grid(color="#ddd8ce", linewidth=0.6)
+        if axis.get_legend_handles_labels()[1]:
+            axis.legend()
     figure.set_dpi(CHART_DPI)
     picture = io.BytesIO()
     figure.canvas.print_png(picture, metadata={"Software": None})

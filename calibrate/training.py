@@ -161,7 +161,6 @@ def _losses(losses: NDArray[np.float64], checks: NDArray[np.float64], label: str
         axis.plot(steps[SMOOTH_STEPS - 1 :][every], mean[every], color=BLUE, linewidth=1.2, label=smooth)
     axis.plot(*checks.T, "o-", color=ORANGE, markersize=4, linewidth=1.2, label="validation, MSE")
     axis.set(xlabel="step", ylabel="loss", yscale="log")
-    axis.legend()
     return chart_uri(figure)
 
 

@@ -170,12 +170,9 @@ def _on_grid(mark: Footprint, place: Place, grid: Grid) -> Images:
     first_y = float(grid.y_mm[0]) + 0.5 * grid.px_mm - 0.5 * fine_mm
     column, row = mark.origin_px
     # from a fine pixel of the grid to a pixel of the footprint, whose centres lie half a pixel from its corner
-    there = np.array(
-        [
-            [scale, 0.0, column - 0.5 + (first_x - place[1]) * mark.px_per_mm],
-            [0.0, scale, row - 0.5 + (place[2] - first_y) * mark.px_per_mm],
-        ]
-    )
+    across = column - 0.5 + (first_x - place[1]) * mark.px_per_mm
+    down = row - 0.5 + (place[2] - first_y) * mark.px_per_mm
+    there = np.array([[scale, 0.0, across], [0.0, scale, down]])
     size = (len(grid.x_mm), len(grid.y_mm))
     fine = cv2.warpAffine(ink, there, (FINE * size[0], FINE * size[1]), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
     return np.asarray(cv2.resize(fine, size, interpolation=cv2.INTER_AREA), np.float32)

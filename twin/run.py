@@ -74,9 +74,8 @@ def fitted_value(constant: Constant, scales: float, error: float) -> FittedValue
     """
     value, low, high = (constant.value(scales + way * NORMAL_95 * error) for way in (0.0, -1.0, 1.0))
     least, most = constant.bounds
-    if error < MOST_SD and least + 0.01 < scales < most - 0.01:
-        return FittedValue(value=value, low=low, high=high)
-    return FittedValue(value=value, low=None, high=None)
+    known = error < MOST_SD and least + 0.01 < scales < most - 0.01
+    return FittedValue(value=value, low=low if known else None, high=high if known else None)
 
 
 @dataclass(frozen=True, slots=True)

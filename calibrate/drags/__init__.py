@@ -23,16 +23,7 @@ from numpy.typing import NDArray
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.presses import Refused, rectified
 from brushloop.calibrate.session import OpenSession, open_session
-from brushloop.calibrate.stroke.preprocess import (
-    PX_PER_MM,
-    Gray,
-    Mask,
-    Measured,
-    components,
-    measure,
-    outline,
-    touches_edge,
-)
+from brushloop.calibrate.stroke.preprocess import PX_PER_MM, Gray, Measured, components, measure, outline, touches_edge
 from brushloop.model.drag import Drawings, Floats
 from brushloop.model.similarity import inked_window
 from brushloop.sessions.errors import SessionDamaged
@@ -226,7 +217,9 @@ def _read(capture: Capture, command: tuple[float, ...] | None, grid: tuple[Float
     )
 
 
-def _on_grid(mask: Mask, anchor_px: tuple[float, float], x_mm: Floats, y_mm: Floats) -> NDArray[np.float32]:
+def _on_grid(
+    mask: NDArray[np.bool_], anchor_px: tuple[float, float], x_mm: Floats, y_mm: Floats
+) -> NDArray[np.float32]:
     """The ink of a stroke that starts at `anchor_px` of its raster."""
     step_px = round(MM_PER_PX * PX_PER_MM)
     left = round(anchor_px[0] + x_mm[0] * PX_PER_MM - 0.5 * step_px)
@@ -236,7 +229,7 @@ def _on_grid(mask: Mask, anchor_px: tuple[float, float], x_mm: Floats, y_mm: Flo
     return np.asarray(cv2.resize(ink, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
-def defects(mask: Mask) -> tuple[str, ...]:
+def defects(mask: NDArray[np.bool_]) -> tuple[str, ...]:
     """Describe what is wrong with a stroke's ink, one phrase for each defect; empty for a sound stroke."""
     ink = mask[inked_window(mask, mask, 0)]
     count, _, stats, _ = cv2.connectedComponentsWithStats(ink.astype(np.uint8), connectivity=8)
@@ -268,7 +261,7 @@ def along_axis(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(turned > 127, np.bool_)
 
 
-def _thumbnail(raster: Gray, mask: Mask) -> Gray:
+def _thumbnail(raster: Gray, mask: NDArray[np.bool_]) -> Gray:
     """A square around the stroke, with its outline drawn in."""
     x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
     side = round(1.15 * max(width, height)) + 8

@@ -283,7 +283,6 @@ def _chart(presses: Presses, press: FittedPress, header: Header) -> str:
             axis.plot(depths[at], measured[at], "o", color=colour, alpha=0.6, markersize=4, label=f"α {tilt:g}°")
             axis.plot(smooth, drawn[tilt][:, column], color=colour, linewidth=1.5)
         axis.set(title=what, xlabel="commanded depth H, mm", ylabel=f"{what} of the mark, mm")
-        axis.legend()
     return chart_uri(figure)
 
 

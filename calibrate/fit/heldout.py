@@ -34,13 +34,12 @@ Predicted = tuple[Floats, Mapping[str, Images]]
 def leave_out(presses: Presses, conditions: Mapping[DepthTilt, Sequence[int]]) -> list[tuple[list[DepthTilt], Presses]]:
     """Conditions left out together, and the presses of all others that a fit uses; none if no press is left."""
     conditions = dict(sorted(conditions.items()))
-    folds = [list(conditions)[k::MAX_FOLDS] for k in range(min(len(conditions), MAX_FOLDS))]
-    return [(fold, presses.pick(others)) for fold in folds if (others := _without(conditions, fold))]
-
-
-def _without(conditions: Mapping[DepthTilt, Sequence[int]], fold: Sequence[DepthTilt]) -> list[int]:
-    others = [press for at, group in conditions.items() if at not in fold for press in group[:PER_CONDITION]]
-    return others[:: max(1, -(-len(others) // MAX_STROKES))]
+    left_out: list[tuple[list[DepthTilt], Presses]] = []
+    for fold in (list(conditions)[k::MAX_FOLDS] for k in range(min(len(conditions), MAX_FOLDS))):
+        others = [press for at, group in conditions.items() if at not in fold for press in group[:PER_CONDITION]]
+        if others:
+            left_out.append((fold, presses.pick(others[:: -(-len(others) // MAX_STROKES)])))
+    return left_out
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,19 +115,15 @@ def held_out_scores(predicted: Sequence[Predicted], models: Sequence[str]) -> li
     conditions = np.repeat(np.arange(len(predicted)), [len(ink) for ink, _ in predicted])
     percent = {name: np.full((len(conditions), len(KEYS), 2), np.nan) for name in (CEILING, *models)}
     for number, (ink, images) in enumerate(predicted):
-        inks, rows = _binary(ink), conditions == number
+        inks, rows = np.where(ink > 0.5, 1.0, 0.0), conditions == number
 
         def score(k: int, others: list[int], inks: Floats = inks) -> Floats:
             return similarity(inks[k], inks[others], Alignment.MM)
 
         percent[CEILING][rows, MM_BINARY] = 100.0 * pair_means(len(inks), score)
-        for name in images:
-            percent[name][rows, MM_BINARY] = 100.0 * similarity(_binary(images[name]), inks, Alignment.MM)
+        for name, image in images.items():
+            drawn = np.where(image > 0.5, 1.0, 0.0)
+            percent[name][rows, MM_BINARY] = 100.0 * similarity(drawn, inks, Alignment.MM)
     ceiling = np.apply_along_axis(ceiling_values, 0, percent[CEILING], conditions)
     stats = statistics(CEILING, ceiling, conditions)
     return [*stats, *(stat for name in models for stat in statistics(name, percent[name], conditions, None, ceiling))]
-
-
-def _binary(image: Images) -> Floats:
-    """Ink or paper as 1 or 0."""
-    return np.where(image > 0.5, 1.0, 0.0)

@@ -11,7 +11,7 @@ import hashlib
 import shlex
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
@@ -52,6 +52,8 @@ Series = tuple[str, str, str, str]
 """Model, alignment, tone, measure."""
 Strokes = dict[tuple[str, ...], float]
 """Scores by (H, alpha) and, where the same strokes are compared, recording and stroke."""
+Beside = dict[Path, LoopRecord | WrittenRecord]
+"""The loops and characters that belong to the sessions of a report, by their files."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,17 +97,6 @@ class ValidationOutput:
         return framed(self.page)
 
 
-@dataclass(slots=True)
-class Beside:
-    """The loops and characters that belong to the sessions of a report, and what was left out."""
-
-    loops: list[LoopRecord] = field(default_factory=list[LoopRecord])
-    written: list[WrittenRecord] = field(default_factory=list[WrittenRecord])
-    figures_13: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
-    """Sessions of characters and their pictures as data URIs."""
-    notes: list[str] = field(default_factory=list[str])
-
-
 def validate(
     request: ValidateRequest, progress: Progress = unseen, opened: Sequence[Recording] = ()
 ) -> ValidationOutput:
@@ -117,7 +108,9 @@ def validate(
     for text in request.gates:
         parse_gate(text)
     curves = [read_curve(text) for text in request.curves]
-    folder = _folder(request)
+    place, *others = request.places
+    home = Path() if others else place if place.is_dir() else place.parent
+    folder = request.out or home / FOLDER
     check_writable(folder)
     sessions = [open_session(place, request.fit) for place in opened or request.places]
     one_source(sessions)
@@ -130,7 +123,7 @@ def validate(
         drags = validate_drags(sessions[0].recording.path, request.fit, progress)
         write_drags(drags, folder, request.command)
         return ValidationOutput(folder, drags=drags, gates=request.gates)
-    beside = find_beside(sessions)
+    beside, notes = find_beside(sessions)
     folder.mkdir(parents=True, exist_ok=True)
     try:
         with (
@@ -141,7 +134,7 @@ def validate(
             report = _write(outcome, folder, curves, beside)
     except Timeout:
         raise CalibrationError(str(folder), "another validation is writing in this folder") from None
-    return ValidationOutput(folder, report, notes=tuple(beside.notes), gates=request.gates)
+    return ValidationOutput(folder, report, notes=tuple(notes), gates=request.gates)
 
 
 def open_session(place: Path | Recording, fit: Path | None = None) -> FittedSession:
@@ -167,37 +160,33 @@ def one_source(sessions: Sequence[FittedSession]) -> Source:
     return first.header.source
 
 
-def find_beside(sessions: Sequence[FittedSession]) -> Beside:
+def find_beside(sessions: Sequence[FittedSession]) -> tuple[Beside, list[str]]:
     """Read the loop and the characters in each session's folder, and the characters beside the folder of sessions.
 
-    Those of other strokes, another brush or another kind of ink are left out. Raises `CalibrationError` for an edited
-    file.
+    Those of other strokes, another brush or another kind of ink are left out, and returned in words. Raises
+    `CalibrationError` for an edited file.
     """
-    beside, source = Beside(), sessions[0].header.source
+    beside, notes, source = Beside(), list[str](), sessions[0].header.source
     brushes, originals = {session.header.brush for session in sessions}, {session.sha256 for session in sessions}
     homes = list(dict.fromkeys(session.recording.path.resolve().parent for session in sessions))
-
-    def belongs(path: Path, record: LoopRecord | WrittenRecord, foreign: str) -> bool:
+    places = dict.fromkeys(place for home in homes for place in (home, home.parent.parent))
+    written = [place / WRITTEN / WrittenRecord.FILE for place in places]
+    for path in (*(home / LOOP / LoopRecord.FILE for home in homes), *written):
+        if not path.is_file():
+            continue
+        record = WrittenRecord.read(path) if path in written else LoopRecord.read(path)
         if record.source != source:
             foreign = f"its source is {record.source}, not {source}"
-        if foreign:
-            beside.notes.append(f"{path} is left out: {foreign}; `{record.MADE_BY}` makes it again")
-        return not foreign
-
-    for path in (home / LOOP / LoopRecord.FILE for home in homes):
-        if path.is_file():
-            loop = LoopRecord.read(path)
-            foreign = "" if loop.original_sha256 in originals else f"it belongs to another recording of {loop.original}"
-            if belongs(path, loop, foreign):
-                beside.loops.append(loop)
-    for folder in dict.fromkeys(place / WRITTEN for home in homes for place in (home, home.parent.parent)):
-        if (path := folder / WrittenRecord.FILE).is_file():
-            record = WrittenRecord.read(path)
+        elif isinstance(record, LoopRecord):
+            known = record.original_sha256 in originals
+            foreign = "" if known else f"it belongs to another recording of {record.original}"
+        else:
             foreign = "" if {record.brush} == brushes else f"it was written with another brush, {record.brush}"
-            if belongs(path, record, foreign):
-                beside.written.append(record)
-                beside.figures_13.append((record.session, figure_13(folder / PICTURE, record)))
-    return beside
+        if foreign:
+            notes.append(f"{path} is left out: {foreign}; `{record.MADE_BY}` makes it again")
+        else:
+            beside[path] = record
+    return beside, notes
 
 
 def figure_13(path: Path, record: WrittenRecord) -> str:
@@ -211,24 +200,17 @@ def figure_13(path: Path, record: WrittenRecord) -> str:
 def _write(outcome: Outcome, folder: Path, curves: Sequence[Curve], beside: Beside) -> Report:
     """Write the files of a report."""
     files = {"scores.csv": scores_csv(outcome.scores)}
-    report = report_of(outcome, hashlib.sha256(files["scores.csv"].encode()).hexdigest(), beside.loops, beside.written)
+    report = report_of(outcome, hashlib.sha256(files["scores.csv"].encode()).hexdigest(), beside.values())
+    written = [(path, record) for path, record in beside.items() if isinstance(record, WrittenRecord)]
+    figures_13 = [(record.session, figure_13(path.with_name(PICTURE), record)) for path, record in written]
     files["summary.csv"] = summary_csv(report)
     files["failures.csv"] = csv_text(Refused._fields, report.refused)
     files[report.FILE] = report.to_json()
     files["verdict.txt"] = f"{verdict(report)}\n"
     names = [*files, *write_parquet(outcome.scores, report.label, folder / "scores.parquet")]
-    files["report.html"] = page_of(outcome, report, curves, names, beside.figures_13)
+    files["report.html"] = page_of(outcome, report, curves, names, figures_13)
     write_files(folder, files)
     return report
-
-
-def _folder(request: ValidateRequest) -> Path:
-    if request.out is not None:
-        return request.out
-    path, *others = request.places
-    if others:
-        return Path(FOLDER)
-    return (path if path.is_dir() else path.parent) / FOLDER
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from brushloop.calibrate.compare import KEYS, TABLE_3, Key, shown
+from brushloop.calibrate.compare import KEYS, NORMAL, STRICT, TABLE_3, Key
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.presses import Press
 from brushloop.calibrate.report import (
     BLUE,
     COLOURS,
@@ -25,8 +24,6 @@ from brushloop.calibrate.report import (
     Point,
     brush_and_size,
     chart_uri,
-    ink_uri,
-    overlay_uri,
     picture_grid,
     printable,
     render,
@@ -35,31 +32,12 @@ from brushloop.calibrate.report import (
 )
 from brushloop.calibrate.scores import MEASURES, Stat
 from brushloop.calibrate.stats import CEILING, NEAR_POINTS, Floats, Summary, is_near
-from brushloop.calibrate.validate.run import (
-    BEZIER_REFITTED,
-    FITTED_HELD_OUT,
-    HELD_OUT,
-    NOT_PREDICTED,
-    PRESSES,
-    ModelInfo,
-    Outcome,
-)
-from brushloop.calibrate.validate.tables import (
-    MISSING,
-    NORMAL,
-    STRICT,
-    Report,
-    Session,
-    TableRow,
-    missed_mm,
-    robot_writing,
-    table_1,
-    table_2,
-    table_3,
-)
+from brushloop.calibrate.validate import run, tables
+from brushloop.calibrate.validate.run import FITTED_HELD_OUT, ModelInfo, Outcome
+from brushloop.calibrate.validate.tables import Report, Session, TableRow
 from brushloop.calibrate.writing.compare import Table3Row
 
-CONDITION_COLUMNS = ("ccd-bsmg", "ccd-bsm", FITTED_HELD_OUT, BEZIER_REFITTED, CEILING)
+CONDITION_COLUMNS = ("ccd-bsmg", "ccd-bsm", FITTED_HELD_OUT, run.BEZIER_REFITTED, CEILING)
 MAX_REFUSED, MAX_REFUSED_IN_TERMINAL = 200, 20
 MAX_SAMPLES = 15
 WIDE_SCALE = 0.005
@@ -72,7 +50,7 @@ MISSED_MM = 0.1
 MAX_NAMED = 6
 ANSWERS = {True: "Yes", False: "No, not closely enough", None: "Not certain"}
 """Whether the model predicts the brush: whether all, none or a part of its interval is within the goal."""
-SHORT = {HELD_OUT: ", held out", "fitted, in sample": ", in sample"}
+SHORT = {run.HELD_OUT: ", held out", "fitted, in sample": ", in sample"}
 """What a model knows of the strokes, shortened for the terminal."""
 MAX_POINTS = 200
 MAX_CONDITIONS, EXTREMES = 5, 6
@@ -102,9 +80,9 @@ def page_of(
         verdict=verdict(report),
         measured=measured(report),
         trust=list(trust(report)),
-        table_one=table_1(report),
-        table_two=table_2(report),
-        table_three=table_3,
+        table_one=tables.table_1(report),
+        table_two=tables.table_2(report),
+        table_three=tables.table_3,
         figures_13=figures_13,
         paper_three=list(TABLE_3.values()),
         plot=distributions(outcome, report),
@@ -118,7 +96,7 @@ def page_of(
         conditions=outcome.scores.conditions() if report.conditions else {},
         samples=[pictured(outcome, k, report.shown) for k in first_of_conditions(outcome, MAX_SAMPLES)],
         side=side_by_side(outcome),
-        shown=best_model.label if best_model is not None else "",
+        drawn_by=best_model.label if best_model is not None else "",
         best=[pictured(outcome, k, report.shown) for k in best],
         worst=[pictured(outcome, k, report.shown) for k in worst],
         steps=by_strokes(report) if report.by_strokes else "",
@@ -176,24 +154,17 @@ def extremes(outcome: Outcome, model: str) -> tuple[list[int], list[int]]:
 def pictured(outcome: Outcome, k: int, model: str) -> dict[str, Any]:
     """A press with what the model predicts for it, their difference, and their scores: the paper's figures 7 and 8."""
     press, csim, ssim = outcome.scores.presses[k], np.nan, np.nan
-    captured, drawn = shown(press.images), outcome.predicted(press)
-    images = {"captured": ink_uri(captured)}
-    if model in drawn:
-        predicted = shown(drawn[model])
-        images |= {"predicted": ink_uri(predicted), "difference": overlay_uri(captured, predicted)}
+    drawn = outcome.predicted(press).get(model)
+    if drawn is not None:
         csim, ssim = 100.0 * outcome.scores.of_key(model, STRICT)[k]
-    return {"press": press, "images": images, "scored": bool(np.isfinite(csim)), "csim": csim, "ssim": ssim}
+    return {"press": press, "drawn": drawn, "scored": bool(np.isfinite(csim)), "csim": csim, "ssim": ssim}
 
 
 def side_by_side(outcome: Outcome) -> dict[str, Any]:
     """Some captures next to the prediction of every model: the paper's figures 3, 10 and 11."""
     labels = {model.name: model.info.label for group in outcome.models.values() for model in group}
-    lines: list[tuple[Press, list[str]]] = []
-    for press in (outcome.scores.presses[k] for k in first_of_conditions(outcome, MAX_CONDITIONS)):
-        drawn = outcome.predicted(press)
-        predictions = (ink_uri(shown(drawn[name])) if name in drawn else "" for name in labels)
-        lines.append((press, [ink_uri(shown(press.images)), *predictions]))
-    return {"labels": list(labels.values()), "lines": lines}
+    presses = [outcome.scores.presses[k] for k in first_of_conditions(outcome, MAX_CONDITIONS)]
+    return {"labels": labels, "lines": [(press, outcome.predicted(press)) for press in presses]}
 
 
 def first_of_conditions(outcome: Outcome, most: int) -> list[int]:
@@ -239,7 +210,6 @@ def by_strokes(report: Report) -> str:
     counts = sorted({step.strokes for step in report.by_strokes})
     axis.set_xticks(counts, map(str, counts))
     axis.set_xticks([], minor=True)
-    axis.legend()
     return chart_uri(figure)
 
 
@@ -249,7 +219,6 @@ def losses(curves: Sequence[Curve]) -> str:
     for (name, steps, mse), colour in zip(curves, itertools.cycle(COLOURS), strict=False):
         axis.plot(steps, mse, "o-", color=colour, markersize=3, label=printable(name))
     axis.set(xlabel="step", ylabel="validation loss (MSE)", yscale="log")
-    axis.legend()
     return chart_uri(figure)
 
 
@@ -259,7 +228,7 @@ def measured(report: Report) -> str:
     brush = brush_and_size(report.sessions[0].header)
     at = f" at {len(report.conditions)} combinations of press depth H and brush tilt α" if report.conditions else ""
     left = f", {strokes - compared} more could not be used" if strokes > compared else ""
-    models = sum(model.basis != PRESSES for model in report.models)
+    models = sum(model.basis != run.PRESSES for model in report.models)
     sessions = f"{len(report.sessions)} sessions" if len(report.sessions) > 1 else "one session"
     return (
         f"{compared} brush presses{at}, from {sessions}, were compared with what {models} stroke models predict for "
@@ -313,7 +282,8 @@ def trust(report: Report) -> Iterator[Point]:
         yield Point(lost <= MUCH_REFUSED * strokes, words)
     else:
         yield Point(True, "Every stroke that counted was used.")
-    for model, count in Counter(press.why.split()[0] for press in report.refused if NOT_PREDICTED in press.why).items():
+    unpredicted = Counter(press.why.split()[0] for press in report.refused if run.NOT_PREDICTED in press.why)
+    for model, count in unpredicted.items():
         yield Point(None, f"{model} does not predict {count} of {strokes} strokes: its row averages the others only.")
     for session in report.sessions:
         for point in _session(session):
@@ -324,7 +294,7 @@ def trust(report: Report) -> Iterator[Point]:
     if _csim(report, FITTED_HELD_OUT) is None:
         yield Point(None, "No model was calibrated to this brush: run “brushloop fit”, then validate again.")
     if _csim(report, "ccd-bsmg") is None:
-        yield Point(None, f"CCD-BSMG is {MISSING['ccd-bsmg']}.")
+        yield Point(None, f"CCD-BSMG is {tables.MISSING['ccd-bsmg']}.")
     for loop in report.loops:
         yield loop.answer
 
@@ -332,7 +302,7 @@ def trust(report: Report) -> Iterator[Point]:
 def _session(session: Session) -> Iterator[Point]:
     """What the pictures alone do not show: strokes that were left out, paper that moved, a scale that is not known."""
     miss, collected, scale = session.deepest_miss, session.collected, session.calibration
-    if miss is not None and missed_mm(miss) > MISSED_MM:
+    if miss is not None and tables.missed_mm(miss) > MISSED_MM:
         yield Point(
             False,
             f"commanded and reached depth differ by more than {MISSED_MM:g} mm, most at "
@@ -371,11 +341,11 @@ def terminal_lines(report: Report) -> Iterator[object]:
     names = ", ".join(session.header.session_id for session in report.sessions[:4])
     yield f"{names}: {source_note(report.source)}"
     yield measured(report)
-    rows = [[*table_2(report, key), *robot_writing(report, key)] for key in (NORMAL, STRICT)]
+    rows = [[*tables.table_2(report, key), *tables.robot_writing(report, key)] for key in (NORMAL, STRICT)]
     yield _terminal_table(f"averages, binary, ink = 1, percent ({report.label})", *rows)
     for record in report.written:
         for name in record.characters:
-            rows = [table_3(record, name, alignment) for alignment in (NORMAL[0], STRICT[0])]
+            rows = [tables.table_3(record, name, alignment) for alignment in (NORMAL[0], STRICT[0])]
             yield _terminal_table(f"Table 3: {name}, averages, binary, percent ({report.label})", *rows)
     yield f"Does CCD-BSM predict this brush? {verdict(report)}"
     for point in trust(report):

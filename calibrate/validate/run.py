@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.commands import ValidateRequest
-from brushloop.calibrate.compare import MM_BINARY, Alignment, Pixels, brush_of, images_of, similarity
+from brushloop.calibrate.compare import MM_BINARY, Alignment, Pixels, brush_of, images_of, similarity, simulated
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.command import BrushFit
 from brushloop.calibrate.fit.heldout import Refit, leave_out, refits
@@ -29,7 +29,6 @@ from brushloop.calibrate.work import Arrays, Scheduler, key_of
 from brushloop.model.ccdbsm import Brush, DomainError
 from brushloop.model.fitted import NAME as FITTED
 from brushloop.model.generator import SHIPPED_GENERATOR
-from brushloop.model.outline import Outline
 from brushloop.model.presses import DepthTilt, Draw, refit_bezier
 from brushloop.sessions.disk import file_sha256
 from brushloop.sessions.records import Condition
@@ -107,16 +106,13 @@ BRUSH_LEFT_OUT = ModelInfo(
     basis=HELD_OUT,
 )
 
-Mark = tuple[Outline, float]
-"""The outline of a press, and the distance of its origin from the zero-touch point, mm."""
-
 
 @dataclass(frozen=True, slots=True)
 class Model:
     """A model to compare with the presses of one session: one row of the tables."""
 
     info: ModelInfo
-    mark: Callable[[Condition], Mark]
+    images: Callable[[Condition], Pixels]
     """What it predicts for a condition; raises `DomainError` for a press that it does not predict."""
 
     @property
@@ -234,11 +230,7 @@ def known_models(session: FittedSession, request: ValidateRequest) -> Sequence[M
 
 def _of_model(model: StrokeModel, basis: str, **changes: str) -> Model:
     info = ModelInfo(name=model.name, label=model.label, definition=model.definition, basis=basis)
-    return Model(info.model_copy(update=changes), lambda at: _pressed(model, at))
-
-
-def _pressed(model: StrokeModel, at: Condition) -> Mark:
-    return model.profile(at.depth_mm, at.tilt_deg), at.depth_mm * math.tan(math.radians(at.tilt_deg))
+    return Model(info.model_copy(update=changes), lambda at: simulated(model, at.depth_mm, at.tilt_deg))
 
 
 def _held_out(
@@ -267,14 +259,14 @@ def _held_out(
 def _left_out(info: ModelInfo, outlines: Mapping[DepthTilt, Draw | None]) -> Model:
     """A model that was fitted without the condition that it predicts; None where the other conditions are too few."""
 
-    def mark(at: Condition) -> Mark:
+    def images(at: Condition) -> Pixels:
         outline = outlines.get((at.depth_mm, at.tilt_deg))
         if outline is None:
             hint = f"at tilt_deg = {at.tilt_deg:g}"
             raise DomainError("depth_mm", at.depth_mm, "what the other conditions determine", hint)
-        return outline(at.depth_mm, at.tilt_deg), 0.0
+        return images_of(outline(at.depth_mm, at.tilt_deg), 0.0)
 
-    return Model(info, mark)
+    return Model(info, images)
 
 
 def predicted(models: Iterable[Model], at: Condition) -> tuple[dict[str, Pixels], list[str]]:
@@ -282,7 +274,7 @@ def predicted(models: Iterable[Model], at: Condition) -> tuple[dict[str, Pixels]
     images, refused = dict[str, Pixels](), list[str]()
     for model in models:
         try:
-            images[model.name] = images_of(*model.mark(at))
+            images[model.name] = model.images(at)
         except DomainError as error:
             refused.append(f"{model.name} {NOT_PREDICTED}: {error}")
     return images, refused

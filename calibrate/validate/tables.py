@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import platform
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import ClassVar, NamedTuple
@@ -19,7 +19,9 @@ import numpy as np
 from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.compare import (
     MM_PER_PX,
+    NORMAL,
     ROBOT_WRITING,
+    STRICT,
     TABLE_1,
     TABLE_2,
     Alignment,
@@ -34,19 +36,8 @@ from brushloop.calibrate.report import Sealed, source_label
 from brushloop.calibrate.scores import MEASURES, Scores, Stat, find_stat, statistics
 from brushloop.calibrate.session import Calibration
 from brushloop.calibrate.stats import CEILING, Floats, Summary, ceiling_values
-from brushloop.calibrate.validate.run import (
-    ANOTHER,
-    FITTED,
-    FITTED_HELD_OUT,
-    KINDS_OF_PRESS,
-    LAMBDAS,
-    NOT_PREDICTED,
-    FittedSession,
-    ModelInfo,
-    Outcome,
-    Refused,
-    Step,
-)
+from brushloop.calibrate.validate import run
+from brushloop.calibrate.validate.run import ANOTHER, FITTED_HELD_OUT, FittedSession, ModelInfo, Outcome, Refused, Step
 from brushloop.calibrate.writing.compare import ANOTHER as ANOTHER_WRITING
 from brushloop.calibrate.writing.compare import PAPER_ROWS, PLANNED, REFERENCE, SIMULATED, Table3Row, WrittenRecord
 from brushloop.model.presses import DepthTilt
@@ -58,9 +49,6 @@ from brushloop.sessions.records import Header, Source, Stroke
 from brushloop.sessions.show import details
 
 PACKAGES = ("brushloop", "numpy", "opencv-python-headless", "scikit-image", "numba", "torch")
-STRICT: Key = (Alignment.MM, Tone.BINARY)
-NORMAL: Key = (Alignment.SIZE_NORMALISED, Tone.BINARY)
-"""The comparison where size and place count, and that of the paper."""
 MISSING = {
     "ccd-bsmg": "not in this run: give a generator trained for a brush of this size with --generator",
     ROBOT_WRITING: "not in this run: “brushloop repress SESSION” presses recovered strokes again; then validate again",
@@ -162,7 +150,7 @@ class Report(Sealed):
     @property
     def lost(self) -> list[tuple[str, str]]:
         """Session and name of each stroke that could not be used."""
-        return sorted({press[:2] for press in self.refused if NOT_PREDICTED not in press.why})
+        return sorted({press[:2] for press in self.refused if run.NOT_PREDICTED not in press.why})
 
     @property
     def label(self) -> str:
@@ -170,14 +158,12 @@ class Report(Sealed):
         return source_label(self.source, (session.header.brush for session in self.sessions))
 
 
-def report_of(
-    outcome: Outcome, scores_sha256: str, loops: Iterable[LoopRecord] = (), written: Iterable[WrittenRecord] = ()
-) -> Report:
+def report_of(outcome: Outcome, scores_sha256: str, beside: Collection[LoopRecord | WrittenRecord] = ()) -> Report:
     """Build one frozen report of a whole run, with the loops and characters that belong to it."""
     stats = tuple(_stats(outcome.scores))
     scored = {stat.model for stat in stats}
     present = [name for name in (*outcome.scores.models, CEILING) if name in scored]
-    order = (FITTED_HELD_OUT, FITTED, "ccd-bsmg", "ccd-bsm", *present)
+    order = (FITTED_HELD_OUT, run.FITTED, "ccd-bsmg", "ccd-bsm", *present)
     report = Report(
         source=outcome.sessions[0].header.source,
         software={name: version(name) for name in PACKAGES} | {"python": platform.python_version()},
@@ -185,14 +171,14 @@ def report_of(
         mm_per_px=MM_PER_PX,
         ssim_settings=SSIM_SETTINGS,
         sessions=tuple(_session(session, outcome.scores) for session in outcome.sessions),
-        models=(*_models(outcome), *(kind for kind in KINDS_OF_PRESS if kind.name in present)),
+        models=(*_models(outcome), *(kind for kind in run.KINDS_OF_PRESS if kind.name in present)),
         shown=next((name for name in order if name in present), ""),
         stats=stats,
         refused=tuple(outcome.refused),
         by_strokes=tuple(outcome.steps),
         scores_sha256=scores_sha256,
-        loops=tuple(loops),
-        written=tuple(written),
+        loops=tuple(record for record in beside if isinstance(record, LoopRecord)),
+        written=tuple(record for record in beside if isinstance(record, WrittenRecord)),
     )
     return report.sealed()
 
@@ -202,7 +188,7 @@ def _stats(scores: Scores) -> Iterator[Stat]:
     another = 100.0 * scores.of(ANOTHER)
     ceiling: Floats = np.apply_along_axis(ceiling_values, 0, another, scores.group_of)
     percent = {model: 100.0 * scores.of(model) for model in scores.models} | {CEILING: ceiling}
-    presses = {kind.name for kind in KINDS_OF_PRESS}
+    presses = {kind.name for kind in run.KINDS_OF_PRESS}
     for model, values in percent.items():
         yield from statistics(model, values, scores.group_of, None, None if model in presses else ceiling)
     for condition, at in scores.conditions().items():
@@ -291,7 +277,7 @@ def robot_writing(report: Report, key: Key = NORMAL) -> list[TableRow]:
 def table_2(report: Report, key: Key = NORMAL) -> list[TableRow]:
     """Rows of the paper's models in its order, then of all others."""
     last = (ANOTHER, CEILING)
-    others = [model.name for model in report.models if model.name not in (*TABLE_2, *last, *LAMBDAS)]
+    others = [model.name for model in report.models if model.name not in (*TABLE_2, *last, *run.LAMBDAS)]
     return [_row(report, name, TABLE_2.get(name), key) for name in (*TABLE_2, *others, *last)]
 
 

@@ -80,7 +80,8 @@ class Character:
         `PLANNED` has one row, since no writing is involved; a writing alone has NaN for another one.
         """
         inks = list(self.captured.values())
-        reference, simulated = as_ink(self.figure.wanted), as_ink(self.figure.simulated)
+        # An image that was not photographed is as dark as its coverage.
+        reference, simulated = (dict.fromkeys(Tone, image) for image in (self.figure.wanted, self.figure.simulated))
         scores: dict[tuple[str, Key], Floats] = {}
         for key in KEYS:
             scores[SIMULATED, key] = np.array([compare_ink(ink, simulated, key) for ink in inks])
@@ -230,16 +231,11 @@ def aligned(ink: Image, alignment: Alignment) -> Image:
     return averaged(ink, (left, top), step_px, SIZE_PX, fine=1).clip(0.0, 1.0)
 
 
-def as_ink(image: Image) -> Ink:
-    """Make ink from an image that was not photographed: its darkness is its coverage."""
-    return dict.fromkeys(Tone, image)
-
-
 def round_of(character: Character, side_mm: float) -> Round:
     """What the writings of a figure show on average; phases for characters only."""
     figure, writings = character.figure, character.captured.values()
     wanted = figure.wanted
-    csim = float(np.mean([compare_ink(as_ink(wanted), ink, HEADLINE)[0] for ink in writings]))
+    csim = float(np.mean([compare_ink(dict.fromkeys(Tone, wanted), ink, HEADLINE)[0] for ink in writings]))
     lost: dict[str, float] = {}
     if figure.medians:
         where = phase_map(figure.paths, side_mm, len(wanted))

@@ -118,9 +118,8 @@ class Demo:
 
     def _say_answer(self) -> None:
         """Print how much of the ink is predicted, and what follows."""
-        from brushloop.calibrate.compare import TABLE_2  # slow to import
+        from brushloop.calibrate.compare import NORMAL, TABLE_2  # slow to import
         from brushloop.calibrate.validate.page import headline, verdict
-        from brushloop.calibrate.validate.tables import NORMAL
 
         if (report := self._validated.report) is None:
             return

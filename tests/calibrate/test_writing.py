@@ -35,7 +35,6 @@ from brushloop.calibrate.writing.compare import (
     WritingComparison,
     WrittenRecord,
     aligned,
-    as_ink,
     compare_ink,
     round_of,
     write_written,
@@ -137,9 +136,10 @@ def test_size_normalised_forgives_place_and_size_and_mm_does_not() -> None:
     small = cv2.resize(cross(), (64, 64), interpolation=cv2.INTER_AREA)
     moved = np.zeros((128, 128), np.float32)
     moved[5:69, 50:114] = small
+    inks = dict.fromkeys(Tone, cross()), dict.fromkeys(Tone, moved)
     for tone in Tone:
-        near = compare_ink(as_ink(cross()), as_ink(moved), (Alignment.SIZE_NORMALISED, tone, Polarity.INK))
-        far = compare_ink(as_ink(cross()), as_ink(moved), (Alignment.MM, tone, Polarity.INK))
+        near = compare_ink(*inks, (Alignment.SIZE_NORMALISED, tone, Polarity.INK))
+        far = compare_ink(*inks, (Alignment.MM, tone, Polarity.INK))
         assert near[0] > 0.93
         assert far[0] < 0.5
     whole = aligned(cross(), Alignment.SIZE_NORMALISED) > 0.5
@@ -147,7 +147,7 @@ def test_size_normalised_forgives_place_and_size_and_mm_does_not() -> None:
 
 
 def character(writings: int = 3) -> Character:
-    captured = {f"x-r{k + 1:02d}": as_ink(cross(k)) for k in range(writings)}
+    captured = {f"x-r{k + 1:02d}": dict.fromkeys(Tone, cross(k)) for k in range(writings)}
     return Character(plan_of(reference="font of the test").figures[0], captured)
 
 
@@ -219,7 +219,7 @@ def came_out(plan: Plan) -> np.ndarray:
 def session(plan: Plan, name: str = "bar", ink: np.ndarray | None = None) -> WritingComparison:
     seen = came_out(plan) if ink is None else ink
     figure = plan.figures[0].model_copy(update={"name": name})
-    character = Character(figure, {f"{name}-r01": as_ink(seen)})
+    character = Character(figure, {f"{name}-r01": dict.fromkeys(Tone, seen)})
     return WritingComparison(opened("s", Path("s.mcap"), calibration=CALIBRATION), plan, [character])
 
 

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
-from brushloop.calibrate.compare import TABLE_1
-from brushloop.calibrate.validate.tables import NORMAL, STRICT, Report, table_1, table_3
+from brushloop.calibrate.compare import NORMAL, STRICT, TABLE_1
+from brushloop.calibrate.validate.tables import Report, table_1, table_3
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Source
 from tests.calibrate.given import loop_record, rows_of, table_of, written_record

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from brushloop.calibrate.compare import NORMAL
 from brushloop.calibrate.session import open_session
 from brushloop.calibrate.training import captures_of
-from brushloop.calibrate.validate.tables import NORMAL, Report
+from brushloop.calibrate.validate.tables import Report
 from brushloop.model.generator import SHIPPED_GENERATOR
 from brushloop.model.generator.stroke import load_generator
 from brushloop.sessions.records import Source

@@ -13,7 +13,7 @@ import pytest
 
 import brushloop
 from brushloop.calibrate.commands import DiffRequest, FitRequest, ValidateRequest
-from brushloop.calibrate.compare import KEYS
+from brushloop.calibrate.compare import KEYS, images_of
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.command import fit_press_session
 from brushloop.calibrate.fit.heldout import BEZIER, FITTED
@@ -234,7 +234,7 @@ def before(session: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_another_version_of_a_model_is_compared_stroke_by_stroke(
     session: Path, before: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(validation, "_pressed", lambda model, at: (model.profile(at.depth_mm, at.tilt_deg), -9.0))
+    monkeypatch.setattr(validation, "simulated", lambda model, *at: images_of(model.profile(*at), -9.0))
     said("validate", session, "--out", tmp_path, *TWO, left_out=True)
     found = compare(DiffRequest(before, tmp_path / "report.json"))
     assert found.by_stroke
