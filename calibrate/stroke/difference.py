@@ -33,6 +33,8 @@ JOIN_MM = 2.0
 """Parts that lie closer to the main part are the same stroke: bristles part, bubbles shine."""
 LEAST_MM2 = 2.0
 """Less new ink than this is no stroke."""
+WIDTH_MM, TIP_MM = 6.0, 2.0
+"""Lengths from the left end within which the width at the start, and the height of the start on the page, are found."""
 NEAR_MM = 10.0
 """New ink at this distance from where the stroke should begin counts a third."""
 
@@ -46,6 +48,18 @@ class NewStroke:
     soft: Soft
     """(h, w) ink from 0 to 1 where it is new, 0 elsewhere."""
     flags: tuple[str, ...]
+
+    def start_px(self, px_per_mm: float) -> tuple[float, float]:
+        """Where the brush touched the paper, (x, y), for a stroke that runs to the right.
+
+        A brush leaves a round mark about its touch, so the touch lies half the width at the start to the right of the
+        left end.
+        """
+        widths = self.mask.sum(axis=0)
+        left = int(np.flatnonzero(widths)[0])
+        width_px = float(widths[left : left + round(WIDTH_MM * px_per_mm)].max())
+        rows = self.soft[:, left : left + round(TIP_MM * px_per_mm)].sum(axis=1)
+        return left + 0.5 * width_px, float(np.average(np.arange(len(rows)) + 0.5, weights=rows))
 
 
 def new_stroke(
