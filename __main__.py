@@ -205,10 +205,11 @@ def fault(
     control: Annotated[Path, typer.Argument(help="Control socket of a rig, made by `brushloop sim --control PATH`.")],
     what: Annotated[str, typer.Argument(help="Device to break; or list, clear, state, release or fresh-sheet.")],
     kind: Annotated[
-        str | None, typer.Argument(help="Kind of fault, such as mute, late, black or bus-off (all in docs/faults.md).")
+        str | None,
+        typer.Argument(help="Kind of fault, such as mute, late, black or bus-off (docs/loopback-controller.md)."),
     ] = None,
     on: Annotated[str | None, typer.Option(help="Fail only in calls of this robot method, such as moveLine.")] = None,
-    nth: Annotated[int | None, typer.Option(help="Begin at the n-th request, push or frame.")] = None,
+    nth: Annotated[int | None, typer.Option(help="Let the fault begin at the n-th request, pose or frame.")] = None,
     phase: Annotated[str | None, typer.Option(help="Begin while the arm does this, such as descending.")] = None,
     press: Annotated[int | None, typer.Option(help="Begin while this many presses are on the paper.")] = None,
     count: Annotated[int | None, typer.Option(help="Occur this many times.")] = None,

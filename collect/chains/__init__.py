@@ -40,7 +40,7 @@ class WritingRequest:
     sessions: Annotated[Path, Option(help="Folder that holds sessions.")] = Path("sessions")
     repeats: Annotated[int, Option(min=1, max=1000, help="How often each character is written.")] = 1
     learn: Annotated[int, Option(min=0, max=20, help="First learn better plans, in at most this many rounds.")] = 0
-    learn_repeats: Annotated[int, Option(min=1, max=100, help="Writings of each character in a round of learning.")] = 2
+    learn_repeats: Annotated[int, Option(min=1, max=100, help="How often a round of learning writes a character.")] = 2
     practice: Annotated[bool, Option(help="First write a practice sheet, and fit the brush model to its ink.")] = False
     data: CharacterData = None
     cell_mm: Annotated[float, Option(min=10, max=500, help="Side of the character's patch of paper.")] = 70.0

@@ -248,7 +248,7 @@ class LimitsStep(Step):
         reached = [point for name, point in places.items() if name.split(" ")[0] in INK]
         points = [*reached, (park_x, park_y, park_z), *corners, *((x, y, z) for z in heights_mm)]
         beside = f"{MARGIN_MM:g} mm around the smallest box that holds sheet, well, wipe, pot and park position"
-        floor = f"{BELOW_MM:g} mm below the deepest press and the dip; {MARGIN_MM:g} mm above travel and park"
+        floor = f"{BELOW_MM:g} mm below the deepest press and the dip; {MARGIN_MM:g} mm above travel and park heights"
         ranges = zip(BOX, hull(points, MARGIN_MM), (beside, beside, floor), strict=True)
         return {field: Taught(range_mm, how) for field, range_mm, how in ranges}
 
