@@ -146,11 +146,14 @@ def intervals(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
 def _held(name: str, letter: str, parameter: str, rows: Sequence[dict[str, str]], seed: int) -> Result:
     """Percent of the intervals of a parameter that hold the command; a missing interval is none."""
     said = [row for row in rows if row[parameter.format("sd_")]]
-    off = [abs(float(row[parameter.format("")]) - float(row["commanded_" + parameter.format("")])) for row in said]
-    held = [o <= NORMAL_95 * float(row[parameter.format("sd_")]) for o, row in zip(off, said, strict=True)]
-    share = 100.0 * statistics.fmean(held)
-    flagged = sum(bool(row["flags"]) for row in rows)
-    where = f"simulated; mean error {statistics.fmean(off):.2f}; {flagged} of {len(rows)} flagged; {machine()}"
+    columns = (parameter.format(""), "commanded_" + parameter.format(""), parameter.format("sd_"))
+    recovered, commanded, sd = (np.array([float(row[column]) for row in said]) for column in columns)
+    off, sure = np.abs(recovered - commanded), np.array([not row["flags"] for row in said])
+    share, guess = 100.0 * float(np.mean(off <= NORMAL_95 * sd)), np.abs(commanded - commanded.mean())
+    errors = (
+        f"mean error of {sure.sum()} unflagged {off[sure].mean():.2f}, of guessing the mean {guess[sure].mean():.2f}"
+    )
+    where = f"simulated; {errors}; {len(rows)} presses; {machine()}"
     ratio = min(share / LEAST_HELD, MOST_HELD / max(share, 1.0))
     return Result(f"intervals.{name}.{letter}", share, "%", "goal 90 to 99 %", ratio, len(said), seed, where)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import math
 from dataclasses import dataclass, field
@@ -30,6 +31,14 @@ A4 = Layout("a4")
 TABLE = "box,depth_mm,tilt_deg\nA1,11,0\nB2,15,5\nD5,20,10\nG8,13,0\n"
 
 
+@functools.cache
+def _printed() -> np.ndarray:
+    """The sheet as a printer without an error of scale prints it, (h, w) gray."""
+    file = io.BytesIO()
+    drawn_sheet(A4).savefig(file, dpi=DPI, format="png")
+    return cv2.imdecode(np.frombuffer(file.getvalue(), np.uint8), cv2.IMREAD_GRAYSCALE)
+
+
 @dataclass(frozen=True, slots=True)
 class Scanned:
     """How a sheet was printed, inked and scanned."""
@@ -54,28 +63,28 @@ class Scanned:
 
     def image(self) -> np.ndarray:
         """The scan, (h, w) gray, at about 400 dpi."""
-        file = io.BytesIO()
-        drawn_sheet(A4).savefig(file, dpi=DPI, format="png")
-        drawn = cv2.imdecode(np.frombuffer(file.getvalue(), np.uint8), cv2.IMREAD_GRAYSCALE)
+        drawn = _printed().copy()
         for number in self.torn:
             (left, top), (right, bottom) = (A4.marks()[number][[0, 2]] * PX_PER_MM).round().astype(int).tolist()
             drawn[top:bottom, left:right] = 255
         (across, along), (tall, wide) = self.print_scale, drawn.shape
-        sheet = cv2.resize(drawn, (round(wide * across), round(tall * along)), interpolation=cv2.INTER_AREA) * 0.94
+        size = round(wide * across), round(tall * along)
+        sheet = 0.94 * cv2.resize(drawn, size, interpolation=cv2.INTER_AREA).astype(np.float32)
         for box, condition in self.pressed.items():
             self._press(sheet, box, *condition)
         for box in self.stained:
             x, y = self._touch_px(box)
             ring, centre = np.ones_like(sheet), (round(x - 8 * PX_PER_MM), round(y))
             cv2.circle(ring, centre, round(35 * PX_PER_MM), (0.75,), round(4 * PX_PER_MM))
-            sheet *= cv2.GaussianBlur(ring, (0, 0), 6)
+            sheet *= cv2.blur(ring, (21, 21))
         turn = math.radians(self.skew_deg)
         scale = np.diag(self.scan_scale)
         move = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]) @ scale
         size = (round(wide * 1.05), round(tall * 1.06))
         affine = np.column_stack([move, [90.0, 40.0]])
         scan = cv2.warpAffine(sheet, affine, size, flags=cv2.INTER_CUBIC, borderValue=(200.0,))
-        noise = np.random.default_rng(3).normal(0.0, 2.0, scan.shape)
+        noise = np.random.default_rng(3).normal(0.0, 2.0, (256, scan.shape[1])).astype(np.float32)
+        noise = np.resize(noise, scan.shape)
         return np.clip(scan + noise, 0, 255).astype(np.uint8)
 
     def _touch_px(self, box: str) -> tuple[float, float]:
