@@ -203,8 +203,6 @@ def _contours(calibration: Calibration, width: int, height: int) -> list[tuple[s
     across, down = (np.linspace(0.0, side - 1.0, n) for side, n in zip((width, height), SCALE_GRID, strict=True))
     scale = np.array([[local_scale(calibration.to_paper, np.array([x, y])) for x in across] for y in down])
     generator = contour_generator(across, down, scale)
-    contours: list[tuple[str, list[list[float]]]] = []
-    for value in MaxNLocator(MOST_CONTOURS).tick_values(float(scale.min()), float(scale.max())):
-        lines = cast("list[Floats]", generator.lines(value))
-        contours += ((f"{value:.6g}", line.round(1).tolist()) for line in lines)
-    return contours
+    values = MaxNLocator(MOST_CONTOURS).tick_values(float(scale.min()), float(scale.max()))
+    lines = ((value, line) for value in values for line in cast("list[Floats]", generator.lines(value)))
+    return [(f"{value:.6g}", line.round(1).tolist()) for value, line in lines]

@@ -98,11 +98,6 @@ def field_grid() -> Grid:
     return Grid(np.asarray(centres - left), np.asarray(top - centres))
 
 
-def covered(prepared: Prepared) -> Image:
-    """(128, 128) share of each pixel that is ink in a capture that was rectified to the field."""
-    return shrunk(prepared.mask.astype(np.float32))
-
-
 def captured(prepared: Prepared) -> Pixels:
     """(len(KEYS), 128, 128) images of a capture that was rectified to the field.
 

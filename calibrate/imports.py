@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
-from importlib.metadata import version
+from dataclasses import fields, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import cv2
 
-from brushloop.calibrate.board.sheet import PX_PER_MM, SheetScan, find_sheet, holds_ink
+from brushloop.calibrate.artefact import made_by
+from brushloop.calibrate.board.sheet import PX_PER_MM, find_sheet, holds_ink
 from brushloop.calibrate.board.spec import MM_PER_INCH
 from brushloop.calibrate.commands import ImportRequest
 from brushloop.calibrate.files import Written, read_gray
@@ -26,53 +26,33 @@ def import_session(request: ImportRequest, progress: Progress = unseen) -> Writt
     Raises `InputError` and `CalibrationError`, leaving nothing behind. Boxes that do not agree with the table are
     returned in `left_out`.
     """
-    options = ImportOptions(
-        request.kind,
-        request.px_per_mm,
-        licence=request.licence,
-        origin=request.origin,
-        brush=request.brush,
-        brush_radius_mm=request.brush_radius_mm,
-        brush_length_mm=request.brush_length_mm,
-        simulated=request.simulated,
-    )
-    source, software = request.photographs, f"brushloop {version('brushloop')}"
+    common = {field.name for field in fields(ImportOptions)} & {field.name for field in fields(request)}
+    options = ImportOptions(**{name: getattr(request, name) for name in common})
+    source, radius, length = request.photographs, request.brush_radius_mm, request.brush_length_mm
     out = request.out or Path("sessions") / (source.resolve().stem if source.is_file() else source.resolve().name)
-    radius, length = request.brush_radius_mm, request.brush_length_mm
     size = f"Brush: R = {radius:g} mm, L = {length:g} mm (--brush-radius-mm, --brush-length-mm)"
     said, left_out = [size] if request.kind == "press" else [], list[tuple[str, str]]()
     if not source.is_file():
-        path = import_photographs(source, request.csv, out, options, software, time.time_ns, progress=progress)
+        path = import_photographs(source, request.csv, out, options, made_by(), time.time_ns, progress=progress)
     else:
         scan = find_sheet(read_gray(source), str(source), request.measured_mm)
         with TemporaryDirectory() as temporary:
             boxes = Path(temporary).resolve() / source.name
             boxes.mkdir()
-            inked = _write_boxes(scan, boxes)
+            pictures = {name: scan.picture(box) for name, box in scan.layout.boxes().items()}
+            for name, picture in pictures.items():
+                cv2.imwrite(str(boxes / f"{name}.png"), picture)
+            inked = {name for name, picture in pictures.items() if holds_ink(picture)}
             origin = request.origin or f"{source.name}, {request.csv.name}"
             options = replace(options, px_per_mm=PX_PER_MM, start_px=scan.start_px, origin=origin)
             named = {image.stem for image, _ in read_table(boxes, request.csv, options)}
-            path = import_photographs(boxes, request.csv, out, options, software, time.time_ns, progress=progress)
+            path = import_photographs(boxes, request.csv, out, options, made_by(), time.time_ns, progress=progress)
         left_out += [(box, "is blank, but the table has a row for it") for box in sorted(named - inked)]
         left_out += [(box, "holds ink, but the table has no row for it") for box in sorted(inked - named)]
-        said += [_described(scan), *([TAKEN_AS_EXACT] if request.measured_mm is None else [])]
+        across, along = scan.px_per_mm
+        dpi, marks = round(across * MM_PER_INCH), len(scan.layout.marks())
+        seen = f"{marks - scan.missing} of {marks} marks are seen, within {scan.residual_mm:.2f} mm of a flat sheet"
+        said.append(f"Scan: {dpi} dpi, one pixel is {1 / across:.5f} mm across and {1 / along:.5f} mm along; {seen}")
+        said += [TAKEN_AS_EXACT] if request.measured_mm is None else []
         said += [f"Box {box} {why}" for box, why in left_out]
     return Written(path, [f"Imported into {path}", *said, f"Next: brushloop analyse {path.parent}"], left_out)
-
-
-def _write_boxes(scan: SheetScan, folder: Path) -> set[str]:
-    """Write the picture of every box as a PNG; return the names of those that hold ink."""
-    inked = set[str]()
-    for name, box in scan.layout.boxes().items():
-        picture = scan.picture(box)
-        cv2.imwrite(str(folder / f"{name}.png"), picture)
-        if holds_ink(picture):
-            inked.add(name)
-    return inked
-
-
-def _described(scan: SheetScan) -> str:
-    across, along = scan.px_per_mm
-    dpi, marks = round(across * MM_PER_INCH), len(scan.layout.marks())
-    seen = f"{marks - scan.missing} of {marks} marks are seen, within {scan.residual_mm:.2f} mm of a flat sheet"
-    return f"Scan: {dpi} dpi, one pixel is {1 / across:.5f} mm across and {1 / along:.5f} mm along; {seen}"

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.compare import ANCHOR_MM, FIELD_MM, KEYS, brush_of, captured, covered, field_around, field_grid
+from brushloop.calibrate.compare import ANCHOR_MM, FIELD_MM, KEYS, brush_of, captured, field_around, field_grid, shrunk
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.report import source_label
 from brushloop.calibrate.session import Calibration, OpenSession, open_session
@@ -156,7 +156,7 @@ def prepare_job(job: tuple[Capture, Calibration | None]) -> Arrays:
     assert prepared.anchor_px is not None, "`prepare_press` refuses a stroke without one"
     return {
         "images": captured(prepared),
-        "coverage": covered(prepared),
+        "coverage": shrunk(prepared.mask.astype(np.float32)),
         "anchor_mm": np.array(prepared.anchor_px) / PX_PER_MM,
         "measured": np.array(astuple(preprocess.measure(prepared.mask))),
         "cut": np.array(prepared.cut),

@@ -51,7 +51,7 @@ def render(template: str, **values: Any) -> str:
 
     Names, licences and origins come from other people's files, so everything is escaped.
     """
-    return _templates().get_template(template).render(**values)
+    return templates().get_template(template).render(**values)
 
 
 def write_page(path: Path, template: str, **values: Any) -> Path:
@@ -66,7 +66,7 @@ def about(header: Header) -> dict[str, str]:
 
 
 @functools.cache
-def _templates() -> Any:
+def templates() -> Any:
     """The templates; each is compiled once in a process."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -161,26 +161,18 @@ def overlay(first: Image, second: Image) -> Image:
     """(h, w, 3) RGB of two (h, w) images of ink: gray where both have it, orange the first alone, blue the second."""
     both = np.minimum(first, second)
     # The colours of Okabe and Ito, which colour-blind readers can distinguish, as distances from white.
-    darker = (
-        both[..., None] * np.array([0.35, 0.35, 0.35])
-        + (first - both)[..., None] * np.array([0.165, 0.631, 1.0])
-        + (second - both)[..., None] * np.array([1.0, 0.553, 0.302])
-    )
+    colours = np.array([[0.35, 0.35, 0.35], [0.165, 0.631, 1.0], [1.0, 0.553, 0.302]])
+    darker = np.stack([both, first - both, second - both], axis=-1) @ colours
     return np.clip(1.0 - darker, 0.0, 1.0).astype(np.float32)
-
-
-@functools.cache
-def _glyphs() -> frozenset[int]:
-    """Code points that the font of charts and picture files draws."""
-    from matplotlib import font_manager
-
-    untyped: Any = font_manager
-    return frozenset(untyped.get_font(untyped.findfont("DejaVu Sans")).get_charmap())
 
 
 def printable(text: str) -> str:
     """A name or label for the text of a picture, with `?` for every character that its font does not draw."""
-    drawn = "".join(c if c.isprintable() and ord(c) in _glyphs() else "?" for c in text)
+    from matplotlib import font_manager
+
+    untyped: Any = font_manager
+    glyphs = untyped.get_font(untyped.findfont("DejaVu Sans")).get_charmap()
+    drawn = "".join(c if c.isprintable() and ord(c) in glyphs else "?" for c in text)
     return drawn.replace("$", r"\$")  # otherwise it begins a formula
 
 

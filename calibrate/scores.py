@@ -55,16 +55,13 @@ class Scores:
         self.presses, self.models = tuple(presses), tuple(models)
         """Presses by session and order of capture, and names of models."""
         self.values = np.full((len(presses), len(models), len(KEYS), 2), np.nan)
-        groups: dict[tuple[int, Condition], list[int]] = {}
-        order = {name: number for number, name in enumerate(dict.fromkeys(press.session for press in presses))}
-        for number, press in enumerate(presses):
-            groups.setdefault((order[press.session], press.condition), []).append(number)
-        self.groups = [groups[key] for key in sorted(groups)]
-        """Numbers of the presses of each group, which is one condition in one session, by session and condition."""
-        self.group_of: Integers = np.zeros(len(presses), np.int64)
-        """(presses,) number of each press's group."""
-        for number, group in enumerate(self.groups):
-            self.group_of[group] = number
+        order = list(dict.fromkeys(press.session for press in presses))
+        places = [(order.index(press.session), press.condition) for press in presses]
+        numbers = {place: number for number, place in enumerate(sorted(set(places)))}
+        self.group_of: Integers = np.array([numbers[place] for place in places], np.int64)
+        """(presses,) number of each press's group, which is one condition in one session, by session and condition."""
+        self.groups: list[list[int]] = [np.flatnonzero(self.group_of == number).tolist() for number in numbers.values()]
+        """Numbers of the presses of each group."""
 
     def __iter__(self) -> Iterator[Score]:
         """The scores by session, order of capture and model; those that are missing are left out."""
@@ -120,12 +117,6 @@ class Stat(Frozen):
     """The condition; None for all."""
     csim: Summary
     ssim: Summary
-
-
-def find_stat(stats: Sequence[Stat], model: str, key: Key, condition: DepthTilt | None = None) -> Stat | None:
-    """The statistics of one model, or None if it has none."""
-    wanted = (model, *key, condition)
-    return next((stat for stat in stats if (stat.model, stat.alignment, stat.tone, stat.cell) == wanted), None)
 
 
 def statistics(

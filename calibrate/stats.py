@@ -161,27 +161,22 @@ class Paired:
     """Two-sided, by flipping the signs of whole groups: exact up to 13 of them, else by 10,000 random flips."""
 
 
-def paired(before: Floats, after: Floats, groups: Integers) -> Paired | None:
-    """`after` minus `before`, pair by pair, NaN left out; None where no pair is left.
+def paired(before: Floats, after: Floats, groups: Integers) -> Paired:
+    """`after` minus `before`, pair by pair, of at least one pair without NaN.
 
-    Pairs of one group, (n,) numbers, share an error, such as that of a model in one condition: they are flipped and
-    drawn together.
+    Pairs of one group, (n,) numbers from 0, share an error, such as that of a model in one condition: they are flipped
+    and drawn together.
     """
     difference = after - before
-    known = np.isfinite(difference)
-    difference = difference[known]
-    n = len(difference)
-    if not n:
-        return None
-    _, group = np.unique(groups[known], return_inverse=True)
-    sums, p = np.bincount(group, difference), 1.0
+    sums, p = np.bincount(groups, difference), 1.0
     # Differences below one millionth are ignored: reports keep six digits.
     if len(sums) > 1 and np.abs(difference).max() >= 1e-6:
         from scipy.stats import permutation_test  # slow to import
 
         flips = permutation_test((sums,), np.sum, permutation_type="samples", n_resamples=FLIPS, rng=SEED)
         p = float(flips.pvalue)
-    return Paired(n, len(sums), float(difference.mean()), interval_over_groups(difference, group), p)
+    interval = interval_over_groups(difference, groups)
+    return Paired(len(difference), len(sums), float(difference.mean()), interval, p)
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

@@ -28,6 +28,7 @@ EDGE_MM, STRIP_MM, LABEL_MM = 8.0, 12.0, 3.0
 """Unprinted edge of the page; height of the rows of marks, and of the line above each box that has its number."""
 MARK_MM, MARKS = 10.0, 5
 """Side of a mark, and the number of marks in each of the two rows."""
+DICTIONARY = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
 TOUCH_MM = 8.0
 """From a box's right edge to its touch point, at half of its height: marks extend to the left."""
 INSET_MM = 0.6
@@ -133,15 +134,14 @@ def drawn_sheet(layout: Layout) -> Any:
     axes.axis("off")
     for number, corners in layout.marks().items():
         (left, top), (right, bottom) = corners[0], corners[2]
-        bits = cv2.aruco.generateImageMarker(_dictionary(), number, 6)
-        axes.imshow(bits, cmap="gray", extent=(left, right, bottom, top), interpolation="nearest")
-    axes.set(xlim=(0.0, width), ylim=(height, 0.0), aspect="auto")
+        bits = cv2.aruco.generateImageMarker(DICTIONARY, number, 6)
+        axes.imshow(bits, cmap="gray", extent=(left, right, bottom, top), interpolation="nearest", aspect="auto")
     planned, small = layout.planned(), {"fontsize": 6.0, "va": "bottom"}
     for name, (x, y, wide, tall) in layout.boxes().items():
         axes.plot([x, x + wide, x + wide, x, x], [y, y, y + tall, y + tall, y], color="0.7", linewidth=0.4)
         right, middle = x + wide - TOUCH_MM, y + 0.5 * tall
-        axes.plot([right - 1.5, right + 1.5], [middle, middle], color="0.85", linewidth=0.3)
-        axes.plot([right, right], [middle - 1.5, middle + 1.5], color="0.85", linewidth=0.3)
+        cross = [right - 1.5, right + 1.5], [middle, middle], [right, right], [middle - 1.5, middle + 1.5]
+        axes.plot(*cross, color="0.85", linewidth=0.3)
         depth, tilt = planned.get(name, ("", ""))
         axes.text(x + 0.5, y - 0.4, f"{name}   H {depth} mm, tilt {tilt} deg" if depth else f"{name}   spare", **small)
     across, along = layout.printed_mm
@@ -245,12 +245,8 @@ def _marks_in(image: Gray) -> dict[int, Floats]:
     """The number and the (4, 2) corners of each mark that is seen, in pixels."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    quads, numbers, _ = cv2.aruco.ArucoDetector(_dictionary(), parameters).detectMarkers(image)
+    quads, numbers, _ = cv2.aruco.ArucoDetector(DICTIONARY, parameters).detectMarkers(image)
     if not quads:
         return {}  # OpenCV then has no numbers, whatever its types say
     pairs = zip(np.ravel(np.asarray(numbers)).tolist(), quads, strict=True)
     return {int(number): np.asarray(quad, np.float64).reshape(4, 2) for number, quad in pairs}
-
-
-def _dictionary() -> cv2.aruco.Dictionary:
-    return cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)

@@ -39,7 +39,6 @@ from brushloop.sessions.disk import as_text, check_writable, csv_text, file_sha2
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.records import Source
 from brushloop.sessions.terminal import Progress, unseen
 
 FOLDER = "validation"
@@ -150,14 +149,13 @@ def open_session(place: Path | Recording, fit: Path | None = None) -> FittedSess
     return FittedSession(session.recording, session.sha256, session.strokes, session.calibration, session.store, brush)
 
 
-def one_source(sessions: Sequence[FittedSession]) -> Source:
-    """Kind of ink of all recordings. Raises `CalibrationError` if they differ."""
+def one_source(sessions: Sequence[FittedSession]) -> None:
+    """Check that all recordings have one kind of ink. Raises `CalibrationError` if they differ."""
     first = sessions[0]
     for other in sessions[1:]:
         if other.header.source != first.header.source:
             what = f"has the source {other.header.source}, but {first.recording.path.name} has {first.header.source}"
             raise CalibrationError(str(other.recording.path), f"{what}: validate them separately")
-    return first.header.source
 
 
 def find_beside(sessions: Sequence[FittedSession]) -> tuple[Beside, list[str]]:
@@ -283,7 +281,8 @@ def compare(request: DiffRequest, _progress: Progress = unseen) -> Difference:
         values = 100.0 * np.array([[side[series][key] for key in both] for side in (first, last)])
         # The error of a model is common to all strokes of a condition.
         conditions = np.unique([",".join(key[:2]) for key in both], return_inverse=True)[1]
-        if both and (test := paired(values[0], values[1], conditions)) is not None:
+        if both:
+            test = paired(values[0], values[1], conditions)
             found.append((series, float(values[0].mean()), float(values[1].mean()), test))
     if not found:
         raise CalibrationError(str(paths[1]), f"has no stroke, condition or model in common with {paths[0]}")

@@ -38,7 +38,7 @@ from brushloop.calibrate.validate.tables import Report, Session, TableRow
 from brushloop.calibrate.writing.compare import Table3Row
 
 CONDITION_COLUMNS = ("ccd-bsmg", "ccd-bsm", FITTED_HELD_OUT, run.BEZIER_REFITTED, CEILING)
-MAX_REFUSED, MAX_REFUSED_IN_TERMINAL = 200, 20
+MAX_REFUSED_IN_TERMINAL = 20
 MAX_SAMPLES = 15
 WIDE_SCALE = 0.005
 """Relative width of pix2len's interval above which it matters: half a percent of every length."""
@@ -69,12 +69,10 @@ def page_of(
 
     `figures_13` are sessions of characters and their pictures as data URIs.
     """
-    best_model, names = report.model(report.shown), [session.header.session_id for session in report.sessions]
     best, worst = extremes(outcome, report.shown)
     return render(
         "report.html.j2",
         report=report,
-        name=", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else ""),
         note=source_note(report.source),
         beside=beside,
         verdict=verdict(report),
@@ -93,18 +91,14 @@ def page_of(
         part=part_with_ceiling(_csim(report, report.shown)),
         scores=[(key, _scores(report, key)) for key in KEYS],
         condition_columns=[model for name in CONDITION_COLUMNS if (model := report.model(name)) is not None],
-        conditions=outcome.scores.conditions() if report.conditions else {},
+        conditions=outcome.scores.conditions() if report.stats else {},
         samples=[pictured(outcome, k, report.shown) for k in first_of_conditions(outcome, MAX_SAMPLES)],
         side=side_by_side(outcome),
-        drawn_by=best_model.label if best_model is not None else "",
+        drawn_by=_label(report, report.shown),
         best=[pictured(outcome, k, report.shown) for k in best],
         worst=[pictured(outcome, k, report.shown) for k in worst],
         steps=by_strokes(report) if report.by_strokes else "",
         curves=losses(curves) if curves else "",
-        refused=report.refused[:MAX_REFUSED],
-        more_refused=max(0, len(report.refused) - MAX_REFUSED),
-        provenance=[(session, provenance(session)) for session in report.sessions],
-        software=", ".join(f"{name} {number}" for name, number in report.software.items()),
     )
 
 
@@ -113,19 +107,6 @@ def _scores(report: Report, key: Key) -> list[tuple[ModelInfo, Stat, int, int]]:
     rows = [(model, stat) for model in report.models if (stat := report.stat(model.name, key)) is not None]
     by_csim, by_ssim = (np.argsort(np.argsort([-getattr(stat, of).avg for _, stat in rows])) for of in MEASURES)
     return [(*row, int(first), int(second)) for row, first, second in zip(rows, by_csim, by_ssim, strict=True)]
-
-
-def provenance(session: Session) -> tuple[tuple[str, str], ...]:
-    """Name and text of what is known of the strokes of a recording."""
-    collected, counts = session.collected, f"{session.strokes} captured, {session.compared} compared"
-    if collected is not None:
-        planned = "" if collected.planned is None else f"{collected.planned} planned, "
-        counts = (
-            f"{planned}{collected.photographed} photographed, {len(collected.pressed_again)} of them pressed again, "
-            f"{len(collected.left_out)} left out, {session.strokes} counted, {session.compared} compared"
-        )
-    touches = "" if collected is None else ", ".join(collected.touches)
-    return ("brush fit", session.fit), ("strokes", counts), ("zero touch", touches)
 
 
 def read_curve(text: str) -> Curve:
@@ -145,8 +126,7 @@ def extremes(outcome: Outcome, model: str) -> tuple[list[int], list[int]]:
     if not model:
         return [], []
     csim = outcome.scores.of_key(model, STRICT)[:, 0]
-    known = np.flatnonzero(np.isfinite(csim))
-    order: list[int] = known[np.argsort(csim[known], kind="stable")].tolist()
+    order: list[int] = np.argsort(csim, kind="stable")[: np.count_nonzero(np.isfinite(csim))].tolist()
     count = min(EXTREMES, max(1, len(order) // 2))
     return order[::-1][:count], order[:count]
 
@@ -154,7 +134,7 @@ def extremes(outcome: Outcome, model: str) -> tuple[list[int], list[int]]:
 def pictured(outcome: Outcome, k: int, model: str) -> dict[str, Any]:
     """A press with what the model predicts for it, their difference, and their scores: the paper's figures 7 and 8."""
     press, csim, ssim = outcome.scores.presses[k], np.nan, np.nan
-    drawn = outcome.predicted(press).get(model)
+    drawn = outcome.predicted(press)[0].get(model)
     if drawn is not None:
         csim, ssim = 100.0 * outcome.scores.of_key(model, STRICT)[k]
     return {"press": press, "drawn": drawn, "scored": bool(np.isfinite(csim)), "csim": csim, "ssim": ssim}
@@ -162,9 +142,9 @@ def pictured(outcome: Outcome, k: int, model: str) -> dict[str, Any]:
 
 def side_by_side(outcome: Outcome) -> dict[str, Any]:
     """Some captures next to the prediction of every model: the paper's figures 3, 10 and 11."""
-    labels = {model.name: model.info.label for group in outcome.models.values() for model in group}
+    labels = {model.info.name: model.info.label for group in outcome.models.values() for model in group}
     presses = [outcome.scores.presses[k] for k in first_of_conditions(outcome, MAX_CONDITIONS)]
-    return {"labels": labels, "lines": [(press, outcome.predicted(press)) for press in presses]}
+    return {"labels": labels, "lines": [(press, outcome.predicted(press)[0]) for press in presses]}
 
 
 def first_of_conditions(outcome: Outcome, most: int) -> list[int]:
@@ -199,15 +179,12 @@ def distributions(outcome: Outcome, report: Report) -> str:
 def by_strokes(report: Report) -> str:
     """CSIM on presses that were not fitted, against the number of presses that were."""
     figure, [[axis]] = picture_grid(1, 1, (7.2, 3.6), report.label)
-    for name, colour in (("CCD-BSM", ORANGE), ("Bézier", BLUE)):
-        csim: dict[int, list[float]] = {}
-        for step in report.by_strokes:
-            if step.model == name:
-                csim.setdefault(step.strokes, []).append(step.csim)
-        counts = sorted(csim)
-        axis.plot(counts, [np.mean(csim[count]) for count in counts], "o-", color=colour, label=f"{name} fitted")
-    axis.set(title="mm, binary", xlabel="presses that were fitted", ylabel="CSIM on all others, %", xscale="log")
     counts = sorted({step.strokes for step in report.by_strokes})
+    for name, colour in (("CCD-BSM", ORANGE), ("Bézier", BLUE)):
+        csim = [[s.csim for s in report.by_strokes if (s.model, s.strokes) == (name, count)] for count in counts]
+        means = [np.mean(of_count) if of_count else np.nan for of_count in csim]
+        axis.plot(counts, means, "o-", color=colour, label=f"{name} fitted")
+    axis.set(title="mm, binary", xlabel="presses that were fitted", ylabel="CSIM on all others, %", xscale="log")
     axis.set_xticks(counts, map(str, counts))
     axis.set_xticks([], minor=True)
     return chart_uri(figure)
@@ -226,7 +203,8 @@ def measured(report: Report) -> str:
     """Summary of the strokes and models that were compared."""
     compared, strokes = (sum(getattr(s, name) for s in report.sessions) for name in ("compared", "strokes"))
     brush = brush_and_size(report.sessions[0].header)
-    at = f" at {len(report.conditions)} combinations of press depth H and brush tilt α" if report.conditions else ""
+    conditions = {stat.cell for stat in report.stats} - {None}
+    at = f" at {len(conditions)} combinations of press depth H and brush tilt α" if conditions else ""
     left = f", {strokes - compared} more could not be used" if strokes > compared else ""
     models = sum(model.basis != run.PRESSES for model in report.models)
     sessions = f"{len(report.sessions)} sessions" if len(report.sessions) > 1 else "one session"
@@ -362,9 +340,8 @@ def _terminal_table(title: str, like: Sequence[TableRow], strict: Sequence[Table
     table = Table("model", "n", "size-\nnormalised\nCSIM / SSIM", "paper's\navg", "mm\nCSIM / SSIM", title=title)
     for row, other in itertools.zip_longest(like, strict):
         if row.scores is not None:
-            words = [_pair(row.scores), "", "" if other is None else _pair(other.scores)]
-            if row.paper is not None:
-                words[1] = f"{row.paper.csim[2]:.2f} / {row.paper.ssim[2]:.2f}"
+            paper = "" if row.paper is None else f"{row.paper.csim[2]:.2f} / {row.paper.ssim[2]:.2f}"
+            words = _pair(row.scores), paper, "" if other is None else _pair(other.scores)
             table.add_row(row.label + SHORT.get(row.basis, ""), str(row.scores.csim.n), *words)
     return table
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -115,11 +115,6 @@ class Model:
     images: Callable[[Condition], Pixels]
     """What it predicts for a condition; raises `DomainError` for a press that it does not predict."""
 
-    @property
-    def name(self) -> str:
-        """Its name."""
-        return self.info.name
-
 
 class Refused(NamedTuple):
     """A press that was not compared, or not with one of the models, and why."""
@@ -150,13 +145,19 @@ class Outcome:
     """Models of each session, by its name."""
     scores: Scores
     """Of every model of any session, then of the comparisons with presses."""
-    refused: Sequence[Refused]
-    steps: Sequence[Step]
+    refused: list[Refused]
+    steps: list[Step]
     """Similarity by number of fitted presses; empty without ablations."""
 
-    def predicted(self, press: Press) -> dict[str, Pixels]:
-        """(len(KEYS), 128, 128) of a press by the models that predict it."""
-        return predicted(self.models[press.session], press.condition)[0]
+    def predicted(self, press: Press) -> tuple[dict[str, Pixels], list[str]]:
+        """(len(KEYS), 128, 128) of a press by the models that predict it, and why the others do not."""
+        images, refused = dict[str, Pixels](), list[str]()
+        for model in self.models[press.session]:
+            try:
+                images[model.info.name] = model.images(press.condition)
+            except DomainError as error:
+                refused.append(f"{model.info.name} {NOT_PREDICTED}: {error}")
+        return images, refused
 
 
 def validate_presses(
@@ -169,7 +170,7 @@ def validate_presses(
     models = {session.header.session_id: known_models(session, request) for session in sessions}
     if len(models) < len(sessions):
         raise CalibrationError(sessions[-1].header.session_id, "two sessions have this name")
-    possible = [*(model.name for known in models.values() for model in known), BEZIER_REFITTED]
+    possible = [*(model.info.name for known in models.values() for model in known), BEZIER_REFITTED]
     possible += [FITTED_HELD_OUT] if any(session.fit for session in sessions) else []
     for name in request.models:
         if name not in possible:
@@ -183,21 +184,20 @@ def validate_presses(
         of_session = list(read_presses(session, left_out, *reasons, scheduler=scheduler, progress=progress))
         refused += (Refused(name, *reason) for reason in left_out)
         every = in_order([*models[name], *_held_out(session, of_session, request, scheduler, progress)])
-        models[name] = [model for model in every if not request.models or model.name in request.models]
+        models[name] = [model for model in every if not request.models or model.info.name in request.models]
         presses += of_session
-    names = dict.fromkeys(model.name for model in in_order([m for group in models.values() for m in group]))
-    scores = Scores(presses, (*names, ANOTHER))
-    for session in sessions:
-        _score(scores, session, models[session.header.session_id], refused, scheduler, progress)
-    steps: list[Step] = []
-    for number, session in enumerate(sessions if request.ablations else ()):
-        steps += _similarity_by_strokes(session, number, scores, scheduler)
-    return Outcome(sessions, request, models, scores, refused, steps)
+    names = dict.fromkeys(model.info.name for model in in_order([m for group in models.values() for m in group]))
+    outcome = Outcome(sessions, request, models, Scores(presses, (*names, ANOTHER)), refused, [])
+    for number, session in enumerate(sessions):
+        _score(outcome, session, scheduler, progress)
+        if request.ablations:
+            outcome.steps.extend(_similarity_by_strokes(session, number, outcome.scores, scheduler))
+    return outcome
 
 
 def in_order(models: Sequence[Model]) -> list[Model]:
     """Sort in the order of the paper's tables, all others last."""
-    return sorted(models, key=lambda model: ORDER.index(model.name) if model.name in ORDER else len(ORDER))
+    return sorted(models, key=lambda model: ORDER.index(model.info.name) if model.info.name in ORDER else len(ORDER))
 
 
 def known_models(session: FittedSession, request: ValidateRequest) -> Sequence[Model]:
@@ -220,7 +220,7 @@ def known_models(session: FittedSession, request: ValidateRequest) -> Sequence[M
         models.append(_of_model(stroke_model("ccd-bsm", brush, lam), PUBLISHED, name=name, label=label))
     for file in request.generators or ([SHIPPED_GENERATOR] if brush == Brush() else []):
         model = load_generator(file, brush)
-        if model.name in [known.name for known in models]:
+        if model.name in [known.info.name for known in models]:
             raise CalibrationError(str(file), f"is a second generator named {model.name}")
         basis = f"trained on exact images of {model.target.stroke_model.label}"
         basis += ", then tuned on captures" if model.fitted else ""
@@ -269,17 +269,6 @@ def _left_out(info: ModelInfo, outlines: Mapping[DepthTilt, Draw | None]) -> Mod
     return Model(info, images)
 
 
-def predicted(models: Iterable[Model], at: Condition) -> tuple[dict[str, Pixels], list[str]]:
-    """(len(KEYS), 128, 128) of a condition by model, and why models do not predict it."""
-    images, refused = dict[str, Pixels](), list[str]()
-    for model in models:
-        try:
-            images[model.name] = model.images(at)
-        except DomainError as error:
-            refused.append(f"{model.name} {NOT_PREDICTED}: {error}")
-    return images, refused
-
-
 ScoreJob = tuple[Pixels, tuple[Sequence[Pixels], ...]]
 """A press (len(KEYS), 128, 128), and the images of each comparison, of that shape, whose scores are averaged."""
 
@@ -289,16 +278,10 @@ def score_job(job: ScoreJob) -> Arrays:
     return {"values": similarities(*job)}
 
 
-def _score(
-    scores: Scores,
-    session: FittedSession,
-    models: Sequence[Model],
-    refused: list[Refused],
-    scheduler: Scheduler,
-    progress: Progress,
-) -> None:
+def _score(outcome: Outcome, session: FittedSession, scheduler: Scheduler, progress: Progress) -> None:
     """Fill the table for one session: every press against every model, and against other presses of its condition."""
-    columns = [scores.models.index(name) for name in (*(model.name for model in models), ANOTHER)]
+    scores, names = outcome.scores, [model.info.name for model in outcome.models[session.header.session_id]]
+    columns = [scores.models.index(name) for name in (*names, ANOTHER)]
     groups = [group for group in scores.groups if scores.presses[group[0]].session == session.header.session_id]
     numbers: dict[str, list[int]] = {}
     """Numbers of presses by the key of their job: equal presses share one."""
@@ -306,10 +289,10 @@ def _score(
     def jobs() -> Iterator[tuple[str, ScoreJob]]:
         for group in groups:
             presses = [scores.presses[k] for k in group]
-            images, reasons = predicted(models, presses[0].condition)
+            images, reasons = outcome.predicted(presses[0])
             for why in reasons:
-                refused.extend(Refused(press.session, press.stroke.stroke_id, why) for press in presses)
-            predictions = [[images[model.name]] if model.name in images else [] for model in models]
+                outcome.refused.extend(Refused(press.session, press.stroke.stroke_id, why) for press in presses)
+            predictions = [[images[name]] if name in images else [] for name in names]
             of_models = [key_of(*drawn) for drawn in predictions]
             of_presses = [key_of(press.images) for press in presses]
             for number, press in enumerate(presses):

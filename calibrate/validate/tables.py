@@ -33,7 +33,7 @@ from brushloop.calibrate.compare import (
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.loop import AGAIN, LoopRecord
 from brushloop.calibrate.report import Sealed, source_label
-from brushloop.calibrate.scores import MEASURES, Scores, Stat, find_stat, statistics
+from brushloop.calibrate.scores import MEASURES, Scores, Stat, statistics
 from brushloop.calibrate.session import Calibration
 from brushloop.calibrate.stats import CEILING, Floats, Summary, ceiling_values
 from brushloop.calibrate.validate import run
@@ -136,12 +136,8 @@ class Report(Sealed):
 
     def stat(self, model: str, key: Key = STRICT, condition: DepthTilt | None = None) -> Stat | None:
         """The scores of one model, or None if it has none."""
-        return find_stat(self.stats, model, key, condition)
-
-    @property
-    def conditions(self) -> list[DepthTilt]:
-        """Depth and tilt of every condition with statistics of its own."""
-        return sorted({stat.cell for stat in self.stats if stat.cell is not None})
+        wanted = (model, *key, condition)
+        return next((stat for stat in self.stats if (stat.model, stat.alignment, stat.tone, stat.cell) == wanted), None)
 
     def model(self, name: str) -> ModelInfo | None:
         """The model of that name, or None if it has no score."""
@@ -199,7 +195,7 @@ def _stats(scores: Scores) -> Iterator[Stat]:
 def _models(outcome: Outcome) -> Iterator[ModelInfo]:
     """Yield every model that was compared, with what it knew of the presses of each session."""
     for name in outcome.scores.models:
-        infos = [model.info for group in outcome.models.values() for model in group if model.name == name]
+        infos = [model.info for group in outcome.models.values() for model in group if model.info.name == name]
         if infos:
             yield infos[-1].model_copy(update={"basis": "; ".join(dict.fromkeys(info.basis for info in infos))})
 
@@ -267,11 +263,9 @@ def table_1(report: Report) -> list[TableRow]:
 
 def robot_writing(report: Report, key: Key = NORMAL) -> list[TableRow]:
     """Rows of strokes pressed again, one of each loop."""
-    rows: list[TableRow] = []
-    for loop in report.loops:
-        basis = f"{loop.original} pressed again as {loop.again}, recovered by {loop.model}"
-        rows.append(TableRow(ROBOT_WRITING, basis, find_stat(loop.stats, AGAIN, key), TABLE_1[ROBOT_WRITING]))
-    return rows
+    basis, paper = "{0.original} pressed again as {0.again}, recovered by {0.model}", TABLE_1[ROBOT_WRITING]
+    again = [(loop, stat) for loop in report.loops for stat in loop.rows(key) if stat.model == AGAIN]
+    return [TableRow(ROBOT_WRITING, basis.format(loop), stat, paper) for loop, stat in again]
 
 
 def table_2(report: Report, key: Key = NORMAL) -> list[TableRow]:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.board.pix2len import Plane, see_board
-from brushloop.calibrate.compare import ANCHOR_MM, MM_PER_PX, covered, field_around, field_grid
+from brushloop.calibrate.compare import ANCHOR_MM, MM_PER_PX, field_around, field_grid, shrunk
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.stroke.preprocess import PX_PER_MM, Gray, on_window, prepare, rectify
 from brushloop.collect.engine.recorder import RunContext, StepContext, meanwhile, uninterrupted
@@ -326,4 +326,4 @@ def pictures_of(image: Gray, plane: Plane, patch: Patch) -> tuple[NDArray[np.uin
         prepared = prepare(raster, anchor_px, "the capture", on_window(patch.rect_mm, window))
     except CaptureRefused:
         return raster, None
-    return raster, covered(prepared) > 0.5
+    return raster, shrunk(prepared.mask.astype(np.float32)) > 0.5

@@ -22,7 +22,7 @@ from brushloop.calibrate.compare import (
 )
 from brushloop.calibrate.loop import AGAIN, ANOTHER, SIMULATED, LoopRecord, Pair, pair_up, score_pairs, statistics_of
 from brushloop.calibrate.presses import Press
-from brushloop.calibrate.scores import Scores, find_stat, similarities
+from brushloop.calibrate.scores import Scores, similarities
 from brushloop.calibrate.validate.run import score_job
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.similarity import binary_scores, csim, ssim
@@ -253,5 +253,5 @@ def test_presses_made_again_too_deep_fail_once_there_are_enough_to_be_certain() 
 
 def test_an_original_alone_in_its_condition_has_no_repeatability() -> None:
     record = record_of([press("b-r01~1", (19.0, 0.0), (19.0, 0.0), "b-r01")])
-    assert find_stat(record.stats, ANOTHER, MM) is None
+    assert ANOTHER not in {row.model for row in record.rows(MM)}
     assert (record.lost, record.answer.good) == ([], None)

@@ -17,10 +17,11 @@ from brushloop.calibrate.compare import KEYS, images_of
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.command import fit_press_session
 from brushloop.calibrate.fit.heldout import BEZIER, FITTED
+from brushloop.calibrate.report import templates
 from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.validate import run as validation
 from brushloop.calibrate.validate.command import compare, validate
-from brushloop.calibrate.validate.page import headline, provenance, trust
+from brushloop.calibrate.validate.page import headline, trust
 from brushloop.calibrate.validate.run import BEZIER_REFITTED, FITTED_HELD_OUT
 from brushloop.calibrate.validate.tables import Collected, GateMissed, Report, check_gates, collected_in
 from brushloop.sessions.events import CaptureResult, Condition, DipResult, Remark, ZeroTouchResult
@@ -187,7 +188,8 @@ def test_what_was_left_out_selected_or_pressed_on_other_paper_stands_above_the_r
         )
         session = report.sessions[0].model_copy(update={"collected": collected.model_copy(update=changes)})
         changed = report.model_copy(update={"sessions": (session,)})
-        return " ".join([*(point.text for point in trust(changed)), *dict(provenance(session)).values()])
+        counted = templates().get_template("parts.html.j2").module.counted(session)
+        return " ".join([*(point.text for point in trust(changed)), counted])
 
     assert "left out during" not in shown()
     assert "8 planned, 8 photographed" in shown()
