@@ -10,7 +10,7 @@ import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 from brushloop.calibrate.artefact import made_by
 from brushloop.calibrate.commands import CompareLoopRequest
@@ -25,12 +25,10 @@ from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.calibrate.stats import Interval, Summary, is_near
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.similarity import SSIM_SETTINGS
+from brushloop.model.strokes import StrokeModel
 from brushloop.sessions.disk import check_writable
 from brushloop.sessions.records import Condition, Header, Source
 from brushloop.sessions.terminal import Progress, unseen
-
-if TYPE_CHECKING:
-    from brushloop.model.strokes import StrokeModel
 
 PAGE, TABLE = "loop.html", "loop.csv"
 AGAIN, ANOTHER, SIMULATED = "re-pressed", "another press", "recovered, simulated"

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from html import escape
@@ -108,23 +109,21 @@ class Recovered:
                 f"{name}: recovered values are {off.mean():+.2f}{scatter} {unit} from the commanded ones; "
                 f"{inside} of {many} intervals (95 %) contain the commanded value"
             )
-        if bare := self._flagged(NO_MODEL_ERROR):
+        flagged = Counter(flag for row in self.rows for flag in row.flags)
+        if bare := flagged[NO_MODEL_ERROR]:
             yield (
                 f"warning: the intervals of {bare} presses leave out the error of the model: fewer than "
                 f"{LEAST_CONDITIONS} other combinations of H and alpha were pressed"
             )
         for name, flag in NOT_INFORMATIVE.items():
-            if vague := self._flagged(flag):
+            if vague := flagged[flag]:
                 yield f"warning: {vague} presses hardly determine {name}: its interval covers most of the range"
-        if 2 * (bound := self._flagged(Flag.AT_BOUND)) > many:
+        if 2 * (bound := flagged[Flag.AT_BOUND]) > many:
             yield f"warning: {bound} presses lie at a limit of H or alpha: first fit this brush (`brushloop fit`)"
         for stroke_id, why in self.left_out:
             yield f"not used: {stroke_id}: {why}"
         yield str(self.out)
         yield str(self.protocol)
-
-    def _flagged(self, flag: str) -> int:
-        return sum(flag in row.flags for row in self.rows)
 
     def _repr_html_(self) -> str:
         rows = (COLUMNS, *self.csv_rows())
@@ -247,8 +246,11 @@ def model_sd(off: Floats, sd: Floats, conditions: Sequence[Condition], fitted: C
     for condition in set(conditions):
         others = [k for k, other in enumerate(conditions) if other != condition and known[k]]
         unseen = [] if condition in fitted else [k for k in others if conditions[k] not in fitted]
-        spreads = [_spread(off[k], sd[k], len({conditions[at] for at in k})) for k in (others, unseen) if k]
-        if len({conditions[k] for k in others}) >= LEAST_CONDITIONS:
+        spreads = list[float]()
+        for presses in (others, unseen):
+            if (many := len({conditions[k] for k in presses})) >= LEAST_CONDITIONS:
+                spreads.append(math.sqrt(common_variance(off[presses], sd[presses])) * student_95(many) / NORMAL_95)
+        if spreads:
             out[[k for k, other in enumerate(conditions) if other == condition]] = max(spreads)
     return out
 
@@ -264,10 +266,3 @@ def common_variance(off: Floats, sd: Floats) -> float:
         return float(np.mean(off**2 / (np.maximum(sd**2, 1e-12) + variance))) - 1.0
 
     return 0.0 if excess(0.0) <= 0.0 else float(brentq(excess, 0.0, float(np.mean(off**2))))
-
-
-def _spread(off: Floats, sd: Floats, conditions: int) -> float:
-    """The deviation from presses of so many conditions, enlarged; 0 from too few."""
-    if conditions < LEAST_CONDITIONS:
-        return 0.0
-    return math.sqrt(common_variance(off, sd)) * student_95(conditions) / NORMAL_95

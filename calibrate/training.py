@@ -72,10 +72,9 @@ def captures_of(sessions: Sequence[OpenSession], generator: Path) -> tuple[Captu
     for session, target in zip(sessions, targets, strict=True):
         for capture in session.recording.captures():
             depth_mm, tilt_deg = capture.stroke.depth_mm, capture.stroke.tilt_deg
-            if depth_mm is None or tilt_deg is None or capture.bad:
-                left_out.append((capture.stroke.stroke_id, capture.bad or "has no depth or tilt"))
-                continue
             try:
+                if depth_mm is None or tilt_deg is None or capture.bad:
+                    raise CaptureRefused(capture.stroke.stroke_id, capture.bad or "has no depth or tilt")
                 target.check(np.array([[depth_mm, tilt_deg]]))
                 images.append(_placed(prepare_press(capture, session.calibration), target))
                 inputs.append((depth_mm, tilt_deg))

@@ -106,25 +106,19 @@ SPREAD = (
     Constant("strand_mm", "mm", 0.7, factor=True),
 )
 """Constants by which presses of one condition differ."""
+LEAST, MOST = np.array([*(one.bounds for one in SHAPE), *[(-FARTHEST, FARTHEST)] * len(PLACE_MM)]).T
+"""Least and greatest coordinates of a point."""
 
 
 def with_values(base: BrushSpec, constants: Sequence[Constant], point: Sequence[float] | Vector) -> BrushSpec:
     """`base` with these constants moved from their defaults by this many scales each."""
-    values = {one.name: one.value(float(scales)) for one, scales in zip(constants, point, strict=False)}
-    return replace(base, **values)
+    return replace(base, **{one.name: one.value(float(by)) for one, by in zip(constants, point, strict=False)})
 
 
 def place_at(point: Vector) -> Place:
     """The last three coordinates of a point."""
     deeper, x, y = (float(mm * v) for mm, v in zip(PLACE_MM, point[len(SHAPE) :], strict=True))
     return deeper, x, y
-
-
-def search_bounds() -> tuple[Vector, Vector]:
-    """Least and greatest coordinates of a point."""
-    ends = [one.bounds for one in SHAPE] + [(-FARTHEST, FARTHEST)] * 3
-    low, high = zip(*ends, strict=True)
-    return np.array(low), np.array(high)
 
 
 def draw(
@@ -134,8 +128,9 @@ def draw(
 
     Raises ValueError, naming value and range, for a press deeper than the brush allows.
     """
-    brush = Brush(spec)
-    descents = _descents(mechanics(spec), place[0], tuple(conditions))
+    brush, default = Brush(spec), BrushSpec()
+    mechanics = replace(spec, seed=0, **{one.name: getattr(default, one.name) for one in (*INK, *SPREAD)})
+    descents = _descents(mechanics, place[0], tuple(conditions))
     ink = np.empty((len(conditions), repeats, len(grid.y_mm), len(grid.x_mm)), np.float32)
     for c, descent in enumerate(descents):
         for r in range(repeats):
@@ -145,14 +140,9 @@ def draw(
     return ink
 
 
-def mechanics(spec: BrushSpec) -> BrushSpec:
-    """The brush with every constant that does not affect the bundle's shape at its default."""
-    default = BrushSpec()
-    return replace(spec, seed=0, **{one.name: getattr(default, one.name) for one in (*INK, *SPREAD)})
-
-
 @lru_cache(maxsize=REMEMBERED)
 def _descents(spec: BrushSpec, deeper_mm: float, conditions: tuple[DepthTilt, ...]) -> tuple[Descent, ...]:
+    """The descents of a brush with every constant that does not affect the bundle's shape at its default."""
     brush, descents = Brush(spec), dict[DepthTilt, Descent]()
     for tilt in {tilt for _, tilt in conditions}:
         reached = {depth: max(depth + deeper_mm, LEAST_MM) for depth, a in conditions if a == tilt}

@@ -215,9 +215,8 @@ def sound_head(spec: BrushSpec, conditions: Sequence[DepthTilt], grid: Grid) -> 
     if not heads_mm:
         return None
     middle_mm = 0.5 * (min(heads_mm) + max(heads_mm))
-    reach_mm = max(heads_mm) - middle_mm
-    misplaced_mm = round(max(reach_mm + MARGIN_MM, LEAST_MISPLACED_MM), 1)
-    return SoundHead(head_mm=round(middle_mm, 1), misplaced_mm=misplaced_mm)
+    reach_mm = max(max(heads_mm) - middle_mm + MARGIN_MM, LEAST_MISPLACED_MM)
+    return SoundHead(head_mm=round(middle_mm, 1), misplaced_mm=round(reach_mm, 1))
 
 
 def _head_mm(image: Images, grid: Grid) -> float | None:

@@ -28,7 +28,7 @@ from brushloop.drivers.sim.brush.spec import BrushSpec
 from brushloop.model.presses import DepthTilt, Grid
 from brushloop.model.similarity import csim
 from brushloop.sessions.terminal import Progress
-from brushloop.twin.brush import SHAPE, SPREAD, STILL, Images, Place, Vector, draw, place_at, search_bounds, with_values
+from brushloop.twin.brush import LEAST, MOST, SHAPE, SPREAD, STILL, Images, Place, Vector, draw, place_at, with_values
 
 IMAGE_SD = 0.12
 """Standard deviation that the fit assumes for a blurred pixel. It is large because neighbouring pixels deviate
@@ -109,43 +109,32 @@ def off(target: Target, seed: int, blur_mm: float, point: Vector) -> Vector:
     """Residuals: differences of blurred pixels between brush and captures over `IMAGE_SD`, then those of the prior."""
     still = replace(target.brush(Solution(point, seed)), **STILL)
     drawn = draw(still, place_at(point), target.conditions, target.grid)[:, 0]
-    apart = blurred(drawn - target.mean, blur_mm, target.grid)
-    return np.concatenate([apart.ravel() / IMAGE_SD, point / PRIOR_SD])
-
-
-def blurred(images: Images, blur_mm: float, grid: Grid) -> NDArray[np.float64]:
-    """Each second row and column of images (n, rows, columns) after a Gaussian blur."""
-    sigma = blur_mm / grid.px_mm
-    soft = [cv2.GaussianBlur(image, (0, 0), sigma)[::EVERY, ::EVERY] for image in images]
-    return np.asarray(soft, np.float64)
+    sigma = blur_mm / target.grid.px_mm
+    apart = [cv2.GaussianBlur(image, (0, 0), sigma)[::EVERY, ::EVERY] for image in drawn - target.mean]
+    return np.concatenate([np.asarray(apart, np.float64).ravel() / IMAGE_SD, point / PRIOR_SD])
 
 
 def search(target: Target, solution: Solution, workers: Executor, blur_mm: float) -> Solution:
-    """One pass, starting from `found`."""
+    """One pass, starting from `solution`."""
     from scipy.optimize import least_squares  # slow to import
 
-    low, high = search_bounds()
-    began = np.clip(solution.point, low + NEAR_BOUND, high - NEAR_BOUND)
-    reached = [began]
-
-    def evaluate(moved: Vector) -> Vector:
-        return off(target, solution.seed, blur_mm, began + moved)
+    began = np.clip(solution.point, LEAST + NEAR_BOUND, MOST - NEAR_BOUND)
+    reached, residuals = [began], partial(off, target, solution.seed, blur_mm)
 
     def slopes(moved: Vector) -> NDArray[np.float64]:
         reached.append(began + moved)
         if len(reached) > STEPS + 1:
             raise _EnoughSteps
-        at_point = partial(off, target, solution.seed, blur_mm)
-        return derivatives(at_point, reached[-1], high, workers)
+        return derivatives(residuals, reached[-1], MOST, workers)
 
     # the search is for the way from where it began, because the minimiser's first step is as long as its start is far
     # from 0, and 1 if that is 0
     with contextlib.suppress(_EnoughSteps):
         best = least_squares(
-            evaluate,
+            lambda moved: residuals(began + moved),
             np.zeros_like(began),
             jac=slopes,
-            bounds=(low - began, high - began),
+            bounds=(LEAST - began, MOST - began),
             max_nfev=MOST_TRIALS * STEPS,
             xtol=1e-3,
             ftol=FTOL,
@@ -216,9 +205,8 @@ def covariance(target: Target, solution: Solution, workers: Executor) -> NDArray
     The sandwich of a least-squares fit: what each condition asks to be changed, the model's own errors included,
     spreads over the conditions. The prior counts as one more observation of each constant.
     """
-    _, high = search_bounds()
     evaluate = partial(off, target, solution.seed, FINE_MM)
-    jacobian = derivatives(evaluate, solution.point, high, workers)
+    jacobian = derivatives(evaluate, solution.point, MOST, workers)
     residual = evaluate(solution.point)
     count, constants = len(target.conditions), len(solution.point)
     of_cells = jacobian[:-constants].reshape(count, -1, constants)
@@ -273,21 +261,17 @@ def fit_spread(
     best = least_squares(
         off, start, jac=lambda point: derivatives(off, point, high, workers), bounds=(low, high), max_nfev=SPREAD_STEPS
     )
-    twin = _drawn(spec, place, tuple(repeats), grid, best.x)
+    twin = draw(with_values(spec, SPREAD, best.x), place, tuple(repeats), grid, REPEATS, FIRST_SEED)
     jacobian = np.asarray(best.jac, np.float64)
     error = np.sqrt(np.diagonal(np.linalg.inv(jacobian.T @ jacobian)))
-    return Spread(tuple(map(float, best.x)), tuple(map(float, error)), agreement(captured), agreement(twin))
+    return Spread(tuple(map(float, best.x)), tuple(map(float, error)), agreement(captured), agreement(list(twin)))
 
 
 def _off_statistics(
     spec: BrushSpec, place: Place, conditions: Sequence[DepthTilt], grid: Grid, seen: Vector, sd: Vector, point: Vector
 ) -> Vector:
-    drawn = statistics(_drawn(spec, place, conditions, grid, point), grid)
-    return np.concatenate([(drawn - seen) / sd, point / SPREAD_PRIOR_SD])
-
-
-def _drawn(spec: BrushSpec, place: Place, conditions: Sequence[DepthTilt], grid: Grid, point: Vector) -> list[Images]:
-    return list(draw(with_values(spec, SPREAD, point), place, conditions, grid, REPEATS, FIRST_SEED))
+    drawn = draw(with_values(spec, SPREAD, point), place, conditions, grid, REPEATS, FIRST_SEED)
+    return np.concatenate([(statistics(list(drawn), grid) - seen) / sd, point / SPREAD_PRIOR_SD])
 
 
 def statistics(ink: Sequence[NDArray[np.floating]], grid: Grid) -> Vector:
@@ -316,10 +300,6 @@ def _measure(image: NDArray[np.floating], grid: Grid) -> tuple[float, float, flo
         return 0.0, 0.0, 0.0, 0.0
     first, last = int(columns[0]), int(columns[-1])
     share = max(1, round(END_SHARE * (last - first + 1)))
-    tip, heel = (_middle_mm(end, grid) for end in (ink[:, first : first + share], ink[:, last + 1 - share : last + 1]))
+    ends = ink[:, first : first + share], ink[:, last + 1 - share : last + 1]
+    tip, heel = (float(np.average(grid.y_mm, weights=end.sum(axis=1))) for end in ends)
     return math.log(float(ink.sum())), float(grid.x_mm[first]), tip, heel
-
-
-def _middle_mm(ink: NDArray[np.bool_], grid: Grid) -> float:
-    """The mean y of the ink."""
-    return float((ink.sum(axis=1) * grid.y_mm).sum() / ink.sum())

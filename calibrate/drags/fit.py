@@ -55,11 +55,10 @@ SPREADS = (2.2, 2.2, 2.2, 2.2, 5.0)
 """Width of the kernel in standard deviations of each of `COMMANDS` of the training strokes; the tilt matters little on
 real ink within 5 deg."""
 RIDGE = 1.0
-SESSION_MM = {"drift_x_mm": 1.0, "drift_y_mm": 1.0, "half_mm": 0.4}
-"""How far place and half width change from one session to another of the same brush (standard deviation)."""
-LEASH_MM = 2.0
+SESSION_MM = {"drift_x_mm": 1.0, "drift_y_mm": 1.0, "half_mm": 0.4, "leash_mm": 2.0}
+"""How far place, half width and leash change from one session to another of the same brush (standard deviation)."""
 GROWTH_MM = {"half_per_mm": 0.5, "leash_per_mm": 2.0, "drift_x_per_mm": 0.5, "drift_y_per_mm": 0.5}
-"""The same for the leash, and for the terms that grow with depth at the deepest stroke."""
+"""The same for the terms that grow with depth, at the deepest stroke."""
 STROKE_MM2 = 0.14
 """Weight of a square millimetre of wrong ink in such a fit. One stroke then determines the place to about 1 mm, as far
 as strokes of one session scatter."""
@@ -286,7 +285,7 @@ def different(commands: Floats, count: int) -> Indices:
 def session_change(commands: Floats) -> dict[str, float]:
     """How far each parameter of a brush fitted to these (B, 5) commands may change (standard deviation)."""
     deepest = max(float(commands[:, COMMANDS.index("depth_mm")].max()), 1e-3)
-    changes = SESSION_MM | {"leash_mm": LEASH_MM} | {name: mm / deepest for name, mm in GROWTH_MM.items()}
+    changes = SESSION_MM | {name: mm / deepest for name, mm in GROWTH_MM.items()}
     return {name: changes[name] for name in DragModel.names() if name in changes}
 
 

@@ -19,15 +19,14 @@ from rich.table import Table
 from brushloop.calibrate.artefact import made_by, put_to_use
 from brushloop.calibrate.commands import FitRequest
 from brushloop.calibrate.drags import Drags, read_drags
-from brushloop.calibrate.drags.fit import LAG, PREDICTED, DragArtefact, adapt_drags, fit_drags, model_of, predicted
+from brushloop.calibrate.drags.fit import PREDICTED, DragArtefact, adapt_drags, fit_drags, model_of, predicted
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written
 from brushloop.calibrate.report import BLUE, ORANGE, about, chart_uri, picture_grid, render, source_note, write_files
 from brushloop.calibrate.stats import CEILING, ceiling_values, pair_means, student_95
-from brushloop.model.drag import Floats
+from brushloop.model.drag import Floats, Indices
 from brushloop.model.similarity import binary_scores, inked_window
 from brushloop.sessions.disk import csv_text
-from brushloop.sessions.records import Header
 from brushloop.sessions.terminal import Progress, unseen
 
 MEASURED = "measured.csv"
@@ -36,54 +35,39 @@ MAX_WORST = 12
 
 
 @dataclass(frozen=True, slots=True)
-class Predicted:
-    """A stroke of a recording, and what a fit predicts of it."""
-
-    stroke_id: str
-    captured: NDArray[np.float32]
-    """(rows, columns) from 0 to 1 on the grid of the session."""
-    ink: NDArray[np.bool_]
-    """(rows, columns) predicted."""
-    fitted: bool
-    """Whether the fit was fitted to this stroke."""
-    scores: dict[str, tuple[float, float]]
-    """CSIM and IoU, from 0 to 1, by row of the report; no ceiling where the command was not repeated."""
-
-
-@dataclass(frozen=True, slots=True)
 class DragValidation:
     """What was measured in a recording of drags, and what a fit predicts of those that can be predicted."""
 
     drags: Drags
     fit: DragArtefact | None
-    strokes: list[Predicted]
-    """Empty without a fit."""
+    predicted: NDArray[np.bool_]
+    """(n, rows, columns) ink that the fit predicts of the placed strokes; like all that follows, empty without one."""
+    fitted: NDArray[np.bool_]
+    """(n,) whether the fit was fitted to a stroke."""
+    scores: dict[str, Floats]
+    """(n, 2) CSIM and IoU, from 0 to 1, by row of the report; no ceiling, but NaN, where no command was repeated."""
 
     @property
-    def header(self) -> Header:
-        """Where the strokes come from."""
-        return self.drags.session.header
-
-    @property
-    def scored(self) -> list[Predicted]:
+    def scored(self) -> Indices:
         """The strokes that the means are over: those that the fit has not seen, or all if it has seen all."""
-        return [stroke for stroke in self.strokes if not stroke.fitted] or self.strokes
+        return np.flatnonzero(~self.fitted | self.fitted.all())
 
     def means(self) -> dict[str, dict[str, float]]:
         """Mean CSIM, mean IoU, standard deviation of CSIM and number of strokes by row of the report."""
         rows: dict[str, dict[str, float]] = {}
-        for name in (PREDICTED, LAG, CEILING):
-            scores = np.array([stroke.scores[name] for stroke in self.scored if name in stroke.scores])
-            if len(scores):
-                csim, iou, csim_sd = np.round([*scores.mean(axis=0), scores[:, 0].std()], 6).tolist()
-                rows[name] = {"csim": csim, "iou": iou, "csim_sd": csim_sd, "strokes": len(scores)}
+        for name, scores in self.scores.items():
+            known = scores[self.scored[np.isfinite(scores[self.scored, 0])]]
+            if len(known):
+                csim, iou, csim_sd = np.round([*known.mean(axis=0), known[:, 0].std()], 6).tolist()
+                rows[name] = {"csim": csim, "iou": iou, "csim_sd": csim_sd, "strokes": len(known)}
         return rows
 
     def to_json(self, fit: DragArtefact) -> str:
         """All scores as JSON, with where ink and fit come from."""
+        header = self.drags.session.header
         contents = {
-            "session_id": self.header.session_id,
-            "source": str(self.header.source),
+            "session_id": header.session_id,
+            "source": str(header.source),
             "recording_sha256": self.drags.session.sha256,
             "fit": fit.digest,
             "fit_session": fit.session_id,
@@ -91,19 +75,23 @@ class DragValidation:
             "prior": fit.prior,
             "mm_per_px": fit.mm_per_px,
             "depth_at_the_ends": self.drags.ends,
-            "in_sample": all(stroke.fitted for stroke in self.strokes),
+            "in_sample": bool(self.fitted.all()),
             "over_all": self.means(),
             "left_out": [{"stroke_id": name, "why": why} for name, why in self.drags.left_out],
             "strokes": [
-                {"stroke_id": stroke.stroke_id, "in_sample": stroke.fitted, "scores": _rounded(stroke.scores)}
-                for stroke in self.strokes
+                {
+                    "stroke_id": drag.stroke.stroke_id,
+                    "in_sample": bool(self.fitted[k]),
+                    "scores": {
+                        name: {"csim": round(float(each[k, 0]), 6), "iou": round(float(each[k, 1]), 6)}
+                        for name, each in self.scores.items()
+                        if np.isfinite(each[k, 0])
+                    },
+                }
+                for k, drag in enumerate(self.drags.placed)
             ],
         }
         return json.dumps(contents, indent=1, ensure_ascii=False) + "\n"
-
-
-def _rounded(scores: dict[str, tuple[float, float]]) -> dict[str, dict[str, float]]:
-    return {name: {"csim": round(csim, 6), "iou": round(iou, 6)} for name, (csim, iou) in scores.items()}
 
 
 def validate_drags(session: Path, fit: Path | None, progress: Progress = unseen) -> DragValidation:
@@ -114,18 +102,14 @@ def validate_drags(session: Path, fit: Path | None, progress: Progress = unseen)
     artefact = None if fit is None else DragArtefact.read(fit)
     drags = read_drags(session, progress)
     if artefact is None:
-        return DragValidation(drags, None, [])
-    captured = drags.drawings.ink
+        return DragValidation(drags, None, np.zeros(0, bool), np.zeros(0, bool), {})
+    captured = drags.drawings.ink > 0.5
     rows = predicted(model_of(artefact.parameters), artefact.kept, drags, np.arange(len(captured)))
-    scores = {name: binary_scores(ink, captured > 0.5) for name, ink in rows.items()}
-    scores[CEILING] = _ceiling(drags.conditions, captured > 0.5)
+    scores = {name: binary_scores(ink, captured) for name, ink in rows.items()}
+    scores[CEILING] = _ceiling(drags.conditions, captured)
     known = artefact.fitted_strokes if artefact.recording_sha256 == drags.session.sha256 else ()
-    strokes: list[Predicted] = []
-    for k, drag in enumerate(drags.placed):
-        name = drag.stroke.stroke_id
-        own = {row: (float(each[k, 0]), float(each[k, 1])) for row, each in scores.items() if np.isfinite(each[k, 0])}
-        strokes.append(Predicted(name, captured[k], rows[PREDICTED][k], name in known, own))
-    return DragValidation(drags, artefact, strokes)
+    fitted = np.array([drag.stroke.stroke_id in known for drag in drags.placed])
+    return DragValidation(drags, artefact, rows[PREDICTED], fitted, scores)
 
 
 def _ceiling(conditions: NDArray[np.int64], truth: NDArray[np.bool_]) -> Floats:
@@ -133,8 +117,7 @@ def _ceiling(conditions: NDArray[np.int64], truth: NDArray[np.bool_]) -> Floats:
     pairs = np.full((len(truth), 2), np.nan)
     for number in np.unique(conditions):
         at = np.flatnonzero(conditions == number)
-        alike = truth[at]
-        pairs[at] = pair_means(len(at), lambda k, others, a=alike: binary_scores(a[others], a[[k] * len(others)]))
+        pairs[at] = pair_means(len(at), lambda k, others, a=truth[at]: binary_scores(a[others], a[[k] * len(others)]))
     return 0.01 * np.apply_along_axis(ceiling_values, 0, 100.0 * pairs, conditions)
 
 
@@ -143,20 +126,18 @@ def write_drags(validation: DragValidation, folder: Path, command: str) -> Path:
 
     Raises OSError.
     """
-    drags, header = validation.drags, validation.header
+    drags, header = validation.drags, validation.drags.session.header
     step = max(1, -(-len(drags.strokes) // MAX_THUMBNAILS))
     page = render(
         "drags.html.j2",
         **about(header),
         header=header,
         provenance=(("validated with", made_by()), ("command", command)),
-        drags=drags,
         width=width_sentence(drags),
         plot=_plot(drags) if drags.strokes else "",
         thumbnails=drags.strokes[::step],
-        means=validation.means(),
         validation=validation,
-        worst=list(_worst(validation)),
+        worst=list(_worst(validation)) if validation.fit else (),
     )
     files = {MEASURED: drags_csv(drags), "report.html": page}
     if validation.fit is not None:
@@ -183,11 +164,13 @@ def drags_csv(drags: Drags) -> str:
     return csv_text([*head, "cut", "flags", "source"], rows)
 
 
-def _worst(validation: DragValidation) -> Iterator[tuple[Predicted, NDArray[np.float32], NDArray[np.float32]]]:
-    """The strokes with the lowest CSIM among those scored, the worst first, and the images of their overlays."""
-    for stroke in sorted(validation.scored, key=lambda stroke: stroke.scores[PREDICTED][0])[:MAX_WORST]:
-        window = inked_window(stroke.ink, stroke.captured > 0.5, 0)
-        yield stroke, stroke.captured[window], stroke.ink[window].astype(np.float32)
+def _worst(validation: DragValidation) -> Iterator[tuple[str, Floats, NDArray[np.float32], NDArray[np.float32]]]:
+    """The strokes with the lowest CSIM among those scored, the worst first: name, scores, and images of an overlay."""
+    scores, drags = validation.scores[PREDICTED], validation.drags
+    for k in validation.scored[scores[validation.scored, 0].argsort(kind="stable")][:MAX_WORST]:
+        captured, drawn = drags.drawings.ink[k], validation.predicted[k]
+        window = inked_window(drawn, captured > 0.5, 0)
+        yield drags.placed[int(k)].stroke.stroke_id, scores[k], captured[window], drawn[window].astype(np.float32)
 
 
 def width_sentence(drags: Drags) -> str:
@@ -225,12 +208,12 @@ def _plot(drags: Drags) -> str:
 
 def summary(validation: DragValidation) -> Iterator[Table | str]:
     """What is printed about a session: lines and tables."""
-    drags, header = validation.drags, validation.header
+    drags, header = validation.drags, validation.drags.session.header
     yield f"{header.session_id}: {source_note(header.source)}"
     yield f"{len(drags.strokes)} strokes measured: {MEASURED} has length, width and area beside the commanded values"
     yield width_sentence(drags)
     if means := validation.means():
-        over = "from a fit to these strokes" if validation.scored[0].fitted else "from a fit to other strokes"
+        over = "from a fit to these strokes" if validation.fitted.all() else "from a fit to other strokes"
         table = Table("", "n", "CSIM", "sd", "IoU", title=f"averages, {over}, percent ({header.source})")
         for name, row in means.items():
             percent = (f"{100 * row[measure]:.2f}" for measure in ("csim", "csim_sd", "iou"))

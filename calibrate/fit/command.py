@@ -213,23 +213,17 @@ def fit_press_session(request: FitRequest, progress: Progress = unseen, opened: 
 
 def _write_page(result: FitResult, press: FittedPress) -> None:
     """Write the page of the fit. Raises OSError."""
-    session, presses = result.session, result.presses
-    header, published = session.header, FittedPress(presses.radius_mm, presses.length_mm)
+    presses, header = result.presses, result.session.header
+    published = FittedPress(presses.radius_mm, presses.length_mm)
     write_page(
         result.page,
         "fit.html.j2",
         **about(header),
-        session=session,
+        result=result,
         window=SHOWN_MM,
-        conditions=[_picture(presses, at, numbers, press, published) for at, numbers in presses.conditions.items()],
-        presses=len(presses),
+        conditions={at: _picture(presses, at, numbers, press, published) for at, numbers in presses.conditions.items()},
         trust=[source_point(header.source), *_trust(result)],
         chart=_chart(presses, press, header),
-        measured=result.sizes,
-        middle="{:g} mm, {:g}°".format(*presses.middle),
-        held_out=result.held_out,
-        refused=result.left_out,
-        px_mm=presses.grid.px_mm,
         provenance=(("fitted with", made_by()), ("artefact", result.path.name)),
     )
 
@@ -245,8 +239,6 @@ def _picture(
         if drawn.any():
             alike = [csim(drawn, seen) for seen in np.asarray(ink > 0.5, np.float32) if seen.any()]
     return {
-        "depth_mm": f"{condition[0]:g}",
-        "tilt_deg": f"{condition[1]:g}",
         "presses": len(numbers),
         "ink": ink.mean(axis=0).astype(np.float32)[SHOWN_ROWS],
         "fitted": _path(press, condition),

@@ -116,11 +116,8 @@ def held_out_scores(predicted: Sequence[Predicted], models: Sequence[str]) -> li
     percent = {name: np.full((len(conditions), len(KEYS), 2), np.nan) for name in (CEILING, *models)}
     for number, (ink, images) in enumerate(predicted):
         inks, rows = np.where(ink > 0.5, 1.0, 0.0), conditions == number
-
-        def score(k: int, others: list[int], inks: Floats = inks) -> Floats:
-            return similarity(inks[k], inks[others], Alignment.MM)
-
-        percent[CEILING][rows, MM_BINARY] = 100.0 * pair_means(len(inks), score)
+        pairs = pair_means(len(inks), lambda k, others, inks=inks: similarity(inks[k], inks[others], Alignment.MM))
+        percent[CEILING][rows, MM_BINARY] = 100.0 * pairs
         for name, image in images.items():
             drawn = np.where(image > 0.5, 1.0, 0.0)
             percent[name][rows, MM_BINARY] = 100.0 * similarity(drawn, inks, Alignment.MM)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
@@ -20,7 +20,6 @@ from brushloop.calibrate.compare import SIZE_PX, Image
 from brushloop.calibrate.errors import CalibrationError, invalid
 from brushloop.calibrate.files import Written
 from brushloop.calibrate.report import BLUE, picture_grid, save_picture, write_files
-from brushloop.calibrate.session import OpenSession
 from brushloop.model.ccdbsm import Brush, DomainError
 from brushloop.model.characters.glyph import CHARACTERS, parse_glyph, paths_of, reference
 from brushloop.model.characters.plan import Patch, Reach, StrokePath, covered, drawn, first_lead, lead
@@ -204,14 +203,6 @@ def recorded_figures(header: Header) -> dict[str, list[Floats]]:
         raise CalibrationError(header.session_id, "was not collected by a `write` protocol") from None
 
 
-def check_drawn_from(plan: Plan, session: OpenSession) -> None:
-    """Check that the session's protocol drew the plan. Raises `CalibrationError` otherwise."""
-    commanded = {figure.name: figure.commanded for figure in plan.figures}
-    for name, strokes in recorded_figures(session.header).items():
-        if commanded.get(name) != as_points(strokes):
-            raise CalibrationError(str(session.recording.path), f"{name!r} was not written from this plan")
-
-
 def code_points(name: str) -> str:
     """A name with code points for Chinese characters, since most machines have no font that shows them."""
     return " ".join(f"U+{ord(c):04X}" if ord(c) > 0x2E7F else c for c in name)
@@ -221,12 +212,6 @@ def as_points(strokes: Sequence[Floats]) -> Points:
     """Convert trajectories (N, 5) to points, rounded like the protocol to 0.001."""
     rounded = (np.round(stroke, 3).tolist() for stroke in strokes)
     return tuple(tuple((x, y, depth, tilt, heading) for x, y, depth, tilt, heading in stroke) for stroke in rounded)
-
-
-def as_medians(paths: Sequence[StrokePath]) -> Medians:
-    """Convert paths with their half widths."""
-    arrays = (np.column_stack((path.points, path.half_width_mm)).tolist() for path in paths)
-    return tuple(tuple((x, y, half) for x, y, half in array) for array in arrays)
 
 
 def plan(request: PlanRequest, _progress: Progress = unseen) -> Written:
@@ -260,15 +245,12 @@ def plan(request: PlanRequest, _progress: Progress = unseen) -> Written:
     figures = tuple(figure for figure, _ in planned)
     record = Plan(model=label, planned_by=by, cell_mm=patch.side_mm, software=made_by(), figures=figures)
     protocol = write_plan(record, request.repeats, request.out)
-    return Written(protocol, (*_said(planned, simulated), str(protocol), str(request.out / PICTURE)))
-
-
-def _said(planned: Sequence[tuple[Figure, Image]], simulated: str) -> Iterator[str]:
-    yield f"simulated without ink by {simulated}"
+    said = [f"simulated without ink by {simulated}"]
     for figure, first in planned:
-        points = sum(len(stroke) for stroke in figure.commanded)
+        points = sum(map(len, figure.commanded))
         scores = f"first plan {_likeness(figure, first)}; refined {_likeness(figure, figure.simulated)}"
-        yield f"{figure.name}: {len(figure.commanded)} strokes, {points} points, ink = 1: {scores}"
+        said.append(f"{figure.name}: {len(figure.commanded)} strokes, {points} points, ink = 1: {scores}")
+    return Written(protocol, (*said, str(protocol), str(request.out / PICTURE)))
 
 
 def _likeness(figure: Figure, image: Image) -> str:
@@ -326,8 +308,10 @@ def _character(name: str, data: Path | None, patch: Patch) -> Figure:
     except ValueError as error:
         raise CalibrationError(str(path), str(error)) from None
     source = SHIPPED_SOURCE if data is None else data.name
-    medians = as_medians(paths_of(strokes, patch, STEP_MM))
-    return Figure(name=name, source=source, medians=medians, wanted=reference(strokes, patch))
+    paths = paths_of(strokes, patch, STEP_MM)
+    medians = [np.column_stack((path.points, path.half_width_mm)).tolist() for path in paths]
+    fields = {"name": name, "source": source, "medians": medians, "wanted": reference(strokes, patch)}
+    return Figure.model_validate(fields)
 
 
 def draw(planned: Sequence[tuple[Figure, Image]], side_mm: float, path: Path) -> None:

@@ -15,21 +15,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from brushloop.calibrate import compare as images
 from brushloop.calibrate.artefact import Frozen, made_by
 from brushloop.calibrate.commands import CompareWrittenRequest
-from brushloop.calibrate.compare import (
-    ROBOT_WRITING,
-    SIZE_PX,
-    TABLE_3,
-    Alignment,
-    Image,
-    Polarity,
-    Tone,
-    averaged,
-    shrunk,
-    similarity,
-    to_tone,
-)
+from brushloop.calibrate.compare import SIZE_PX, Alignment, Image, Polarity, Tone
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.files import Written
 from brushloop.calibrate.presses import Refused, prepare_patch
@@ -37,7 +26,7 @@ from brushloop.calibrate.report import Sealed, about, data_uri, overlay, picture
 from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.calibrate.stats import Floats, Summary, pair_means, summarise
 from brushloop.calibrate.stroke.preprocess import Prepared
-from brushloop.calibrate.writing import Figure, Plan, Round, check_drawn_from, code_points, load_plan
+from brushloop.calibrate.writing import Figure, Plan, Round, as_points, code_points, load_plan, recorded_figures
 from brushloop.model.characters.plan import Phase, phase_map
 from brushloop.model.similarity import SSIM_SETTINGS
 from brushloop.sessions.disk import check_writable, csv_text
@@ -56,7 +45,7 @@ SIMULATED, REFERENCE = "captured, simulated", "captured, reference"
 PLANNED, ANOTHER = "simulated, reference", "captured, another writing"
 PAIRS = (SIMULATED, REFERENCE, PLANNED, ANOTHER)
 """The comparisons made."""
-PAPER_ROWS = {SIMULATED: TABLE_3["ccd-bsmg"], REFERENCE: TABLE_3[ROBOT_WRITING]}
+PAPER_ROWS = {SIMULATED: images.TABLE_3["ccd-bsmg"], REFERENCE: images.TABLE_3[images.ROBOT_WRITING]}
 """The paper's row shown with a comparison: our reading, see `TABLE_3`."""
 NORMAL_SIDE_PX = 100
 
@@ -177,11 +166,13 @@ def compare_written(path: Path, plan: Plan, progress: Progress = unseen) -> Writ
     Raises `CalibrationError` if the two do not belong together or nothing can be compared.
     """
     session, refused = open_session(path), list[Refused]()
-    check_drawn_from(plan, session)
-    writings: dict[str, dict[str, Ink]] = {}
-    cut = list[str]()
+    commanded = {figure.name: figure.commanded for figure in plan.figures}
+    for name, strokes in recorded_figures(session.header).items():
+        if commanded.get(name) != as_points(strokes):
+            raise CalibrationError(str(session.recording.path), f"{name!r} was not written from this plan")
+    writings, cut = dict[str, dict[str, Ink]](), list[str]()
     for stroke_id, name, prepared in read_writings(session, refused, progress):
-        ink = {Tone.BINARY: shrunk(prepared.mask.astype(np.float32)), Tone.GRAY: shrunk(prepared.soft)}
+        ink = {Tone.BINARY: images.shrunk(prepared.mask.astype(np.float32)), Tone.GRAY: images.shrunk(prepared.soft)}
         writings.setdefault(name, {})[stroke_id] = ink
         if prepared.cut:
             cut.append(stroke_id)
@@ -215,8 +206,8 @@ def read_writings(
 def compare_ink(fixed: Ink, moving: Ink, key: Key) -> Floats:
     """(2,) CSIM and SSIM of the ink of two patches. Raises ValueError for a blank one."""
     alignment, tone, polarity = key
-    one, other = (to_tone(aligned(ink[tone], alignment), tone) for ink in (fixed, moving))
-    return similarity(one, other[None], alignment, polarity)[0]
+    one, other = (images.to_tone(aligned(ink[tone], alignment), tone) for ink in (fixed, moving))
+    return images.similarity(one, other[None], alignment, polarity)[0]
 
 
 def aligned(ink: Image, alignment: Alignment) -> Image:
@@ -228,7 +219,7 @@ def aligned(ink: Image, alignment: Alignment) -> Image:
         raise ValueError("holds no ink")
     step_px = float(1 + max(np.ptp(rows), np.ptp(columns))) / NORMAL_SIDE_PX
     left, top = (0.5 * float(at[0] + at[-1] + 1 - SIZE_PX * step_px) for at in (columns, rows))
-    return averaged(ink, (left, top), step_px, SIZE_PX, fine=1).clip(0.0, 1.0)
+    return images.averaged(ink, (left, top), step_px, SIZE_PX, fine=1).clip(0.0, 1.0)
 
 
 def round_of(character: Character, side_mm: float) -> Round:
@@ -325,8 +316,7 @@ def draw(written: WritingComparison, path: Path) -> None:
         )
         for axis, (text, image) in zip(axes, parts, strict=True):
             axis.set_title(text, fontsize=8, pad=2)
-            axis.set_xticks([])
-            axis.set_yticks([])
+            axis.set(xticks=[], yticks=[])
             ink = 1 - image if image.ndim == 2 else image
             axis.imshow(ink, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
     save_picture(figure, path)

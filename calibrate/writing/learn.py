@@ -19,6 +19,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from brushloop.calibrate import writing
 from brushloop.calibrate.artefact import made_by, put_to_use
 from brushloop.calibrate.commands import FitFootprintRequest, LearnRequest, PracticeRequest
 from brushloop.calibrate.compare import Image
@@ -27,30 +28,10 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written
 from brushloop.calibrate.session import open_session
 from brushloop.calibrate.stroke.preprocess import PX_PER_MM
-from brushloop.calibrate.writing import (
-    Figure,
-    FootprintArtefact,
-    Plan,
-    PlannedBy,
-    Round,
-    as_points,
-    load_plan,
-    recorded_figures,
-    write_plan,
-)
+from brushloop.calibrate.writing import Figure, FootprintArtefact, Plan, PlannedBy, Round, as_points
 from brushloop.calibrate.writing.compare import WritingComparison, compare_written, read_writings, round_of
-from brushloop.model.characters.plan import (
-    LATER_SPREADS_MM,
-    Phase,
-    Reach,
-    covered,
-    directions,
-    drawn,
-    grid,
-    lead,
-    phase_map,
-    without_tilt,
-)
+from brushloop.model.characters import plan as trajectories
+from brushloop.model.characters.plan import Phase, Reach, without_tilt
 from brushloop.model.drag import NAMES, Drawings, Floats, Footprint, fit_each, fit_footprint, inked
 from brushloop.model.similarity import binary_scores
 from brushloop.sessions.disk import check_writable
@@ -89,7 +70,7 @@ def fit(request: FitFootprintRequest, progress: Progress = unseen) -> Written:
     Raises `CalibrationError` if the session is an import, or holds too few strokes.
     """
     opened, refused = open_session(request.session, "drag"), list[tuple[str, str]]()
-    figures, cell_mm = recorded_figures(opened.header), opened.strokes[0].cell_mm
+    figures, cell_mm = writing.recorded_figures(opened.header), opened.strokes[0].cell_mm
     assert cell_mm is not None  # as every stroke that a protocol of figures drew has
     strokes, ink = list[list[Floats]](), list[Image]()
     for stroke_id, name, prepared in read_writings(opened, refused, progress):
@@ -144,7 +125,7 @@ def practice(request: PracticeRequest, _progress: Progress = unseen) -> Written:
         for number in range(FIGURES)
     )
     plan = Plan(model="none: practice", planned_by=by, cell_mm=request.cell_mm, software=made_by(), figures=figures)
-    protocol = write_plan(plan, 1, request.out)
+    protocol = writing.write_plan(plan, 1, request.out)
     return Written(protocol, (str(protocol),))
 
 
@@ -163,7 +144,7 @@ def practice_strokes(side_mm: float, reach: Reach, brush_length_mm: float) -> li
         heading = rng.uniform(-180.0, 180.0) + np.cumsum(rng.normal(0.0, 8.0, count))
         if len(out) % 3 == 0:
             heading[count // 2 :] += rng.choice([-1.0, 1.0]) * rng.uniform(50.0, 150.0)
-        places = np.cumsum(directions(heading) * length_mm / count, axis=0)
+        places = np.cumsum(trajectories.directions(heading) * length_mm / count, axis=0)
         low, high = places.min(axis=0), places.max(axis=0)
         places += MARGIN * side_mm - low + rng.uniform(0.0, 1.0, 2) * np.maximum(room_mm - (high - low), 0.0)
         depths = rng.uniform(0.1, 1.0, 3) * deepest_mm
@@ -178,10 +159,10 @@ def practice_strokes(side_mm: float, reach: Reach, brush_length_mm: float) -> li
 def learn(request: LearnRequest, progress: Progress = unseen) -> Written:
     """Make the next plan from what the ink of this one showed. Raises `CalibrationError`."""
     check_writable(request.out)
-    following = learned(compare_written(request.session, load_plan(request.plan), progress))
+    following = learned(compare_written(request.session, writing.load_plan(request.plan), progress))
     settled = request.settled_repeats is not None and all(figure.settled for figure in following.figures)
     repeats = (request.settled_repeats if settled else None) or request.repeats
-    protocol = write_plan(following, repeats, request.out)
+    protocol = writing.write_plan(following, repeats, request.out)
     said = [
         f"{figure.name}: CSIM {figure.rounds[-1].csim_percent:.2f}, ink = 1, mm"
         + ("; no further round helps: the best one is kept" if figure.settled else "")
@@ -212,7 +193,7 @@ def learned(written: WritingComparison) -> Plan:
 def drawings_of(strokes: Sequence[Sequence[Floats]], ink: Sequence[Image], side_mm: float) -> Drawings:
     """The strokes, (N, 5) each, that were commanded on every patch, and the ink (S, S) that they left."""
     paths = [[without_tilt(points) for points in of_patch] for of_patch in strokes]
-    return Drawings.of(paths, np.stack(ink), *grid(side_mm, len(ink[0])))
+    return Drawings.of(paths, np.stack(ink), *trajectories.grid(side_mm, len(ink[0])))
 
 
 def _after(figure: Figure, last: Round) -> Figure:
@@ -227,11 +208,13 @@ def _after(figure: Figure, last: Round) -> Figure:
 def _corrected(figure: Figure, captured: Image, footprint: Footprint, reach: Reach, side_mm: float) -> Figure:
     strokes, size_px = figure.strokes, len(captured)
     footprints = fit_each(drawings_of([strokes], [captured], side_mm), footprint)
-    miss = missed(captured, drawn(footprints, strokes, side_mm, size_px), side_mm)
+    miss = missed(captured, trajectories.drawn(footprints, strokes, side_mm, size_px), side_mm)
     miss *= GAIN * _trust(figure, side_mm, size_px)
-    near = LATER_SPREADS_MM
-    moved = lead(footprints, strokes, figure.wanted, side_mm, reach, added_mm=miss, spreads_mm=near, held=HELD)
-    simulated = covered(drawn(footprints, moved, side_mm, size_px) + miss, side_mm)
+    near = trajectories.LATER_SPREADS_MM
+    moved = trajectories.lead(
+        footprints, strokes, figure.wanted, side_mm, reach, added_mm=miss, spreads_mm=near, held=HELD
+    )
+    simulated = trajectories.covered(trajectories.drawn(footprints, moved, side_mm, size_px) + miss, side_mm)
     return figure.model_copy(update={"commanded": as_points(moved), "simulated": simulated})
 
 
@@ -253,4 +236,4 @@ def _trust(figure: Figure, side_mm: float, size_px: int) -> Floats:
         return np.ones((size_px, size_px))
     before, now = (each.lost_percent for each in figure.rounds[-2:])
     factors = [WORSE if now.get(phase, 0.0) > before.get(phase, 0.0) else 1.0 for phase in Phase]
-    return np.array(factors)[phase_map(figure.paths, side_mm, size_px)]
+    return np.array(factors)[trajectories.phase_map(figure.paths, side_mm, size_px)]
