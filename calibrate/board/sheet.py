@@ -105,6 +105,8 @@ def print_sheet(request: SheetRequest, _progress: Progress = unseen) -> Written:
     if request.page not in PAGES:
         raise CalibrationError(f"page {request.page!r}", f"is not one of {', '.join(PAGES)}")
     check_target(path, ".pdf")
+    if not path.parent.is_dir():
+        raise CalibrationError(str(path), f"there is no folder {path.parent}")
     for target in (path, table):
         if target.exists():
             raise CalibrationError(str(target), "exists already and is not overwritten")

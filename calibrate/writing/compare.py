@@ -245,6 +245,19 @@ def summary(written: WritingComparison) -> Iterator[str]:
         if row.polarity is Polarity.INK and row.tone is Tone.BINARY:
             csim, ssim = ("{:.2f} / {:.2f} / {:.2f}".format(*of.range_and_avg) for of in (row.csim, row.ssim))
             yield f"{row.character} {row.alignment}, {row.pair}: CSIM {csim}, SSIM {ssim}"
+    yield from agreement(written)
+
+
+def agreement(written: WritingComparison) -> Iterator[str]:
+    """A sentence for each character: how alike writing and model are, and how alike two writings of one plan are."""
+    for character in written.characters:
+        scores = (character.scores[pair, (Alignment.MM, Tone.BINARY, Polarity.PAPER)] for pair in (SIMULATED, ANOTHER))
+        model, writing = (summarise(100.0 * each[:, 1]) for each in scores)
+        if model is not None and writing is not None:
+            yield (
+                f"{character.figure.name}: with paper as 1, the writings reach an SSIM of {model.avg:.1f} % with the "
+                f"simulated image, and of {writing.avg:.1f} % with each other (mm, binary)."
+            )
 
 
 def write_written(written: WritingComparison, folder: Path, command: str) -> Path:
@@ -273,6 +286,7 @@ def write_written(written: WritingComparison, folder: Path, command: str) -> Pat
         ways=list(itertools.product(Tone, (Alignment.SIZE_NORMALISED, Alignment.MM))),
         order=list(itertools.product(PAIRS, Polarity)),
         paper_rows=PAPER_ROWS,
+        agreement=list(agreement(written)),
         rounds=[[*each.figure.rounds, round_of(each, plan.cell_mm)] for each in written.characters],
         phases=[str(phase) for phase in Phase],
         ssim_settings=SSIM_SETTINGS,
