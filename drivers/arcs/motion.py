@@ -207,7 +207,7 @@ async def queue_all(
     if size > len(lines):
         raise PathDisturbed(DEVICE, "sequence", f"the controller holds {size} lines, but {len(lines)} were sent")
     if size < len(lines):
-        raise _not_begun(f"the controller holds only {size} of {len(lines)} lines of the path")
+        raise _not_begun(f"the controller holds {size} of {len(lines)} lines of the path")
     if not rests:
         raise _not_begun("the controller does not hold its path: the arm moved before its path was released")
     go()
