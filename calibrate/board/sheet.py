@@ -28,7 +28,7 @@ EDGE_MM, STRIP_MM, LABEL_MM = 8.0, 12.0, 3.0
 """Unprinted edge of the page; height of the rows of marks, and of the line above each box that has its number."""
 MARK_MM, MARKS = 10.0, 5
 """Side of a mark, and the number of marks in each of the two rows."""
-DICTIONARY = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+DICTIONARY = cv2.aruco.DICT_4X4_50
 TOUCH_MM = 8.0
 """From a box's right edge to its touch point, at half of its height: marks extend to the left."""
 INSET_MM = 0.6
@@ -136,7 +136,7 @@ def drawn_sheet(layout: Layout) -> Any:
     axes.axis("off")
     for number, corners in layout.marks().items():
         (left, top), (right, bottom) = corners[0], corners[2]
-        bits = cv2.aruco.generateImageMarker(DICTIONARY, number, 6)
+        bits = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(DICTIONARY), number, 6)
         axes.imshow(bits, cmap="gray", extent=(left, right, bottom, top), interpolation="nearest", aspect="auto")
     planned, small = layout.planned(), {"fontsize": 6.0, "va": "bottom"}
     for name, (x, y, wide, tall) in layout.boxes().items():
@@ -237,7 +237,7 @@ def _stretch(layout: Layout, measured_mm: tuple[float, float] | None) -> tuple[f
     across, along = layout.printed_mm
     stretch = (1.0, 1.0) if measured_mm is None else (measured_mm[0] / across, measured_mm[1] / along)
     for axis, value, drawn in zip(("across", "along"), stretch, layout.printed_mm, strict=True):
-        if abs(value - 1.0) > MOST_DRIFT:
+        if not abs(value - 1.0) <= MOST_DRIFT:  # NaN too
             allowed = f"{(1 - MOST_DRIFT) * drawn:.1f} to {(1 + MOST_DRIFT) * drawn:.1f}"
             raise CalibrationError("--measured-mm", f"{axis}: {value * drawn:g} mm, allowed {allowed}")
     return stretch
@@ -245,9 +245,9 @@ def _stretch(layout: Layout, measured_mm: tuple[float, float] | None) -> tuple[f
 
 def _marks_in(image: Gray) -> dict[int, Floats]:
     """The number and the (4, 2) corners of each mark that is seen, in pixels."""
-    parameters = cv2.aruco.DetectorParameters()
+    dictionary, parameters = cv2.aruco.getPredefinedDictionary(DICTIONARY), cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    quads, numbers, _ = cv2.aruco.ArucoDetector(DICTIONARY, parameters).detectMarkers(image)
+    quads, numbers, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(image)
     if not quads:
         return {}  # OpenCV then has no numbers, whatever its types say
     pairs = zip(np.ravel(np.asarray(numbers)).tolist(), quads, strict=True)

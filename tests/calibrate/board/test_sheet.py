@@ -180,8 +180,9 @@ def test_a_command_names_the_boxes_that_do_not_agree_and_ends_with_code_3(tmp_pa
         (lambda image: cv2.resize(image, None, fx=0.4, fy=0.4, interpolation=cv2.INTER_AREA), None, "159 dpi; 200 are"),
         (lambda image: _photographed(image), None, "lay the sheet flat on a scanner"),
         (lambda image: image, (28.1, 194.0), "--measured-mm: across: 28.1 mm, allowed 272.6 to 289.4"),
+        (lambda image: image, (281.0, math.nan), "--measured-mm: along: nan mm, allowed"),
     ],
-    ids=["another page", "mirrored", "half of it", "coarse", "a photograph", "centimetres"],
+    ids=["another page", "mirrored", "half of it", "coarse", "a photograph", "centimetres", "no number"],
 )
 def test_what_is_no_scan_of_a_sheet_is_refused_in_one_line(blank_scan, change, measured_mm, message):
     with pytest.raises(CalibrationError, match=message.replace("(", r"\(")):
