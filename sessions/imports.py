@@ -125,7 +125,9 @@ def read_table(folder: Path, path: Path, options: ImportOptions) -> list[tuple[P
             if len(cells) != len(names):
                 raise ValueError(f"{len(cells)} fields, expected {len(names)}")
             fields = dict(zip(names, _texts(cells), strict=True))
-            image = _image(folder, fields[file] + ending)
+            image = _image(folder, fields[file], ending)
+            if image is None:
+                raise ValueError(f"{file} {fields[file][:80]!r} is not in {folder.name}/")
             name = fields.get("name", image.relative_to(folder).with_suffix("").as_posix())
             if "name" in fields and not 0 < len(name) <= MAX_NAME_CHARS:
                 raise ValueError(f"column `name`: {name[:80]!r}, allowed: 1 to {MAX_NAME_CHARS} characters")
@@ -196,13 +198,10 @@ def _stroke(name: str, still: int, values: dict[str, float], options: ImportOpti
         raise ValueError(f"column `{problem['loc'][0]}`: {problem['input']}, {problem['msg'].lower()}") from None
 
 
-def _image(folder: Path, name: str) -> Path:
-    """Path of a photograph, with links resolved. Raises `ValueError` where it is not in the folder."""
+def _image(folder: Path, name: str, ending: str) -> Path | None:
+    """Path of a photograph, with links resolved; None where it is not in the folder."""
     try:
-        image = (folder / name).resolve()
-        inside = image.is_relative_to(folder) and image.is_file()
+        image = (folder / (name + ending)).resolve()
+        return image if image.is_relative_to(folder) and image.is_file() else None
     except (OSError, RuntimeError):
-        image, inside = folder, False  # the name is too long, or links form a loop
-    if not inside:
-        raise ValueError(f"file {name[:80]!r} is not in {folder.name}/")
-    return image
+        return None  # the name is too long, or links form a loop

@@ -221,3 +221,9 @@ def test_a_table_of_boxes_needs_a_scan_and_a_page_must_be_known(tmp_path, table)
         print_sheet(SheetRequest(tmp_path / "x.pdf", "a5"))
     line = refused("sessions", "import", tmp_path, "--csv", table, "--out", tmp_path / "x")
     assert "column `file` is missing" in line
+    scan = tmp_path / "scan.png"
+    cv2.imwrite(str(scan), Scanned().image())
+    table.write_text("box,depth_mm,tilt_deg\nK1,11,0\n")
+    line = refused("sessions", "import", scan, "--csv", table, "--out", tmp_path / "x")
+    assert line.endswith("sheet.csv: line 2: box 'K1' is not in scan.png/")
+    assert not (tmp_path / "x").exists()
