@@ -140,7 +140,9 @@ class FitRequest:
 
     session: Annotated[Path, Argument(help="A session of presses, or of drags: its folder or its .mcap file.")]
     prior: Annotated[Path | None, Option(help="An earlier fit of drags with this brush, to be adapted.")] = None
-    strokes: Annotated[int | None, Option(min=1, help="With --prior: number of differing strokes to adapt to.")] = None
+    strokes: Annotated[
+        int | None, Option(min=1, help="With --prior: number of strokes to adapt to, chosen to differ widely.")
+    ] = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -112,7 +112,7 @@ def doctor(
 
 @rig_app.command()
 def new(
-    rig: Annotated[Path, typer.Argument(help="The rig.toml to write; values so far are kept beside it.")] = RIG_FILE,
+    rig: Annotated[Path, typer.Argument(help="The rig.toml to write; values taught are saved beside it.")] = RIG_FILE,
     arm: StepArm = False,
 ) -> None:
     """Guide you through the first day, from an unboxed arm to a rig.toml. Run it again to resume."""
@@ -138,7 +138,7 @@ def _commission(rig: Path, step: str | None, *, arm: bool) -> None:
     from brushloop.drivers.host import Clock
 
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
-        raise ConfigError("rig", "", "the first day needs a screen: run this command in a terminal")
+        raise ConfigError("rig", "", "the first-day guide needs a screen: run this command in a terminal")
 
     visit = Visit(rig, Clock(), armed=arm)
 

@@ -24,7 +24,7 @@ def as_batch(*values: Array) -> tuple[Array, ...]:
     """All values as float64 arrays (B,), broadcast to each other. Raises ValueError for more than one dimension."""
     batch = [np.atleast_1d(np.asarray(value, np.float64)) for value in values]
     if any(part.ndim > 1 for part in batch):
-        raise ValueError(f"stroke parameters are scalars or (B,), got shapes {[part.shape for part in batch]}")
+        raise ValueError(f"stroke parameters: scalars or shape (B,), got shapes {[part.shape for part in batch]}")
     return tuple(np.broadcast_arrays(*batch))
 
 

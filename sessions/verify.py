@@ -353,7 +353,7 @@ def _judge_file(
         try:
             check_digest(evidence.folder / name, listed.sha256)
             if file is not None and not problems and dict(file.counts) != listed.counts:
-                problems = [f"holds {dict(file.counts)}, but the journal says {listed.counts}"]
+                problems = [f"holds messages {dict(file.counts)}, but the journal says {listed.counts}"]
         except SessionDamaged as error:
             why = verdict.damaged[name] = "; ".join(problems) or error.what
             lost = Counter[str]() if file is None else Counter(listed.counts) - file.counts

@@ -213,7 +213,9 @@ def fit_lens(
     ways = held(normals)
     fewest = min(int(ways.max()), int(held(nominal_normals(kept)).max())) + 1
     if fewest < LEAST_VIEWS:
-        problem = f"{len(kept)} usable views, but the board is held at {fewest} angles, at least {LEAST_VIEWS} needed"
+        problem = (
+            f"{len(kept)} usable views; different angles of the board: {fewest}, at least {LEAST_VIEWS} are needed"
+        )
         raise CalibrationError(where, "; ".join([f"{problem}: slant the board to other sides", *useless]))
     slants = {v.name: float(s) for v, s in zip(kept, np.degrees(np.arccos(normals[:, 2])), strict=True)}
     warnings = [f"{view.name}: {flag}" for view in kept for flag in view.flags]

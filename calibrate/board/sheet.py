@@ -118,7 +118,7 @@ def print_sheet(request: SheetRequest, _progress: Progress = unseen) -> Written:
     across, along = layout.printed_mm
     said = (
         f"{path}: {len(layout.boxes())} boxes. Print at 100 %.",
-        f"{table}: what to press in each box. Write down what you pressed, and remove the rows of boxes left blank.",
+        f"{table}: what to press in each box. Change it to what you pressed, and remove the rows of boxes left blank.",
         f"Measure the print between the outer edges of its marks: {across:g} mm across and {along:g} mm along if the "
         "printer is exact.",
     )

@@ -242,7 +242,7 @@ def fit_lines(drags: Drags, artefact: DragArtefact) -> Iterator[Any]:
     label, note = about(drags.session.header).values()
     yield f"{note}; {len(artefact.fitted_strokes)} dragged strokes"
     yield from (f"left out: {name}: {why}" for name, why in drags.left_out)
-    yield f"depth at both ends: {drags.ends or 'as in the middle, because the table gives no depth at the ends'}"
+    yield f"depth at both ends: {drags.ends or 'the same as in the middle, because the table gives none for the ends'}"
     if artefact.prior:
         adapted = ", ".join(artefact.refitted)
         yield f"Adapted from the brush of {artefact.prior_session} (fit {artefact.prior}): {adapted}."

@@ -294,7 +294,7 @@ def _trust(result: FitResult) -> Iterator[Point]:
         yield Point(None, "No combination was pressed twice, so the repeatability of the brush is not known here.")
     else:
         span = "" if csim.below_interval is None else " (95 % {:.1f} to {:.1f})".format(*csim.below_interval)
-        words = f"On presses left out of the fit, its CSIM is {csim.below_ceiling:.1f} points{span} below the ceiling"
+        words = f"On presses left out of it, the fit's CSIM is {csim.below_ceiling:.1f} points{span} below the ceiling"
         words += f", over the {csim.below_n} of {csim.n} presses with a ceiling" if csim.below_n < csim.n else ""
         yield Point(is_near(csim.below_ceiling, csim.below_interval), f"{words}; up to {NEAR_POINTS:g} points is near.")
     yield Point(None, "The pictures above show presses that were fitted; judge the fit by the held-out scores.")

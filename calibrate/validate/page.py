@@ -241,7 +241,7 @@ def verdict(report: Report) -> str:
     avg = csim.avg if csim.below_avg is None else csim.below_avg
     says = f"{_label(report, report.shown)} predicts presses{unseen} with an average CSIM of {avg:.1f} %{part}"
     if csim.below_ceiling is None:
-        return f"It cannot be said, because no condition was pressed twice and so there is no ceiling. {says}."
+        return f"It cannot be said: no condition was pressed twice, so there is no ceiling. {says}."
     top = avg + csim.below_ceiling
     below = round(top, 1) - round(avg, 1)  # so that the printed numbers add up
     span = "" if csim.below_interval is None else " (95 % interval: {:.1f} to {:.1f})".format(*csim.below_interval)

@@ -255,8 +255,8 @@ def agreement(written: WritingComparison) -> Iterator[str]:
         model, writing = (summarise(100.0 * each[:, 1]) for each in scores)
         if model is not None and writing is not None:
             yield (
-                f"{character.figure.name}: with paper as 1, the writings reach an SSIM of {model.avg:.1f} % with the "
-                f"simulated image, and of {writing.avg:.1f} % with each other (mm, binary)."
+                f"{character.figure.name}: SSIM {model.avg:.1f} % between the writings and the simulated image, "
+                f"{writing.avg:.1f} % between the writings (mm, binary, paper as 1)."
             )
 
 

@@ -53,7 +53,7 @@ class Writing:
         for number in range(1, request.learn + 1):
             plan = self._learn(plan, number)
             if all(figure.settled for figure in load_plan(plan).figures):
-                say("The last round improved no character. The best plans are now written.")
+                say("The last round improved no character. Next, the best plans are written.")
                 break
         session = self._written(plan, request.repeats)
         return self._compare(session, plan, request.out)

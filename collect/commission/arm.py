@@ -162,7 +162,7 @@ class ArmStep(Step):
                 tone="warning",
             )
         as_set, (payload_kg, *cog_mm) = "as set on the pendant", settings.payload
-        question = "The payload is 0 kg, but holder and brush have weight: the guided arm drifts. Go on with 0 kg?"
+        question = "The payload is 0 kg, but holder and brush have weight: a guided arm will drift. Go on with 0 kg?"
         if not payload_kg and not await visit.yes(question):
             raise NotAccepted("the payload is 0 kg.", "Weigh holder, sensor and brush; set the weight on the pendant.")
         values = {

@@ -184,7 +184,7 @@ class ForceStep(Step):
         points = inside_corners(notebook.get("paper.size_mm"), INSET_MM)
         lean_deg = PaperPlane(*notebook.get("aside.plane")).slope_deg
         widest_deg = min(max(math.ceil(10.0 * (lean_deg + LEAN_ROOM_DEG)) / 10.0, 1.0), 3.0)
-        leans = f"the sheet leans by {lean_deg:.2f} deg; {LEAN_ROOM_DEG:g} deg were added"
+        leans = f"the sheet leans by {lean_deg:.2f} deg; {LEAN_ROOM_DEG:g} deg of margin were added"
         return {
             "touch.method": Taught(method, why),
             "touch.points_mm": Taught(points.tolist(), f"{INSET_MM:g} mm inside the sheet's corners"),

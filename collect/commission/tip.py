@@ -181,7 +181,7 @@ class TipStep(Step):
         await self._pin(visit)
         visit.say(
             "Now the direction of the brush: hold the brush upright along a set square that stands on the table.",
-            f"{UPRIGHTS} upright poses are needed; the goal for their mean is a standard error of {WORST_DEG:g} deg.",
+            f"{UPRIGHTS} upright poses are needed; the goal is a standard error of {WORST_DEG:g} deg.",
         )
         await self._uprights(visit)
 

@@ -17,7 +17,7 @@ RIG_FILE, PROTOCOL_FILE = Path("rig.toml"), Path("protocol.toml")
 Rig = Annotated[Path, Option(help="The rig.toml: addresses, frames and limits of the rig.")]
 Arm = Annotated[bool, Option("--arm", help="Let real hardware move.")]
 Tui = Annotated[bool | None, Option("--tui/--no-tui", help="Show the screen, by default in any terminal.")]
-NewSheet = Annotated[int | None, Option(min=1, help="Confirm that sheet N is in place; repeating it is harmless.")]
+NewSheet = Annotated[int | None, Option(min=1, help="Confirm that sheet N is in place; the option may be repeated.")]
 
 
 @dataclass(frozen=True, slots=True)

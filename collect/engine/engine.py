@@ -255,7 +255,7 @@ class Engine:
                 "rig.toml", "robot", f"{hardware}: look at the robot cell, keep a hand at the emergency stop, add --arm"
             )
         if await self._run.asker.ask_or_default(prompt) == prompt.default:
-            raise CollectAborted("it was not confirmed that the arm may move; nothing was powered and nothing moved")
+            raise CollectAborted("nobody confirmed that the arm may move; nothing was powered and nothing moved")
 
     @contextlib.contextmanager
     def _waiting(self) -> Generator[None]:

@@ -324,7 +324,7 @@ class Photographer:
 
     def _not_shown(self) -> CameraLate:
         return CameraLate(
-            f"the camera did not show within {self._patience_s:g} s that the arm went over the sheet and away again. "
+            f"within {self._patience_s:g} s, the camera did not show the arm going over the sheet and away again. "
             "It looks elsewhere, its picture is frozen, or its delay is far longer than camera.max_delay_ms = "
             f"{self._config.max_delay_ms:g}. Point it at the sheet; let nothing but the arm move in its view."
         )

@@ -178,7 +178,7 @@ def brush_shorter_than_tool(offset_mm: Sequence[float], length_mm: float) -> Che
 
 def deepest_press(max_depth_mm: float, length_mm: float) -> Check:
     """The deepest press: beyond it the bundle is pressed flat, and its hairs break."""
-    remedy = "Give brush.max_depth_mm a smaller value: the ferrule would come near the paper."
+    remedy = "Set brush.max_depth_mm within this range: deeper, the ferrule comes near the paper."
     return within("deepest press", max_depth_mm, 0.5, round(0.6 * length_mm, 1), "mm", remedy)
 
 

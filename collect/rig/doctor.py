@@ -134,7 +134,7 @@ async def _force(config: ForceTable, clock: Clock) -> Finding:
         force_n, lost = math.hypot(*newest.force_n), sensor.assembler
         finding.notes = f"{rate_hz:.0f} readings/s, {force_n:.3f} N at rest, not zeroed yet"
         if lost.torn or lost.refused or sensor.bus_errors:
-            finding.problem = f"{lost.torn} broken, {lost.refused} refused readings, {sensor.bus_errors} bus errors"
+            finding.problem = f"{lost.torn} broken and {lost.refused} refused readings, {sensor.bus_errors} bus errors"
             finding.remedy = "Check wiring, shielding and termination."
         elif force_n > config.max_n:
             ceiling = f"above the ceiling force.max_n = {config.max_n:g} N"

@@ -241,7 +241,7 @@ async def _until_felt(
         if len(readings) > clear and all(reading.force_n > reading.least_n for reading in last):
             return readings
         if z_mm <= lowest_z_mm + 1e-6:
-            raise StepError(f"nothing was touched down to {z_mm:.2f} mm, in steps of {step_mm:g} mm")
+            raise StepError(f"no contact was found down to {z_mm:.2f} mm, in steps of {step_mm:g} mm")
         z_mm -= step_mm
 
 

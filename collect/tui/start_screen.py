@@ -231,7 +231,7 @@ class StartScreen(Screen[None]):
 
         before = str(browser.config if what == "rig" else browser.protocol)
         picks = "".join(f"\n{number}  {path}" for number, path in listed.items())
-        question = f"File of the {what}: type a number or a path; escape keeps {before}.{picks}"
+        question = f"Which {what} file? Type a number or a path; escape keeps {before}.{picks}"
         app_of(self).push_screen(AskScreen(Prompt(question, default=before, read=str)), answered)
 
     @work(exclusive=True, group="new")

@@ -92,7 +92,7 @@ def decode_message(payload: bytes) -> tuple[int, list[Any]]:
         case [int(head), *rest] if not isinstance(head, bool):
             return head, rest  # pyright: ignore[reportUnknownVariableType]
         case _:
-            raise ProtocolViolation(STREAM, "decode", f"not an array with a channel: {payload[:20]!r}")
+            raise ProtocolViolation(STREAM, "decode", f"not an array that begins with a channel: {payload[:20]!r}")
 
 
 CHANNEL = 0

@@ -308,6 +308,6 @@ class SriM8123:
     def _lose_bus(self, what: str) -> None:
         self._loss = (
             f"the bus {self._table.interface} {self._table.channel} {what}",
-            f"Check wiring, termination and that both ends run at {self._table.bitrate} bit/s; "
+            f"Check the wiring, the termination and that both ends run at {self._table.bitrate} bit/s; "
             "then set the interface down and up, and connect again.",
         )

@@ -101,7 +101,7 @@ class ArcsServer(LoopbackServer):
         """Carry out a request, and reply."""
         ident, name, params = (request.get(field) for field in ("id", "method", "params"))
         if name is None:
-            return _error(ident, INVALID_REQUEST, "a request is a JSON object with a method")
+            return _error(ident, INVALID_REQUEST, "a request must be a JSON object with a method")
         if name not in self._methods:
             return _error(ident, METHOD_NOT_FOUND, f"method not found: {name}")
         try:

@@ -86,7 +86,7 @@ def parse_path(path: str, field: str) -> Floats:
     try:
         follow_svg(path, pen)
     except (ValueError, IndexError, ArithmeticError) as error:
-        raise ValueError(f"{field}: is no SVG path: {str(error)[:60]}") from None
+        raise ValueError(f"{field}: not an SVG path: {str(error)[:60]}") from None
     moves: list[tuple[str, tuple[tuple[float, float], ...]]] = pen.value
     arcs, begin, at = list[Floats](), np.zeros(2), np.zeros(2)
     for name, points in moves:

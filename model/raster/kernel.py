@@ -38,7 +38,7 @@ def rasterise(points, weights, placed, out):
     # and the first and last cell that pieces pass in each row, on their way down and up.
     steps, crossings = np.zeros((size, size + 8)), np.empty((2, size + 3))
     if not _rasterise(points, weights, placed, out, steps, crossings, np.empty((size, 4), np.int64)):
-        raise ValueError(f"a shape is not finite, or lies more than {FURTHEST:g} pixels away")
+        raise ValueError(f"a shape has points that are not finite or lie more than {FURTHEST:g} pixels away")
 
 
 @numba.njit(**OPTIONS, cache=True)

@@ -122,7 +122,7 @@ def test_images_straight_from_presses_match_the_outline_s(size_px: int, px_mm: f
         ({"px_mm": -1.0}, "px_mm = -1"),
         ({"heading_deg": np.zeros(2)}, r"heading_deg has shape \(2,\)"),
         ({"origin_mm": np.zeros((2, 2))}, r"origin_mm has shape \(2, 2\), expected \(2,\) or \(3, 2\)"),
-        *(({"origin_mm": (x_mm, 1.0)}, "not finite, or lies more than 1e") for x_mm in (math.nan, math.inf, 1e30)),
+        *(({"origin_mm": (x_mm, 1.0)}, "not finite or lie more than 1e") for x_mm in (math.nan, math.inf, 1e30)),
     ],
 )
 def test_what_makes_no_image_is_refused(options: dict, words: str) -> None:

@@ -103,7 +103,7 @@ def test_a_board_that_is_always_held_alike_gives_no_lens(slant: float) -> None:
     for k in range(10):
         turn, place = np.array([slant, 0, 0]) + rng.normal(0, 0.01, 3), rng.uniform([-180, -150, 450], [0, 0, 650])
         alike.append(view(f"{k}.png", turn, place, rng.normal(0, 0.1, (54, 2))))
-    with pytest.raises(CalibrationError, match=r"10 usable views, but the board is held at \d angles, at least 4"):
+    with pytest.raises(CalibrationError, match=r"10 usable views; different angles of the board: \d, at least 4"):
         fit_lens(alike)
 
 

@@ -301,7 +301,7 @@ def test_headline_verdict_and_ceiling_are_of_the_presses_whose_condition_was_pre
 
 def test_without_a_repeated_condition_it_is_said_that_the_question_has_no_answer(tmp_path: Path) -> None:
     said("validate", once := imported_presses(tmp_path, CONDITIONS[:3], name="once"), *QUICK)
-    assert (once / "validation" / "verdict.txt").read_text().startswith("It cannot be said, because no condition was")
+    assert (once / "validation" / "verdict.txt").read_text().startswith("It cannot be said: no condition was")
 
 
 def test_strokes_that_are_left_out_end_in_exit_code_3_after_the_report(tmp_path: Path) -> None:

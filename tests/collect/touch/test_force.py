@@ -125,7 +125,7 @@ async def test_a_sheet_that_moved_since_the_last_touch_is_found(reaction: Push, 
 @pytest.mark.parametrize(
     ("paper_z_mm", "samples", "said"),
     [
-        (117.0, force.MOST_SAMPLES, r"nothing was touched down to 118\.00 mm"),
+        (117.0, force.MOST_SAMPLES, r"no contact was found down to 118\.00 mm"),
         (124.0, force.MOST_SAMPLES, "touches already"),
         (
             120.0,

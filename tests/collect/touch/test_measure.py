@@ -96,7 +96,7 @@ async def test_touches_by_camera_lie_within_150_um_of_the_truth_at_3_sigma(
 @pytest.mark.parametrize(
     ("touch", "paper_z_mm", "said"),
     [
-        ({"method": "force"}, 117.5, "nothing was touched down to"),
+        ({"method": "force"}, 117.5, "no contact was found down to"),
         ({"method": "camera"}, 115.5, "no touch of the row, down to"),
         (
             {"method": "camera", "points_mm": [(90.0, 4.0), (4.0, 4.0), (4.0, 40.0)]},

@@ -65,7 +65,7 @@ def test_ways_lie_on_the_patch_with_the_foot_of_the_font_at_its_margin() -> None
         ("[" * 100_000, "Invalid JSON"),
         (glyph_text(strokes=[]), "strokes: List should have at least 1 item"),
         (glyph_text(strokes=[SQUARE, SQUARE]), "medians: holds 1, expected 2"),
-        (glyph_text(strokes=["M 0 0 L 5"]), "strokes.0: is no SVG path"),
+        (glyph_text(strokes=["M 0 0 L 5"]), "strokes.0: not an SVG path"),
         (glyph_text(strokes=["M 0 0 L 9 0 M 3 3 L 1 9 Z"]), "expected one loop"),
         (glyph_text(strokes=["M 0 0 L 1e9 0 L 0 9 Z"]), "coordinates of at most 4096"),
         (glyph_text(strokes=["M 0 0 L 9 0 Z"]), "strokes.0: encloses nothing"),
