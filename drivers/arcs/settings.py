@@ -161,7 +161,7 @@ async def _until_mode(controller: Controller, *wanted: RobotMode) -> None:
     while (mode := await controller.mode()) not in wanted:
         await controller.require_safe("power on")
         if loop.time() > until_s:
-            what = f"mode {mode} did not become {' or '.join(sorted(wanted))}"
+            what = f"the mode stayed {mode}; expected {' or '.join(sorted(wanted))}"
             remedy = "Look at the pendant: a confirmation may be waiting there."
             raise DeviceTimeout(DEVICE, "power on", what, remedy=remedy)
         await asyncio.sleep(POLL_S)

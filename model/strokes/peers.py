@@ -29,7 +29,7 @@ def models(basis: Basis) -> tuple[StrokeModel, ...]:
     shapes: dict[str, tuple[str, str, Profile]] = {
         "ccd-bsm": (
             "CCD-BSM",
-            f"Half an ellipse at the heel and two parabolas to the tip (Eq. 1-5), dilation {basis.lam:.4g}.",
+            f"Half an ellipse at the heel and two parabolas to the tip (Eq. 1-5), widened by lambda = {basis.lam:.4g}.",
             lambda h, a: mark(h, a).outline(),
         ),
         "bezier": (
