@@ -23,15 +23,15 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written, check_target, replacing, write_whole
 from brushloop.sessions.terminal import Progress, unseen
 
-ROWS, COLUMNS = "ABCDEFG", 9
-EDGE_MM, STRIP_MM, LABEL_MM = 8.0, 12.0, 3.0
+ROWS, COLUMNS = "ABCDEFGH", 8
+EDGE_MM, STRIP_MM, LABEL_MM = 6.0, 12.0, 2.5
 """Unprinted edge of the page; height of the rows of marks, and of the line above each box that has its number."""
 MARK_MM, MARKS = 10.0, 5
 """Side of a mark, and the number of marks in each of the two rows."""
 DICTIONARY = cv2.aruco.DICT_4X4_50
-TOUCH_MM = 8.0
+TOUCH_MM = 8.5
 """From a box's right edge to its touch point, at half of its height: marks extend to the left."""
-INSET_MM = 0.6
+INSET_MM = 0.3
 """Width of the strip along the edges of a box that is not read, because the edges are printed there."""
 PAGES = ("a4", "letter", "a3")
 """Each page has marks of its own numbers, so that a scan tells which page it shows."""

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from brushloop.calibrate.board.sheet import PAGES, Layout, drawn_sheet, find_sheet, print_sheet
+from brushloop.calibrate.board.sheet import INSET_MM, PAGES, TOUCH_MM, Layout, drawn_sheet, find_sheet, print_sheet
 from brushloop.calibrate.commands import ImportRequest, SheetRequest
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.imports import import_session
@@ -89,7 +89,7 @@ class Scanned:
 
     def _touch_px(self, box: str) -> tuple[float, float]:
         x, y, wide, tall = A4.boxes()[box]
-        return (x + wide - 8.0) * self.print_scale[0] * PX_PER_MM, (y + 0.5 * tall) * self.print_scale[1] * PX_PER_MM
+        return (x + wide - 8.5) * self.print_scale[0] * PX_PER_MM, (y + 0.5 * tall) * self.print_scale[1] * PX_PER_MM
 
     def _press(self, sheet: np.ndarray, box: str, depth_mm: float, tilt_deg: float) -> None:
         """Ink the mark of a press on the print."""
@@ -179,8 +179,8 @@ def test_a_command_names_the_boxes_that_do_not_agree_and_ends_with_code_3(tmp_pa
         (lambda image: image[: len(image) // 2].copy(), None, "some of them in each row"),
         (lambda image: cv2.resize(image, None, fx=0.4, fy=0.4, interpolation=cv2.INTER_AREA), None, "159 dpi; 200 are"),
         (lambda image: _photographed(image), None, "lay the sheet flat on a scanner"),
-        (lambda image: image, (28.1, 194.0), "--measured-mm: across: 28.1 mm, allowed 272.6 to 289.4"),
-        (lambda image: image, (281.0, math.nan), "--measured-mm: along: nan mm, allowed"),
+        (lambda image: image, (28.1, 198.0), "--measured-mm: across: 28.1 mm, allowed 276.4 to 293.6"),
+        (lambda image: image, (285.0, math.nan), "--measured-mm: along: nan mm, allowed"),
     ],
     ids=["another page", "mirrored", "half of it", "coarse", "a photograph", "centimetres", "no number"],
 )
@@ -212,8 +212,14 @@ def test_the_sheet_and_its_table_are_written_once_for_each_size_of_page(tmp_path
     with pytest.raises(CalibrationError, match="exists already and is not overwritten"):
         print_sheet(request)
     layout = Layout(page)
-    assert len(layout.boxes()) == 63
-    assert min(layout.box_mm) > 20.0
+    assert len(layout.boxes()) == 64
+    # Every planned press of the paper's brush fits its box, with a millimetre to spare for the hand.
+    (wide, tall), model = layout.box_mm, stroke_models(Brush())["ccd-bsm"]
+    for depth, tilt in layout.planned().values():
+        mark, lean_mm = model.profile(float(depth), float(tilt)), depth * math.tan(math.radians(tilt))
+        assert -float(mark.x_min_mm[0]) - lean_mm < wide - TOUCH_MM - INSET_MM - 1.0
+        assert float(mark.x_max_mm[0]) + lean_mm < TOUCH_MM - INSET_MM - 1.0
+        assert float(np.abs(mark.points[..., 1]).max()) < 0.5 * tall - INSET_MM - 1.0
 
 
 def test_a_table_of_boxes_needs_a_scan_and_a_page_must_be_known(tmp_path, table):
