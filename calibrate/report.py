@@ -166,13 +166,18 @@ def overlay(first: Image, second: Image) -> Image:
     return np.clip(1.0 - darker, 0.0, 1.0).astype(np.float32)
 
 
-def printable(text: str) -> str:
-    """A name or label for the text of a picture, with `?` for every character that its font does not draw."""
+@functools.cache
+def _glyphs() -> frozenset[int]:
+    """Code points that the font of charts and picture files draws."""
     from matplotlib import font_manager
 
     untyped: Any = font_manager
-    glyphs = untyped.get_font(untyped.findfont("DejaVu Sans")).get_charmap()
-    drawn = "".join(c if c.isprintable() and ord(c) in glyphs else "?" for c in text)
+    return frozenset(untyped.get_font(untyped.findfont("DejaVu Sans")).get_charmap())
+
+
+def printable(text: str) -> str:
+    """A name or label for the text of a picture, with `?` for every character that its font does not draw."""
+    drawn = "".join(c if c.isprintable() and ord(c) in _glyphs() else "?" for c in text)
     return drawn.replace("$", r"\$")  # otherwise it begins a formula
 
 
