@@ -271,7 +271,7 @@ def trust(report: Report) -> Iterator[Point]:
         yield Point(False, words)
     if _csim(report, FITTED_HELD_OUT) is None:
         yield Point(None, "No model was calibrated to this brush: run “brushloop fit”, then validate again.")
-    if _csim(report, "ccd-bsmg") is None:
+    if _csim(report, "ccd-bsmg") is None and "ccd-bsmg" not in unpredicted:
         yield Point(None, f"CCD-BSMG is {tables.MISSING['ccd-bsmg']}.")
     for loop in report.loops:
         yield loop.answer

@@ -321,7 +321,7 @@ class ReviewScreen(Screen[None]):
         result, press, folder = capture.result, capture.press, self._review.folder
         why = "  marked bad" if capture.marked_bad else ""
         if not result.kept:
-            why = f"  not counted by the run: {result.verdict or 'pressed again, as requested'}"
+            why = f"  not counted by the run: {result.verdict or 'as requested'}"
         file = capture.file if (folder / capture.file).is_file() else merged_file(folder).name
         lines = [
             Content.assemble((press.stroke_id, "bold"), f"  {condition_text(press.condition)}", (why, "bold")),

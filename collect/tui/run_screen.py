@@ -401,7 +401,8 @@ def _capture_words(last: LastCapture) -> Content:
     elif missed := [check for check in last.verdict.checks if not check.passed]:
         lines.append(checks_content(missed))
     else:
-        lines.append(Content(f"✓ all {len(last.verdict.checks)} checks{'' if last.kept else ', but pressed again'}"))
+        asked = "" if last.kept else "; not counted, as the operator requested"
+        lines.append(Content(f"✓ all {len(last.verdict.checks)} checks{asked}"))
     if last.likeness is not None:
         lines.append(Content.styled(f"CCD-BSM as published (right): CSIM {100.0 * last.likeness:.1f} %", "dim"))
     return Content("\n").join(lines)
