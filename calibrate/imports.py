@@ -7,14 +7,14 @@ from dataclasses import fields, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import cv2
-
 from brushloop.calibrate.artefact import made_by
-from brushloop.calibrate.board.sheet import PX_PER_MM, find_sheet, holds_ink
+from brushloop.calibrate.board.sheet import find_sheet, holds_ink
 from brushloop.calibrate.board.spec import MM_PER_INCH
 from brushloop.calibrate.commands import ImportRequest
 from brushloop.calibrate.files import Written, read_gray
+from brushloop.calibrate.stroke.preprocess import PX_PER_MM
 from brushloop.sessions.imports import ImportOptions, import_photographs, read_table
+from brushloop.sessions.messages import encode_png
 from brushloop.sessions.terminal import Progress, unseen
 
 TAKEN_AS_EXACT = "The print was taken to be exact: measure it and give --measured-mm to be sure of every length."
@@ -39,12 +39,11 @@ def import_session(request: ImportRequest, progress: Progress = unseen) -> Writt
         with TemporaryDirectory() as temporary:
             boxes = Path(temporary).resolve() / source.name
             boxes.mkdir()
-            pictures = {name: scan.picture(box) for name, box in scan.layout.boxes().items()}
+            pictures = {name: scan.picture(box, PX_PER_MM) for name, box in scan.layout.boxes().items()}
             for name, picture in pictures.items():
-                cv2.imwrite(str(boxes / f"{name}.png"), picture)
-            inked = {name for name, picture in pictures.items() if holds_ink(picture)}
-            origin = request.origin or f"{source.name}, {request.csv.name}"
-            options = replace(options, px_per_mm=PX_PER_MM, start_px=scan.start_px, origin=origin)
+                (boxes / f"{name}.png").write_bytes(encode_png(picture))
+            inked = {name for name, picture in pictures.items() if holds_ink(picture, PX_PER_MM)}
+            options = replace(options, px_per_mm=PX_PER_MM, start_px=scan.start_px(PX_PER_MM))
             named = {image.stem for image, _ in read_table(boxes, request.csv, options)}
             path = import_photographs(boxes, request.csv, out, options, made_by(), time.time_ns, progress=progress)
         left_out += [(box, "is blank, but the table has a row for it") for box in sorted(named - inked)]

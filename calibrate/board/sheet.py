@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.board.lens import Floats, Gray
-from brushloop.calibrate.board.spec import MM_PER_INCH, PAGES_MM, Rectangle
+from brushloop.calibrate.board.spec import MM_PER_INCH, PAGES_MM, Rectangle, check_pdf
 from brushloop.calibrate.commands import SheetRequest
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.files import Written, check_target, replacing, write_whole
+from brushloop.calibrate.files import Written, replacing, write_whole
 from brushloop.sessions.terminal import Progress, unseen
 
 ROWS, COLUMNS = "ABCDEFGH", 8
@@ -44,8 +44,6 @@ MOST_RESIDUAL_MM = 0.2
 """Largest root mean square distance of the marks from an affine map: more is a photograph, or a fold."""
 ASTRAY_MM = 1.0
 """Distance above which a mark is left out."""
-PX_PER_MM = 20.0
-"""Resolution of the picture of a box, which is that of the raster on which strokes are measured."""
 INK_DARKER, INK_MM2 = 0.5, 4.0
 """A box with at least this area that is darker than this share of its paper holds ink: a pale stain does not count."""
 
@@ -104,9 +102,7 @@ def print_sheet(request: SheetRequest, _progress: Progress = unseen) -> Written:
     path, table = request.out, request.out.with_suffix(".csv")
     if request.page not in PAGES:
         raise CalibrationError(f"page {request.page!r}", f"is not one of {', '.join(PAGES)}")
-    check_target(path, ".pdf")
-    if not path.parent.is_dir():
-        raise CalibrationError(str(path), f"there is no folder {path.parent}")
+    check_pdf(path)
     for target in (path, table):
         if target.exists():
             raise CalibrationError(str(target), "exists already and is not overwritten")
@@ -177,17 +173,16 @@ class SheetScan:
         across, along = np.linalg.norm(self.to_px[:, :2], axis=0) / np.array(self.stretch)
         return float(across), float(along)
 
-    @property
-    def start_px(self) -> tuple[float, float]:
+    def start_px(self, px_per_mm: float) -> tuple[float, float]:
         """The touch point in the picture of each box."""
         (wide, tall), (across, along) = self.layout.box_mm, self.stretch
         x, y = wide - TOUCH_MM - INSET_MM, 0.5 * tall - INSET_MM
-        return x * across * PX_PER_MM, y * along * PX_PER_MM
+        return x * across * px_per_mm, y * along * px_per_mm
 
-    def picture(self, box: Rectangle) -> Gray:
-        """The inside of a box at 20 px/mm of the print, straightened."""
+    def picture(self, box: Rectangle, px_per_mm: float) -> Gray:
+        """The inside of a box at this scale of the print, straightened."""
         x, y, wide, tall = box
-        step = np.array([1.0 / (PX_PER_MM * side) for side in self.stretch])
+        step = np.array([1.0 / (px_per_mm * side) for side in self.stretch])
         size = [int((side - 2.0 * INSET_MM) / each) for side, each in zip((wide, tall), step, strict=True)]
         corner = np.array([x + INSET_MM, y + INSET_MM]) + 0.5 * step
         move = np.column_stack([self.to_px[:, :2] * step, self.to_px @ np.array([*corner, 1.0])])
@@ -213,24 +208,22 @@ def find_sheet(image: Gray, where: str, measured_mm: tuple[float, float] | None)
     to_px: Floats = np.asarray(fitted, np.float64)
     used = cast("NDArray[np.uint8]", inside).ravel() > 0
     off_px: Floats = (drawn_mm @ to_px[:, :2].T + to_px[:, 2] - pixels)[used]
-    stretch = _stretch(layout, measured_mm)
     residual_mm = float(np.sqrt(2.0 * np.mean(np.square(off_px)))) / scale
     astray = sum(not all(four) for four in used.reshape(-1, 4).tolist())
-    scan = SheetScan(layout, image, to_px, stretch, residual_mm, 2 * MARKS - len(marks) + astray)
-    if min(scan.px_per_mm) < LEAST_PX_PER_MM:
-        raise CalibrationError(
-            where, f"has {min(scan.px_per_mm) * MM_PER_INCH:.0f} dpi; 200 are needed, 400 are better"
-        )
+    missing = 2 * MARKS - len(marks) + astray
+    scan = SheetScan(layout, image, to_px, _stretch(layout, measured_mm), residual_mm, missing)
+    if (least := min(scan.px_per_mm)) < LEAST_PX_PER_MM:
+        raise CalibrationError(where, f"has {least * MM_PER_INCH:.0f} dpi; 200 are needed, 400 are better")
     if residual_mm > MOST_RESIDUAL_MM or 4 * astray > len(marks):
         why = f"its marks lie {residual_mm:.2f} mm from where a flat scan would show them"
         raise CalibrationError(where, f"{why}: lay the sheet flat on a scanner, and do not photograph it")
     return scan
 
 
-def holds_ink(picture: Gray) -> bool:
+def holds_ink(picture: Gray, px_per_mm: float) -> bool:
     """Whether the picture of a box shows ink."""
     dark = picture < INK_DARKER * float(np.percentile(picture, 90))
-    return float(np.count_nonzero(dark)) >= INK_MM2 * PX_PER_MM**2
+    return float(np.count_nonzero(dark)) >= INK_MM2 * px_per_mm**2
 
 
 def _stretch(layout: Layout, measured_mm: tuple[float, float] | None) -> tuple[float, float]:

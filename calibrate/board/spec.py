@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 import cv2
@@ -119,15 +120,20 @@ def named_board(options: BoardOptions) -> Board:
         raise invalid("board", error) from None
 
 
+def check_pdf(path: Path) -> None:
+    """Check before any work that a PDF may be written to `path`, in an existing folder. Raises `CalibrationError`."""
+    check_target(path, ".pdf")
+    if not path.parent.is_dir():
+        raise CalibrationError(str(path), f"there is no folder {path.parent}")
+
+
 def print_board(request: PrintRequest, _progress: Progress = unseen) -> Written:
     """Write a board as a PDF of one page, turned if it only fits that way.
 
     Raises `CalibrationError` if it does not fit, or if `out` is not that of a PDF: no other file is overwritten.
     """
     board, path = named_board(request), request.out
-    check_target(path, ".pdf")
-    if not path.parent.is_dir():
-        raise CalibrationError(str(path), f"there is no folder {path.parent}")
+    check_pdf(path)
     if path.exists() and not (path.is_file() and path.read_bytes().startswith(b"%PDF")):
         raise CalibrationError(str(path), "exists and is not a PDF; it is not overwritten")
     drawn(board, request.page).savefig(path, format="pdf", metadata={"CreationDate": None})
