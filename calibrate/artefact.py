@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Generator
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import ClassVar, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from brushloop.calibrate.errors import CalibrationError, invalid
+from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import write_whole
 from brushloop.sessions.disk import read_bounded
 
@@ -24,11 +26,25 @@ POINTER = "current"
 NAME = re.compile(rb"([0-9a-f]{%d}\.json)\n?" % HASH_CHARS)
 """File name of an artefact. A pointer that holds anything else, such as a path out of the folder, is refused."""
 MAX_POINTER_BYTES = 256
+PLAIN = {"json_invalid": "is not JSON: give a file that brushloop wrote", "extra_forbidden": "unknown field"}
+"""What is said where pydantic's own words are a riddle to whoever named the wrong file."""
 
 
 def made_by() -> str:
     """The name and version of this software, as files record it."""
     return f"brushloop {version('brushloop')}"
+
+
+@contextmanager
+def checked_fields(where: str) -> Generator[None]:
+    """Raise `CalibrationError` for the first invalid field of what is validated inside, in one line that names it."""
+    try:
+        yield
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(map(str, first["loc"]))
+        message = PLAIN.get(first["type"], first["msg"])
+        raise CalibrationError(where, f"{field}: {message}" if field else message) from None
 
 
 class Frozen(BaseModel):
@@ -58,10 +74,8 @@ class Artefact(Frozen):
         Raises `InputError` if there is none, and `CalibrationError` for any other file or version, or an edited one.
         """
         data = read_bounded(path)
-        try:
+        with checked_fields(str(path)):
             artefact = cls.model_validate_json(data)
-        except ValidationError as error:
-            raise invalid(str(path), error) from None
         if hashlib.sha256(data).hexdigest()[:HASH_CHARS] != path.stem:
             raise CalibrationError(str(path), "was edited or renamed: its name is not the hash of its contents")
         return artefact

@@ -111,6 +111,8 @@ CharacterData = Annotated[
     Path | None,
     Option(help="Folder with a file for each character, as 字.json, from github.com/chanind/hanzi-writer-data."),
 ]
+PROTOCOL = "protocol-write.toml"
+"""Name of the protocol in the folder of a plan."""
 FIT = "Brush fit; the session's own by default. `published`, or a session without a fit: CCD-BSM as published."
 PlanFile = Annotated[Path, Option(help="The plan's folder, or its plan.json.")]
 Written = Annotated[Path, Argument(help="The session in which the plan's characters were written.")]
@@ -233,11 +235,6 @@ class CompareLoopRequest:
     fit: Annotated[Path | None, Option(help=FIT)] = None
     out: Annotated[Path, Option(help="Folder for loop.html, loop.csv, loop.json.")] = Path("loop")
     command: str = field(default_factory=_command_line)
-    """Named by the report as what made it."""
-
-
-PROTOCOL = "protocol-write.toml"
-"""Name of the protocol in the folder of a plan."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -306,7 +303,6 @@ class CompareWrittenRequest:
     plan: PlanFile
     out: Annotated[Path, Option(help="Folder for written.html, .csv, .json and figure-13.png.")] = Path("written")
     command: str = field(default_factory=_command_line)
-    """Named by the report as what made it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

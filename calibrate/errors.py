@@ -7,28 +7,13 @@ InputError                  of `brushloop.sessions`
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from brushloop.sessions.errors import InputError
-
-if TYPE_CHECKING:
-    from pydantic import ValidationError
 
 
 class CalibrationError(InputError):
     """The captures or files do not allow the requested result."""
-
-
-PLAIN = {"json_invalid": "is not JSON: give a file that brushloop wrote", "extra_forbidden": "unknown field"}
-"""What is said where pydantic's own words are a riddle to whoever named the wrong file."""
-
-
-def invalid(where: str, error: ValidationError) -> CalibrationError:
-    """An error for the first invalid field of a file, in one line that names the field."""
-    first = error.errors()[0]
-    field = ".".join(map(str, first["loc"]))
-    message = PLAIN.get(first["type"], first["msg"])
-    return CalibrationError(where, f"{field}: {message}" if field else message)
 
 
 class StrokesLeftOut(Exception):

@@ -91,8 +91,10 @@ def _write_pictures(
         row = {"episode_index": index, "file": ""} | _row(session.header, press.capture.stroke)
         row["dip_to_touch_unlike"] = float(press.name in odd) if press.name in waits else None
         row |= {"quality": session.verdicts.get(press.name, ""), "marked_bad": press.capture.bad} | values
+        # Readable, safe on any file system, and with the index distinct whatever the strokes are called.
+        safe = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in press.name)[:80]
         for name, data in pictures.items():
-            path = _file_name(index, press.name, name, data)
+            path = f"{name}s/{index:04d}-{safe}.{'png' if data.startswith(PNG_START) else 'jpg'}"
             (folder / path).parent.mkdir(exist_ok=True)
             (folder / path).write_bytes(data)
             row["file" if name == "image" else f"{name}_file"] = path
@@ -127,12 +129,6 @@ def _row(header: Header, stroke: Stroke) -> Row:
 def _pair(column: str, values: tuple[float, float] | None) -> Row:
     """Two columns, `{}` in whose name stands for x and y."""
     return dict(zip((column.format("x"), column.format("y")), values or (None, None), strict=True))
-
-
-def _file_name(index: int, stroke_id: str, picture: str, data: bytes) -> str:
-    """A readable path, safe on any file system and distinct whatever the strokes are called."""
-    safe = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in stroke_id)[:80]
-    return f"{picture}s/{index:04d}-{safe}.{'png' if data.startswith(PNG_START) else 'jpg'}"
 
 
 def _write_table(path: Path, table: dict[str, list[Any]]) -> None:

@@ -61,10 +61,6 @@ class Press:
         return Condition(self.stroke.depth_mm or 0.0, self.stroke.tilt_deg or 0.0)
 
 
-Unless = Callable[[Press], str]
-"""The reason why a press cannot be used, empty if it can."""
-
-
 def uncommanded(press: Press) -> str:
     """Refuse a press of unknown depth or tilt."""
     return "has no depth or tilt" if press.stroke.depth_mm is None or press.stroke.tilt_deg is None else ""
@@ -92,14 +88,15 @@ def beside_touch(press: Press) -> str:
 def read_presses(
     session: OpenSession,
     refused: list[Refused],
-    *unless: Unless,
+    *unless: Callable[[Press], str],
     chosen: Collection[str] | None = None,
     scheduler: Scheduler | None = None,
     progress: Progress = unseen,
 ) -> Iterator[Press]:
     """Yield the presses of a session in order of capture, all or those of some names; the others go to `refused`.
 
-    Raises `SessionDamaged` for a recording that cannot be read; a photograph that cannot is refused.
+    `unless` give the reason why a press cannot be used, empty if it can. Raises `SessionDamaged` for a recording that
+    cannot be read; a photograph that cannot is refused.
     """
     store, bad = session.store, bad_stills(session.recording.path.parent)
     wanted = [k for k, stroke in enumerate(session.strokes) if chosen is None or stroke.stroke_id in chosen]
@@ -200,10 +197,13 @@ def rectified(capture: Capture, calibration: Calibration | None) -> tuple[Gray, 
         raise CaptureRefused(stroke.stroke_id, "has neither a calibration nor a scale of its own")
     anchor_px = stroke.anchor_px
     if anchor_px is not None and stroke.kind == "press":
-        around, (left_mm, top_mm) = 0.5 * preprocess.BACKGROUND_MM, ANCHOR_MM
-        right_mm, bottom_mm = FIELD_MM - left_mm, FIELD_MM - top_mm
-        reach_mm = (left_mm + around, top_mm + around, right_mm + around, bottom_mm + around)
-        image, anchor_px = preprocess.cut_out(image, anchor_px, stroke.px_per_mm, reach_mm, capture.where)
+        before_mm, around_mm = np.array(ANCHOR_MM), 0.5 * preprocess.BACKGROUND_MM
+        first = np.floor(anchor_px - (before_mm + around_mm) * stroke.px_per_mm)
+        last = np.ceil(anchor_px + (FIELD_MM - before_mm + around_mm) * stroke.px_per_mm)
+        (left, top), (right, bottom) = np.clip([first, last], 0, image.shape[::-1]).astype(int).tolist()
+        image, anchor_px = image[top:bottom, left:right], (anchor_px[0] - left, anchor_px[1] - top)
+        if not image.size:
+            raise CaptureRefused(capture.where, preprocess.NOT_IN_FIELD)
     raster = preprocess.rescale(image, stroke.px_per_mm, capture.where)
     scale_x, scale_y = (PX_PER_MM / scale for scale in stroke.px_per_mm)
     anchor = None if anchor_px is None else (anchor_px[0] * scale_x, anchor_px[1] * scale_y)
@@ -213,22 +213,15 @@ def rectified(capture: Capture, calibration: Calibration | None) -> tuple[Gray, 
 def prepare_press(capture: Capture, calibration: Calibration | None) -> Prepared:
     """Rectify a stroke to the millimetre field, whether or not it was marked bad: that may change, the result is kept.
 
-    Raises as `rectified` does.
+    `cut` is set where ink lies outside the field. Raises as `rectified` does, and `CaptureRefused` if all of it does.
     """
     stroke = capture.stroke
     _, prepared = rectified(capture, calibration)
     if calibration is not None and stroke.anchor_mm is not None:
         return prepared
-    if prepared.anchor_px is None:
+    anchor_px = prepared.anchor_px
+    if anchor_px is None:
         raise CaptureRefused(stroke.stroke_id, "has no touch point (start_x_px, start_y_px) to align it with a model")
-    return _cropped(prepared, prepared.anchor_px)
-
-
-def _cropped(prepared: Prepared, anchor_px: tuple[float, float]) -> Prepared:
-    """Crop a raster to the field around its anchor; `cut` is set where ink is left out.
-
-    Raises `CaptureRefused` if none of the stroke lies in the field.
-    """
     side, (height, width) = round(FIELD_MM * PX_PER_MM), prepared.mask.shape
     left, top = (
         min(max(round(at - away_mm * PX_PER_MM), -side), most)

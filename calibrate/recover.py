@@ -79,9 +79,7 @@ class Recovered:
     session: OpenSession
     model: str
     rows: list[Row]
-    """One for each recovered press."""
     left_out: list[Refused]
-    """(stroke, reason) of each press that was not recovered."""
     out: Path
 
     @property

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
-from brushloop.calibrate.artefact import Frozen
+from brushloop.calibrate.artefact import Frozen, checked_fields
 from brushloop.calibrate.compare import Image, shown
-from brushloop.calibrate.errors import CalibrationError, invalid
+from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import write_whole
 from brushloop.sessions.disk import read_bounded
 from brushloop.sessions.messages import encode_png
@@ -139,8 +139,6 @@ def image_uri(image: NDArray[np.uint8]) -> str:
 
 def photograph_uri(image: NDArray[np.uint8]) -> str:
     """An (h, w) gray photograph as a JPEG data URI, made smaller if a side is longer than `PHOTOGRAPH_PX`."""
-    import cv2
-
     share = min(1.0, PHOTOGRAPH_PX / max(image.shape))
     small = cv2.resize(image, None, fx=share, fy=share, interpolation=cv2.INTER_AREA) if share < 1.0 else image
     data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
@@ -255,10 +253,8 @@ class Sealed(Frozen):
             raise CalibrationError(str(path), f"format is {str(fields_format)[:40]!r}, not {cls.FORMAT!r}")
         if known != digest:
             raise CalibrationError(str(path), "was edited: its digest does not match its contents")
-        try:
+        with checked_fields(str(path)):
             return cls.model_validate(fields)
-        except ValidationError as error:
-            raise invalid(str(path), error) from None
 
 
 def _digest(contents: dict[str, Any]) -> str:

@@ -6,20 +6,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import AliasPath, BaseModel, Field, ValidationError
+from pydantic import AliasPath, BaseModel, Field
 
-from brushloop.calibrate.artefact import Artefact, current, made_by
+from brushloop.calibrate.artefact import Artefact, checked_fields, current, made_by
 from brushloop.calibrate.board.lens import Lens
 from brushloop.calibrate.board.pix2len import Plane
 from brushloop.calibrate.board.spec import BoardSpec
-from brushloop.calibrate.errors import CalibrationError, invalid
+from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.work import FOLDER as FINISHED
 from brushloop.calibrate.work import Store
 from brushloop.sessions.disk import read_bounded
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Header, Stroke
 
-Kind = Literal["press", "drag"]
 EFFECTIVE = "rig.effective.json"
 """The configuration in effect: rig.toml, with the changes that the environment made."""
 OTHER_KIND = {
@@ -75,7 +74,7 @@ class OpenSession:
         return origin | {"calibration": self.calibration_digest, "software": made_by()}
 
 
-def open_session(place: Path | Recording, kind: Kind | None = None) -> OpenSession:
+def open_session(place: Path | Recording, kind: Literal["press", "drag"] | None = None) -> OpenSession:
     """Open a session by its folder, MCAP file or opened recording, with the calibration in use.
 
     Raises `InputError`, and `CalibrationError` for a session without strokes, with some of another kind, without a
@@ -114,7 +113,5 @@ def rig_of(session: Recording | Path) -> RigView:
     inside = isinstance(session, Recording)
     where = f"{session.path} {EFFECTIVE}" if inside else str(session / EFFECTIVE)
     data = session.attachment(EFFECTIVE) if inside else read_bounded(session / EFFECTIVE)
-    try:
+    with checked_fields(where):
         return RigView.model_validate_json(data)
-    except ValidationError as error:
-        raise invalid(where, error) from None

@@ -53,21 +53,21 @@ def find_board(image: Gray, board: Board, name: str, expected: int | None = None
     `expected` is the number of corners that a sheet on the board leaves visible; all of them by default.
     """
     corners = _checkerboard(image, board, name) if isinstance(board, Checkerboard) else _charuco(image, board, name)
-    pixels, ids, board_mm, total = corners
+    pixels, board_mm, total = corners
     flags, wanted = list[str](), total if expected is None else expected
     saturated = float(np.count_nonzero(image >= SATURATED)) / image.size
     if saturated > MOST_SATURATED:
         flags.append(f"{100 * saturated:.0f} % of the pixels are saturated: expose less")
-    if len(ids) < PARTLY_HIDDEN * wanted:
-        flags.append(f"only {len(ids)} of {wanted} corners are seen: the board is partly hidden or out of view")
-    return BoardView(name, (image.shape[1], image.shape[0]), pixels, board_mm, ids, tuple(flags))
+    if len(pixels) < PARTLY_HIDDEN * wanted:
+        flags.append(f"only {len(pixels)} of {wanted} corners are seen: the board is partly hidden or out of view")
+    return BoardView(name, (image.shape[1], image.shape[0]), pixels, board_mm, tuple(flags))
 
 
 def _blank(image: Gray) -> bool:
     return float(np.percentile(image, 99) - np.percentile(image, 1)) < LEAST_CONTRAST
 
 
-def _charuco(image: Gray, spec: BoardSpec, name: str) -> tuple[Floats, NDArray[np.int64], Floats, int]:
+def _charuco(image: Gray, spec: BoardSpec, name: str) -> tuple[Floats, Floats, int]:
     board = charuco_board(spec, name)
     pixels, ids, numbers = _detected(image, board)
     twice = sorted(number for number, times in Counter(int(n) for n in numbers).items() if times > 1)
@@ -94,8 +94,7 @@ def _charuco(image: Gray, spec: BoardSpec, name: str) -> tuple[Floats, NDArray[n
         raise CalibrationError(name, why)
     board_mm = np.asarray(board.getChessboardCorners(), np.float64)[ids, :2]
     gap_mm = 0.5 * (spec.square_mm - spec.marker_mm)
-    fine = _refined(image, pixels, board_mm, spec.square_mm, gap_mm)
-    return fine, ids, board_mm, total
+    return _refined(image, pixels, board_mm, spec.square_mm, gap_mm), board_mm, total
 
 
 def _detected(image: Gray, board: cv2.aruco.CharucoBoard) -> tuple[Floats, NDArray[np.int64], NDArray[np.int64]]:
@@ -113,14 +112,13 @@ def _detected(image: Gray, board: cv2.aruco.CharucoBoard) -> tuple[Floats, NDArr
     return corners.reshape(-1, 2).astype(np.float64), own.astype(np.int64), every.astype(np.int64)
 
 
-def _checkerboard(image: Gray, board: Checkerboard, name: str) -> tuple[Floats, NDArray[np.int64], Floats, int]:
+def _checkerboard(image: Gray, board: Checkerboard, name: str) -> tuple[Floats, Floats, int]:
     columns, rows = board.inner_corners
     pixels = _squares(image, board.inner_corners)
     if pixels is None:
         raise CalibrationError(name, _why_no_board(image, board.inner_corners))
-    ids = np.arange(columns * rows, dtype=np.int64)
     board_mm = (_grid(board.inner_corners) + 1.0) * board.square_mm
-    return _refined(image, pixels, board_mm, board.square_mm, board.square_mm), ids, board_mm, columns * rows
+    return _refined(image, pixels, board_mm, board.square_mm, board.square_mm), board_mm, columns * rows
 
 
 def _grid(inner: tuple[int, int]) -> Floats:

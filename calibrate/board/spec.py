@@ -9,11 +9,11 @@ from typing import Annotated, Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from brushloop.calibrate.artefact import Frozen
+from brushloop.calibrate.artefact import Frozen, checked_fields
 from brushloop.calibrate.commands import BoardOptions, PrintRequest
-from brushloop.calibrate.errors import CalibrationError, invalid
+from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written, check_target
 from brushloop.sessions.terminal import Progress, unseen
 
@@ -70,8 +70,6 @@ class BoardView:
     """(n, 2) corners in the photograph."""
     board_mm: NDArray[np.float64]
     """(n, 2) the same corners on the board: x right, y down, from its upper left corner."""
-    ids: NDArray[np.int64]
-    """(n,) number of each corner, row by row."""
     flags: tuple[str, ...] = ()
     """Problems with the photograph, although corners were found."""
 
@@ -110,14 +108,12 @@ def named_board(options: BoardOptions) -> Board:
         what = "give either --checkerboard (inner corners) or --charuco (squares), such as 9x6"
         raise CalibrationError("board", what)
     size, square_mm = (checkerboard or charuco).lower().split("x"), options.square_mm
-    try:
+    with checked_fields("board"):
         if checkerboard:
             return Checkerboard.model_validate({"inner_corners": size, "square_mm": square_mm})
         marker_mm = options.marker_mm or 0.75 * square_mm
         markers = {"marker_mm": marker_mm, "dictionary": options.dictionary, "origin_mm": (0.0, 0.0)}
         return BoardSpec.model_validate({"squares": size, "square_mm": square_mm} | markers)
-    except ValidationError as error:
-        raise invalid("board", error) from None
 
 
 def check_pdf(path: Path) -> None:
@@ -177,11 +173,10 @@ def drawn(board: Board, page: str) -> Any:
         size = f"{width:g} x {height:g} mm with {MARGIN_MM:g} mm around it and its name below"
         raise CalibrationError(f"page {page}", f"has no room for a board of {size}")
     left, top = (page_mm[0] - width) / 2.0, (page_mm[1] - height - TEXT_ROOM_MM) / 2.0
-    black = [(left + x, top + y, w, h) for x, y, w, h in rectangles(board)]
     figure: Any = Figure(figsize=(page_mm[0] / MM_PER_INCH, page_mm[1] / MM_PER_INCH))
     # From mm with y down to inches with y up.
     from_mm = Affine2D().translate(0.0, -page_mm[1]).scale(1.0 / MM_PER_INCH, -1.0 / MM_PER_INCH)
-    patches = [Patch((x, y), w, h) for x, y, w, h in black]
+    patches = [Patch((left + x, top + y), w, h) for x, y, w, h in rectangles(board)]
     placed = from_mm + figure.dpi_scale_trans
     figure.add_artist(PatchCollection(patches, color="black", linewidth=0.0, transform=placed))
     words = f"{describe(board)}. Print at 100 %: the board is {width:g} x {height:g} mm."

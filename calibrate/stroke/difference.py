@@ -74,7 +74,9 @@ def new_stroke(
         sizes = [f"{image.shape[1]} x {image.shape[0]} px" for image in (after, before)]
         raise CaptureRefused(where, f"is {sizes[0]}, but the photograph before it is {sizes[1]}")
     shift = _shift(before, after)
-    first, second = _reflectance(before), _reflectance(_moved(after, (-shift[0], -shift[1])))
+    back = np.array([[1.0, 0.0, -shift[0]], [0.0, 1.0, -shift[1]]])
+    aligned = cv2.warpAffine(after, back, after.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
+    first, second = _reflectance(before), _reflectance(cast("Gray", aligned))
     clean = first > DARK_SHARE
     darker = np.where(clean, first - second, 0.0).astype(np.float32)
     quiet = darker[clean & (darker < RIM)]
@@ -108,12 +110,6 @@ def _shift(before: Gray, after: Gray) -> tuple[float, float]:
         return 0.0, 0.0
     dx, dy = (float(v) for v in warp[:, 2])
     return (dx, dy) if correlation >= LEAST_CORRELATION and max(abs(dx), abs(dy)) <= MOST_SHIFT_PX else (0.0, 0.0)
-
-
-def _moved(image: Gray, by: tuple[float, float]) -> Gray:
-    matrix = np.array([[1.0, 0.0, by[0]], [0.0, 1.0, by[1]]])
-    size = (image.shape[1], image.shape[0])
-    return cast("Gray", cv2.warpAffine(image, matrix, size, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _reflectance(image: Gray) -> Soft:

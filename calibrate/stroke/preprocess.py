@@ -6,7 +6,6 @@ measured. All later steps work on `Prepared`: a binary mask and soft ink at 20 p
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import cast
@@ -22,7 +21,7 @@ from brushloop.calibrate.errors import CaptureRefused
 Soft = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Rect = tuple[float, float, float, float]
-"""Four lengths: x, y, width and height of a rectangle, or how far to reach to the left, top, right and bottom."""
+"""x, y, width and height of a rectangle."""
 PX_PER_MM = 20.0
 """Resolution of the raster that strokes are measured on (0.05 mm a pixel)."""
 MAX_RASTER_PX = 8192
@@ -75,22 +74,6 @@ def rescale(image: Gray, px_per_mm: tuple[float, float], where: str) -> Gray:
         raise CaptureRefused(where, f"is {size[0]} x {size[1]} px at 20 px/mm, allowed 8 to {MAX_RASTER_PX}")
     shrinks = size[0] < width
     return cast("Gray", cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR))
-
-
-def cut_out(
-    image: Gray, point_px: tuple[float, float], px_per_mm: tuple[float, float], reach_mm: Rect, where: str
-) -> tuple[Gray, tuple[float, float]]:
-    """The part of a photograph that reaches so far from a point to the left, top, right and bottom; the point in it.
-
-    Raises `CaptureRefused` for a point so far outside that nothing is left.
-    """
-    (x, y), (left, top, right, bottom) = point_px, reach_mm
-    column, row = (max(0, math.floor(at - reach)) for at, reach in ((x, left * px_per_mm[0]), (y, top * px_per_mm[1])))
-    last = max(0, math.ceil(y + bottom * px_per_mm[1])), max(0, math.ceil(x + right * px_per_mm[0]))
-    part = image[row : last[0], column : last[1]]
-    if not part.size:
-        raise CaptureRefused(where, NOT_IN_FIELD)
-    return part, (x - column, y - row)
 
 
 def rectify_by(image: Gray, plane: Plane, window_mm: Rect, where: str) -> Gray:

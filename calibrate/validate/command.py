@@ -49,8 +49,6 @@ MAX_PICTURE_BYTES = 16 * 1024 * 1024
 SIGNIFICANT = 0.05
 Series = tuple[str, str, str, str]
 """Model, alignment, tone, measure."""
-Strokes = dict[tuple[str, ...], float]
-"""Scores by (H, alpha) and, where the same strokes are compared, recording and stroke."""
 Beside = dict[Path, LoopRecord | WrittenRecord]
 """The loops and characters that belong to the sessions of a report, by their files."""
 
@@ -302,7 +300,7 @@ def report_path(place: Path) -> Path:
     raise CalibrationError(str(place), why)
 
 
-def _scores(path: Path, report: Report, *, by_stroke: bool) -> dict[Series, Strokes]:
+def _scores(path: Path, report: Report, *, by_stroke: bool) -> dict[Series, dict[tuple[str, ...], float]]:
     """Read scores by condition, recording and stroke, or averaged by condition.
 
     Raises `CalibrationError` for an edited table.

@@ -70,6 +70,8 @@ def page_of(
     `figures_13` are sessions of characters and their pictures as data URIs.
     """
     best, worst = extremes(outcome, report.shown)
+    # Some captures next to the prediction of every model: the paper's figures 3, 10 and 11.
+    pressed = [outcome.scores.presses[k] for k in first_of_conditions(outcome, MAX_CONDITIONS)]
     return render(
         "report.html.j2",
         report=report,
@@ -93,7 +95,8 @@ def page_of(
         condition_columns=[model for name in CONDITION_COLUMNS if (model := report.model(name)) is not None],
         conditions=outcome.scores.conditions() if report.stats else {},
         samples=[pictured(outcome, k, report.shown) for k in first_of_conditions(outcome, MAX_SAMPLES)],
-        side=side_by_side(outcome),
+        labels={model.info.name: model.info.label for group in outcome.models.values() for model in group},
+        lines=[(press, outcome.predicted(press)[0]) for press in pressed],
         drawn_by=_label(report, report.shown),
         best=[pictured(outcome, k, report.shown) for k in best],
         worst=[pictured(outcome, k, report.shown) for k in worst],
@@ -138,13 +141,6 @@ def pictured(outcome: Outcome, k: int, model: str) -> dict[str, Any]:
     if drawn is not None:
         csim, ssim = 100.0 * outcome.scores.of_key(model, STRICT)[k]
     return {"press": press, "drawn": drawn, "scored": bool(np.isfinite(csim)), "csim": csim, "ssim": ssim}
-
-
-def side_by_side(outcome: Outcome) -> dict[str, Any]:
-    """Some captures next to the prediction of every model: the paper's figures 3, 10 and 11."""
-    labels = {model.info.name: model.info.label for group in outcome.models.values() for model in group}
-    presses = [outcome.scores.presses[k] for k in first_of_conditions(outcome, MAX_CONDITIONS)]
-    return {"labels": labels, "lines": [(press, outcome.predicted(press)[0]) for press in presses]}
 
 
 def first_of_conditions(outcome: Outcome, most: int) -> list[int]:

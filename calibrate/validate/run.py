@@ -10,7 +10,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,21 +28,27 @@ from brushloop.calibrate.stats import CEILING, others_of
 from brushloop.calibrate.work import Arrays, Scheduler, key_of
 from brushloop.model.ccdbsm import Brush, DomainError
 from brushloop.model.fitted import NAME as FITTED
+from brushloop.model.fitted import fitted_model
 from brushloop.model.generator import SHIPPED_GENERATOR
+from brushloop.model.generator.stroke import load_generator
 from brushloop.model.presses import DepthTilt, Draw, refit_bezier
+from brushloop.model.strokes import StrokeModel, stroke_model, stroke_models
 from brushloop.sessions.disk import file_sha256
 from brushloop.sessions.records import Condition
 from brushloop.sessions.terminal import Progress, counted, unseen
-
-if TYPE_CHECKING:
-    from brushloop.model.strokes import StrokeModel
 
 PUBLISHED, NOT_PREDICTED = "as published", "does not predict this press"
 HELD_OUT = "fitted, held-out conditions"
 PRESSES = "captured presses"
 FITTED_HELD_OUT, BEZIER_REFITTED = "ccd-bsm-heldout", "bezier-refitted"
 ANOTHER = "another press"
-"""A capture predicted by other captures of its condition, averaged: how well one press predicts another."""
+PRESS_ROWS = {
+    ANOTHER: "A capture predicted by other captures of its condition, averaged: how well the brush repeats a press. A "
+    "model can do better, because both presses stray from their average image.",
+    CEILING: "The score of a perfect model, which draws the best image of each condition: estimated from the "
+    "similarity of other presses of the condition.",
+}
+"""Definitions of what stands in the tables beside the models."""
 LAMBDAS = {"ccd-bsm-lambda-1": 1.0, "ccd-bsm-lambda-pi/2": 0.5 * math.pi}
 """Values compared in addition to lambda = pi, which is CCD-BSM itself: the paper's figure 3."""
 ORDER = ("ccd-bsmg", "ccd-bsm", FITTED, FITTED_HELD_OUT, "bezier", BEZIER_REFITTED, "ellipse", "line", "circle")
@@ -72,39 +78,6 @@ class ModelInfo(Frozen):
     """What it knows of these presses: `as published`, `fitted, in sample`, `fitted, held-out conditions`, ..."""
     sha256: str = ""
     """Hash of a generator's file."""
-
-
-KINDS_OF_PRESS = (
-    ModelInfo(
-        name=ANOTHER,
-        label="another press",
-        definition="A capture predicted by other captures of its condition, averaged: how well the brush repeats a "
-        "press. A model can do better, because both presses stray from their average image.",
-        basis=PRESSES,
-    ),
-    ModelInfo(
-        name=CEILING,
-        label=CEILING,
-        definition="The score of a perfect model, which draws the best image of each condition: estimated from the "
-        "similarity of other presses of the condition.",
-        basis=PRESSES,
-    ),
-)
-"""What stands in the tables beside the models."""
-BEZIER_LEFT_OUT = ModelInfo(
-    name=BEZIER_REFITTED,
-    label="Bezier refitted",
-    definition="Two mirrored cubic Bezier curves; ends, belly and shoulder regressed on the captures of all other "
-    "conditions.",
-    basis=HELD_OUT,
-)
-BRUSH_LEFT_OUT = ModelInfo(
-    name=FITTED_HELD_OUT,
-    label="CCD-BSM calibrated",
-    definition="CCD-BSM's lengths with gains, powers, profile and edges fitted to the captures of all other "
-    "conditions.",
-    basis=HELD_OUT,
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,10 +179,6 @@ def known_models(session: FittedSession, request: ValidateRequest) -> Sequence[M
     Where no generator is given, the shipped one is used for brushes of its size. Raises what `load_generator` does, and
     `CalibrationError` for two generators of one name.
     """
-    from brushloop.model.fitted import fitted_model
-    from brushloop.model.generator.stroke import load_generator
-    from brushloop.model.strokes import stroke_model, stroke_models
-
     brush, fit = brush_of(session.header), session.fit
     models = [_of_model(model, PUBLISHED) for model in stroke_models(brush).values()]
     if fit is not None:
@@ -252,11 +221,14 @@ def _held_out(
         what = f"{session.header.session_id}: conditions left out in turn"
         fits = refits(jobs, session.store, scheduler, what, progress)
         brushes = {at: fit.outline for (fold, _), fit in zip(left_out, fits, strict=True) for at in fold}
-        yield _left_out(BRUSH_LEFT_OUT, brushes)
-    yield _left_out(BEZIER_LEFT_OUT, {at: refit_bezier(others) for fold, others in left_out for at in fold})
+        how = "CCD-BSM's lengths with gains, powers, profile and edges fitted to"
+        yield _left_out(FITTED_HELD_OUT, "CCD-BSM calibrated", how, brushes)
+    how = "Two mirrored cubic Bezier curves; ends, belly and shoulder regressed on"
+    curves = {at: refit_bezier(others) for fold, others in left_out for at in fold}
+    yield _left_out(BEZIER_REFITTED, "Bezier refitted", how, curves)
 
 
-def _left_out(info: ModelInfo, outlines: Mapping[DepthTilt, Draw | None]) -> Model:
+def _left_out(name: str, label: str, how: str, outlines: Mapping[DepthTilt, Draw | None]) -> Model:
     """A model that was fitted without the condition that it predicts; None where the other conditions are too few."""
 
     def images(at: Condition) -> Pixels:
@@ -266,7 +238,8 @@ def _left_out(info: ModelInfo, outlines: Mapping[DepthTilt, Draw | None]) -> Mod
             raise DomainError("depth_mm", at.depth_mm, "what the other conditions determine", hint)
         return images_of(outline(at.depth_mm, at.tilt_deg), 0.0)
 
-    return Model(info, images)
+    definition = f"{how} the captures of all other conditions."
+    return Model(ModelInfo(name=name, label=label, definition=definition, basis=HELD_OUT), images)
 
 
 ScoreJob = tuple[Pixels, tuple[Sequence[Pixels], ...]]

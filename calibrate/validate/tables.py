@@ -167,7 +167,7 @@ def report_of(outcome: Outcome, scores_sha256: str, beside: Collection[LoopRecor
         mm_per_px=MM_PER_PX,
         ssim_settings=SSIM_SETTINGS,
         sessions=tuple(_session(session, outcome.scores) for session in outcome.sessions),
-        models=(*_models(outcome), *(kind for kind in run.KINDS_OF_PRESS if kind.name in present)),
+        models=tuple(_models(outcome, present)),
         shown=next((name for name in order if name in present), ""),
         stats=stats,
         refused=tuple(outcome.refused),
@@ -184,20 +184,22 @@ def _stats(scores: Scores) -> Iterator[Stat]:
     another = 100.0 * scores.of(ANOTHER)
     ceiling: Floats = np.apply_along_axis(ceiling_values, 0, another, scores.group_of)
     percent = {model: 100.0 * scores.of(model) for model in scores.models} | {CEILING: ceiling}
-    presses = {kind.name for kind in run.KINDS_OF_PRESS}
     for model, values in percent.items():
-        yield from statistics(model, values, scores.group_of, None, None if model in presses else ceiling)
+        yield from statistics(model, values, scores.group_of, None, None if model in run.PRESS_ROWS else ceiling)
     for condition, at in scores.conditions().items():
         for model, values in percent.items():
             yield from statistics(model, values[at], scores.group_of[at], (condition.depth_mm, condition.tilt_deg))
 
 
-def _models(outcome: Outcome) -> Iterator[ModelInfo]:
-    """Yield every model that was compared, with what it knew of the presses of each session."""
+def _models(outcome: Outcome, present: Sequence[str]) -> Iterator[ModelInfo]:
+    """Yield every model that was compared, with what it knew of the presses of each session; then the other rows."""
     for name in outcome.scores.models:
         infos = [model.info for group in outcome.models.values() for model in group if model.info.name == name]
         if infos:
             yield infos[-1].model_copy(update={"basis": "; ".join(dict.fromkeys(info.basis for info in infos))})
+    for name, definition in run.PRESS_ROWS.items():
+        if name in present:
+            yield ModelInfo(name=name, label=name, definition=definition, basis=run.PRESSES)
 
 
 def _session(session: FittedSession, scores: Scores) -> Session:

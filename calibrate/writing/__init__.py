@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
-from pydantic import Field, PlainSerializer, PlainValidator, ValidationError, model_validator
+from pydantic import Field, PlainSerializer, PlainValidator, model_validator
 
-from brushloop.calibrate.artefact import Frozen, SessionFit, made_by
+from brushloop.calibrate.artefact import Frozen, SessionFit, checked_fields, made_by
 from brushloop.calibrate.commands import PROTOCOL, PlanRequest
 from brushloop.calibrate.compare import SIZE_PX, Image
-from brushloop.calibrate.errors import CalibrationError, invalid
+from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import Written
 from brushloop.calibrate.report import BLUE, picture_grid, save_picture, write_files
 from brushloop.model.ccdbsm import Brush, DomainError
@@ -166,10 +166,8 @@ class Plan(Frozen):
 def load_plan(path: Path) -> Plan:
     """Read plan.json, or the one in a plan's folder. Raises `CalibrationError`."""
     path = path / FILE if path.is_dir() else path
-    try:
+    with checked_fields(str(path)):
         return Plan.model_validate_json(read_bounded(path, MAX_PLAN_BYTES))
-    except ValidationError as error:
-        raise invalid(str(path), error) from None
 
 
 def write_plan(plan: Plan, repeats: int, out: Path) -> Path:
@@ -287,11 +285,7 @@ def read_wanted(what: str, data: Path | None, patch: Patch) -> list[Figure]:
         raise CalibrationError("character", f"expected 1 to {MAX_FIGURES} characters")
     if len(set(what)) != len(what):
         raise CalibrationError("character", "a character occurs twice: set the protocol's `repeats` to write it again")
-    figures = [_character(name, data, patch) for name in what]
-    for figure in figures:
-        if not figure.wanted.any():
-            raise CalibrationError(figure.name, "has no width anywhere: nothing would be written")
-    return figures
+    return [_character(name, data, patch) for name in what]
 
 
 def _character(name: str, data: Path | None, patch: Patch) -> Figure:
@@ -307,10 +301,13 @@ def _character(name: str, data: Path | None, patch: Patch) -> Figure:
         strokes = parse_glyph(read_bounded(path).decode())
     except ValueError as error:
         raise CalibrationError(str(path), str(error)) from None
+    wanted = reference(strokes, patch)
+    if not wanted.any():
+        raise CalibrationError(name, "has no width anywhere: nothing would be written")
     source = SHIPPED_SOURCE if data is None else data.name
     paths = paths_of(strokes, patch, STEP_MM)
     medians = [np.column_stack((path.points, path.half_width_mm)).tolist() for path in paths]
-    fields = {"name": name, "source": source, "medians": medians, "wanted": reference(strokes, patch)}
+    fields = {"name": name, "source": source, "medians": medians, "wanted": wanted}
     return Figure.model_validate(fields)
 
 

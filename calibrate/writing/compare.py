@@ -47,7 +47,6 @@ PAIRS = (SIMULATED, REFERENCE, PLANNED, ANOTHER)
 """The comparisons made."""
 PAPER_ROWS = {SIMULATED: images.TABLE_3["ccd-bsmg"], REFERENCE: images.TABLE_3[images.ROBOT_WRITING]}
 """The paper's row shown with a comparison: our reading, see `TABLE_3`."""
-NORMAL_SIDE_PX = 100
 
 
 @dataclass(frozen=True)
@@ -217,7 +216,7 @@ def aligned(ink: Image, alignment: Alignment) -> Image:
     rows, columns = (np.flatnonzero((ink > 0.5).any(axis=axis)) for axis in (1, 0))
     if not rows.size:
         raise ValueError("holds no ink")
-    step_px = float(1 + max(np.ptp(rows), np.ptp(columns))) / NORMAL_SIDE_PX
+    step_px = float(1 + max(np.ptp(rows), np.ptp(columns))) / images.NORMAL_LENGTH_PX
     left, top = (0.5 * float(at[0] + at[-1] + 1 - SIZE_PX * step_px) for at in (columns, rows))
     return images.averaged(ink, (left, top), step_px, SIZE_PX, fine=1).clip(0.0, 1.0)
 

@@ -200,7 +200,7 @@ async def _board_in(visit: Visit, picture: Gray, name: str, *, lying: bool) -> B
         return None
     columns, rows = board.squares
     if not lying:
-        visit.say(f"{len(view.ids)} of {(columns - 1) * (rows - 1)} corners of the board are seen", picture=picture)
+        visit.say(f"{len(view.pixels)} of {(columns - 1) * (rows - 1)} corners of the board are seen", picture=picture)
     return view
 
 

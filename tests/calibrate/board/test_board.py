@@ -43,8 +43,7 @@ CHARUCO = BoardSpec(squares=(5, 7), square_mm=40.0, marker_mm=20.0, dictionary="
 TRUE = Lens(size_px=(640, 480), matrix=(800.0, 805.0, 322.0, 236.0), distortion=(-0.21, 0.06, 0.001, -0.0005, 0.0))
 LONG = TRUE.model_copy(update={"matrix": (1280.0, 1288.0, 322.0, 236.0)})
 """The lens of another camera."""
-IDS = np.arange(54)
-BOARD_MM = np.column_stack([IDS % 9 + 1.0, IDS // 9 + 1.0]) * 25.0
+BOARD_MM = np.column_stack([np.arange(54) % 9 + 1.0, np.arange(54) // 9 + 1.0]) * 25.0
 
 
 def checkers(square_px: int = 40) -> np.ndarray:
@@ -62,7 +61,7 @@ def view(name: str, turn: Sequence[float], place: Sequence[float], noise: np.nda
     """Corners as a lens sees them, each off by its noise (54, 2) px."""
     flat = np.column_stack([BOARD_MM, np.zeros(54)])
     pixels, _ = cv2.projectPoints(flat, np.array(turn), np.array(place), lens.camera, np.array(lens.distortion))
-    return BoardView(name, TRUE.size_px, pixels.reshape(-1, 2) + noise, BOARD_MM, IDS)
+    return BoardView(name, TRUE.size_px, pixels.reshape(-1, 2) + noise, BOARD_MM)
 
 
 def views(count: int, noise_px: float = 0.1, seed: int = 0, lens: Lens = TRUE) -> list[BoardView]:
@@ -94,7 +93,7 @@ def test_opencvs_own_photographs_give_its_own_lens() -> None:
     assert fitted.rms_px <= 0.20
     assert fitted.lens.matrix[0] == pytest.approx(535.92, rel=0.01)
     assert (fitted.dropped, fitted.warnings) == ({}, ())
-    assert len(find_board(cv2.imread(str(DATA / "choriginal.jpg"), 0), CHARUCO, "photograph").ids) == 24
+    assert len(find_board(cv2.imread(str(DATA / "choriginal.jpg"), 0), CHARUCO, "photograph").pixels) == 24
 
 
 @pytest.mark.parametrize("slant", [0.0, 0.4], ids=["face on", "slanted alike"])
@@ -216,7 +215,7 @@ def printed(board: Board) -> np.ndarray:
 @pytest.mark.parametrize("board", [SPEC, Checkerboard(inner_corners=(7, 5), square_mm=20.0)], ids=["charuco", "plain"])
 def test_a_printed_board_is_seen_whole_and_at_true_scale(board: Board) -> None:
     view = find_board(printed(board), board, "print")
-    assert len(view.ids) in (24, 35)
+    assert len(view.pixels) in (24, 35)
     assert np.polyfit(view.board_mm[:, 0], view.pixels[:, 0], 1)[0] == pytest.approx(PX_PER_MM, rel=1e-4)
     [words] = drawn(board, "a4").texts
     assert "of 20 mm" in words.get_text()
