@@ -173,9 +173,7 @@ def shown(images: Pixels) -> Image:
 def brush_of(header: Header) -> Brush:
     """The brush that a recording names; missing sizes are those of the published brush."""
     nominal = Brush()
-    return Brush(
-        radius_mm=header.brush_radius_mm or nominal.radius_mm, length_mm=header.brush_length_mm or nominal.length_mm
-    )
+    return Brush(header.brush_radius_mm or nominal.radius_mm, header.brush_length_mm or nominal.length_mm)
 
 
 def to_pixels(image: Image) -> Pixels:

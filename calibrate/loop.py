@@ -27,7 +27,7 @@ from brushloop.model.ccdbsm import DomainError
 from brushloop.model.similarity import SSIM_SETTINGS
 from brushloop.model.strokes import StrokeModel
 from brushloop.sessions.disk import check_writable
-from brushloop.sessions.records import Condition, Header, Source
+from brushloop.sessions.records import Condition, Source
 from brushloop.sessions.terminal import Progress, unseen
 
 PAGE, TABLE = "loop.html", "loop.csv"
@@ -121,7 +121,10 @@ def compare(request: CompareLoopRequest, progress: Progress = unseen) -> Written
     where, source = str(second.recording.path), second.header.source
     if (first.header.source == Source.LOOPBACK) != (source == Source.LOOPBACK):
         raise CalibrationError(where, f"has the source {source}, but the original has {first.header.source}")
-    repeated = _replayed(second.header)
+    try:
+        repeated: Any = json.loads(second.header.protocol)["of"]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        repeated = None
     if repeated != first.header.session_id:
         what = "" if repeated is None else f", but {repeated}"
         raise CalibrationError(where, f"does not repeat {first.header.session_id}{what}")
@@ -201,15 +204,6 @@ def statistics_of(scores: Scores) -> Iterator[Stat]:
     for compared in scores.models:
         percent = 100.0 * scores.of(compared)
         yield from statistics(compared, percent, scores.group_of, ceiling=another if compared == AGAIN else None)
-
-
-def _replayed(header: Header) -> str | None:
-    """The session whose presses the protocol repeats; None where it repeats none."""
-    try:
-        of: Any = json.loads(header.protocol)["of"]
-        return None if of is None else str(of)
-    except (ValueError, KeyError, TypeError, RecursionError):
-        return None
 
 
 def write_loop(

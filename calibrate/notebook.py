@@ -25,6 +25,8 @@ from brushloop.calibrate.presses import Refused, read_presses, rectified
 from brushloop.calibrate.session import Calibration, OpenSession, open_session
 from brushloop.calibrate.stroke.preprocess import Gray, Prepared
 from brushloop.model.ccdbsm import Brush
+from brushloop.model.fitted import fitted_model
+from brushloop.model.generator.stroke import named_model
 from brushloop.model.strokes import Prediction
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.events import Begin, StepEvent, StepKind
@@ -205,9 +207,6 @@ def predict(condition: Condition, brush: Brush | BrushFit | None = None, model: 
 
     Raises `UnknownModelError`, and `DomainError` for a press that the model does not predict.
     """
-    from brushloop.model.fitted import fitted_model
-    from brushloop.model.generator.stroke import named_model
-
     chosen = brush or Brush()
     drawn = named_model(model, chosen) if isinstance(chosen, Brush) else fitted_model(chosen.press())
     images = simulated(drawn, condition.depth_mm, condition.tilt_deg)

@@ -8,13 +8,12 @@ from typing import Any, Literal
 
 from pydantic import AliasPath, BaseModel, Field
 
+from brushloop.calibrate import work
 from brushloop.calibrate.artefact import Artefact, checked_fields, current, made_by
 from brushloop.calibrate.board.lens import Lens
 from brushloop.calibrate.board.pix2len import Plane
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.work import FOLDER as FINISHED
-from brushloop.calibrate.work import Store
 from brushloop.sessions.disk import read_bounded
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Header, Stroke
@@ -54,7 +53,7 @@ class OpenSession:
     """At least one."""
     calibration: Calibration | None
     """None for an import, which has its own scale."""
-    store: Store
+    store: work.Store
 
     @property
     def header(self) -> Header:
@@ -95,7 +94,7 @@ def open_session(place: Path | Recording, kind: Literal["press", "drag"] | None 
         if calibration.recording_sha256 != sha256:
             problem = f"belongs to another recording ({calibration.session_id}): run `brushloop calibrate` again"
             raise CalibrationError(str(used), problem)
-    return OpenSession(recording, sha256, strokes, calibration, Store(folder / FINISHED))
+    return OpenSession(recording, sha256, strokes, calibration, work.Store(folder / work.FOLDER))
 
 
 class RigView(BaseModel):

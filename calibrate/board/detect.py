@@ -27,7 +27,6 @@ MOST_SATURATED = 0.4
 PARTLY_HIDDEN = 0.7
 """Share of corners below which a board is reported as partly hidden."""
 CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-
 LEAST_CONTRAST = 30.0
 BLANK = "is blank: nothing in it is darker than the rest"
 GRID_ERROR = 0.25

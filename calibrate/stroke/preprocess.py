@@ -169,10 +169,14 @@ def prepare(
 ) -> Prepared:
     """Find the stroke on a 20 px/mm raster. `patch_px` (x, y, w, h) hides everything outside the patch.
 
-    `join_mm` and `speck_share` say which components belong to the stroke. Raises `CaptureRefused` if the raster is
-    blank or nothing is left after cleaning.
+    `join_mm` and `speck_share` say which components belong to the stroke. Raises `CaptureRefused` if the raster shows
+    too little of the patch or is blank, or nothing is left after cleaning.
     """
-    window = _patch_window(raster, patch_px, where)
+    height, width = raster.shape
+    x, y, w, h = patch_px if patch_px is not None else (0, 0, width, height)
+    window = slice(max(y, 0), min(y + h, height)), slice(max(x, 0), min(x + w, width))
+    if min(side.stop - side.start for side in window) < MIN_WINDOW_PX:
+        raise CaptureRefused(where, "shows less than 2 mm of the stroke's patch")
     # Only the patch: neighbours' ink and the table's edge would distort the estimated lighting.
     reflectance = np.ones(raster.shape, np.float32)
     reflectance[window] = flatten(raster[window])
@@ -182,18 +186,14 @@ def prepare(
     contrast = 1.0 - float(np.partition(pixels, kth)[kth])
     if contrast < CONTRAST_GATE:
         raise CaptureRefused(where, f"is blank: at most {contrast:.2f} darker than paper, {CONTRAST_GATE} is needed")
-    otsu, _ = cv2.threshold(to_levels(reflectance[window]), 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
-    ink = to_levels(reflectance) <= round(otsu)
+    levels = np.clip(reflectance * 255.0, 0.0, 255.0).astype(np.uint8)
+    otsu, _ = cv2.threshold(levels[window], 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    ink = levels <= round(otsu)
     mask, others_mm2 = components(ink, anchor_px, join_mm, speck_share)
     if not mask.any():
         raise CaptureRefused(where, "holds no stroke after specks and neighbours were removed")
     flags = _flags(raster[window], mask[window], others_mm2)
     return Prepared(mask, _soft_ink(reflectance, mask), ink, anchor_px, touches_edge(mask[window]), flags)
-
-
-def to_levels(reflectance: Soft) -> Gray:
-    """Map reflectance from 0 to 1 to 256 levels."""
-    return np.clip(reflectance * 255.0, 0.0, 255.0).astype(np.uint8)
 
 
 def _soft_ink(reflectance: Soft, mask: Mask) -> Soft:
@@ -222,16 +222,6 @@ def _flags(raster: Gray, mask: Mask, others_mm2: Sequence[float]) -> tuple[str, 
     if glare > GLARE_MM2:
         flags.append(f"glare: {glare:.1f} mm2 are brighter than paper under this light")
     return tuple(flags)
-
-
-def _patch_window(raster: Gray, patch_px: tuple[int, int, int, int] | None, where: str) -> tuple[slice, slice]:
-    """Rows and columns of the raster that show the patch; all of them without a patch. Raises `CaptureRefused`."""
-    height, width = raster.shape
-    x, y, w, h = patch_px if patch_px is not None else (0, 0, width, height)
-    rows, columns = slice(max(y, 0), min(y + h, height)), slice(max(x, 0), min(x + w, width))
-    if rows.stop - rows.start < MIN_WINDOW_PX or columns.stop - columns.start < MIN_WINDOW_PX:
-        raise CaptureRefused(where, "shows less than 2 mm of the stroke's patch")
-    return rows, columns
 
 
 def touches_edge(mask: Mask) -> bool:

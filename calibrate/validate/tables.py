@@ -96,7 +96,6 @@ class Session(Frozen):
     compared: int
     cut: tuple[str, ...]
     calibration: Calibration | None
-    """None for an import, which brings its own scale."""
     fit: str
     deepest_miss: Stroke | None = None
     """The stroke whose reached depth differs most from the commanded one; None where none is recorded."""

@@ -39,15 +39,13 @@ SHIPPED_SOURCE = "hanzi-writer-data 2.0.1, from Make Me a Hanzi; outlines of Arp
 STEP_MM = 2.0
 """Approximate distance of neighbouring points."""
 TILT_DEG = 5.0
-"""The initial tilt; refinement may change it within reach."""
+"""The initial tilt, which refinement may change within reach; practice strokes keep it."""
 MAX_FIGURES = 20
 MOST_TILT_DEG = 30.0
 MAX_PLAN_BYTES = 4 * 1024 * 1024
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Points = tuple[tuple[tuple[Number, Number, Number, Number, Number], ...], ...]
 """[stroke][point] of x, y, depth, tilt, heading, as in the protocol."""
-Medians = tuple[tuple[tuple[Number, Number, Number], ...], ...]
-"""[stroke][point] of x, y and half width in mm."""
 
 
 def _encoded(ink: Image) -> str:
@@ -131,8 +129,8 @@ class Figure(Frozen):
     wanted: Picture = np.zeros((SIZE_PX, SIZE_PX), np.float32)
     simulated: Picture = np.zeros((SIZE_PX, SIZE_PX), np.float32)
     """The ink as the planning model draws it."""
-    medians: Medians = ()
-    """What the phases follow from; empty for practice strokes."""
+    medians: tuple[tuple[tuple[Number, Number, Number], ...], ...] = ()
+    """[stroke][point] of x, y and half width in mm, which the phases follow from; empty for practice strokes."""
     rounds: Annotated[tuple[Round, ...], Field(max_length=1000)] = ()
     """The rounds of learning so far, in order."""
     best: Points = ()

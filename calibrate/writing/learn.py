@@ -60,8 +60,6 @@ MARGIN = 0.22
 """Share of the patch at each side that is kept free: ink lands behind its command, and must not reach the edge."""
 DEEPEST = 0.3
 """Greatest depth as a share of the brush's length."""
-MM_BETWEEN = 2.0
-TILT_DEG = 5.0
 
 
 def fit(request: FitFootprintRequest, progress: Progress = unseen) -> Written:
@@ -140,7 +138,7 @@ def practice_strokes(side_mm: float, reach: Reach, brush_length_mm: float) -> li
     out: list[Floats] = []
     while len(out) < FIGURES * PER_FIGURE:
         length_mm = rng.uniform(0.2, 1.0) * room_mm
-        count = max(4, round(length_mm / MM_BETWEEN))
+        count = max(4, round(length_mm / writing.STEP_MM))
         heading = rng.uniform(-180.0, 180.0) + np.cumsum(rng.normal(0.0, 8.0, count))
         if len(out) % 3 == 0:
             heading[count // 2 :] += rng.choice([-1.0, 1.0]) * rng.uniform(50.0, 150.0)
@@ -149,7 +147,7 @@ def practice_strokes(side_mm: float, reach: Reach, brush_length_mm: float) -> li
         places += MARGIN * side_mm - low + rng.uniform(0.0, 1.0, 2) * np.maximum(room_mm - (high - low), 0.0)
         depths = rng.uniform(0.1, 1.0, 3) * deepest_mm
         depth = np.interp(np.linspace(0.0, 1.0, count), (0.0, 0.5, 1.0), depths)
-        points = np.column_stack((places, depth, np.full(count, TILT_DEG), heading))
+        points = np.column_stack((places, depth, np.full(count, writing.TILT_DEG), heading))
         stroke = reach.spaced(np.round(reach.within(points, side_mm), 3))
         if len(stroke) >= 3:
             out.append(stroke)
