@@ -178,7 +178,7 @@ def _watching(spans: Spans) -> Iterator[None]:
 
     watched: list[tuple[Any, str, str | None]] = [
         (Run, "perform", None),  # by the kind of its step
-        (AuboArcs, "move", "move"),
+        (AuboArcs, "follow", "move"),
         (OpenCvCamera, "fresh", FRAME),
         (InkStation, "replenish", INK),
         (Recorder, "still", ENCODE),

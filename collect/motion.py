@@ -258,13 +258,9 @@ class Procedures:
         """Make moves and follow paths one after the other, each when the arm rests after the one before."""
         robot, acc_mm_s2 = self.rig.robot, self._config.motion.acc_mm_s2
         for segment in segments:
-            speed_mm_s = segment.speed_mm_s
-            if isinstance(segment, Move):
-                self.target_mm = segment.target.position_mm
-                await robot.move(segment.target, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
-            else:
-                self.target_mm = segment.poses[-1].position_mm
-                await robot.follow(segment.poses, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
+            poses = [segment.target] if isinstance(segment, Move) else segment.poses
+            self.target_mm = poses[-1].position_mm
+            await robot.follow(poses, speed_mm_s=segment.speed_mm_s, acc_mm_s2=acc_mm_s2)
 
     async def queue(self, moves: Sequence[Move]) -> list[Pose]:
         """Send all moves to the controller before the first begins; it then ends them whatever happens to this program.

@@ -118,12 +118,8 @@ class Robot(Device, Protocol):
         """Power the arm and release its brakes; moves nothing."""
         ...
 
-    async def move(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
-        """Move the tip in a straight line that is checked as a whole; returns when the arm has settled."""
-        ...
-
     async def follow(self, poses: Sequence[Pose], *, speed_mm_s: float, acc_mm_s2: float) -> None:
-        """Move the tip through all poses without halting between them, corners rounded within 1 mm."""
+        """Move the tip through all poses without halting, corners rounded within 1 mm; returns when it has settled."""
         ...
 
     async def sequence(self, lines: Sequence[QueuedLine], *, acc_mm_s2: float) -> list[Pose]:

@@ -29,6 +29,7 @@ from brushloop.drivers.arcs import wire
 from brushloop.drivers.camera.source import CameraTable
 from brushloop.drivers.devices import Frame, Identity, Stamp
 from brushloop.drivers.errors import DeviceTimeout
+from brushloop.drivers.force.simulator import ERROR_FRAME
 from brushloop.drivers.force.sri_m8123 import SriM8123
 from brushloop.drivers.host import Clock
 from brushloop.drivers.sim.config import SimConfig, Table, View
@@ -129,8 +130,7 @@ class Lab:
     @property
     def at_rest(self) -> bool:
         """Nothing moves and nothing is queued."""
-        motion = self.rig.world.motion
-        return motion.exec_id(self.rig.world.clock.now_s()) == -1 and motion.size == 0
+        return self.rig.world.motion.exec_id(self.rig.world.clock.now_s()) == -1
 
     def engine(self, **options: Any) -> SteppedEngine:
         """As `brushloop collect` makes it; `options` are those of a `CollectRequest`."""
@@ -324,9 +324,9 @@ class LoopSensor(SriM8123):
 
     async def _read(self) -> None:
         while self._loss is None:
-            for frame in self._board.round():
-                at_s, is_error = self._rig.time.now_s, frame.error
-                self._take(can.Message(at_s, frame.can_id, False, False, is_error, data=frame.data))
+            for can_id, data in self._board.round():
+                at_s, is_error = self._rig.time.now_s, bool(can_id & ERROR_FRAME)
+                self._take(can.Message(at_s, can_id & ~ERROR_FRAME, False, False, is_error, data=data))
             await asyncio.sleep(1.0 / self._rig.config.force_hz)
 
 
@@ -337,16 +337,13 @@ class MemoryLine:
         self.instrument = instrument
         self.came = b""
         """What waits to be read."""
-        self._request = bytearray()
 
     @property
     def in_waiting(self) -> int:
         return len(self.came)
 
     def write(self, data: bytes) -> None:
-        self._request += data
-        while (request := self.instrument.take(self._request)) is not None:
-            self.came += self._answered(request)
+        self.came += self._answered(data)
 
     def read(self, size: int) -> bytes:
         taken, self.came = self.came[:size], self.came[size:]

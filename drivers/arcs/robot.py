@@ -98,10 +98,6 @@ class AuboArcs:
         """The controller's names of its robot mode and its safety mode."""
         return await self._motion.mode(), await self._motion.safety()
 
-    async def move(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
-        """Move the tip in a straight line; returns when the arm has settled within tolerance. See `follow`."""
-        await self.follow([target], speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
-
     async def follow(self, poses: Sequence[Pose], *, speed_mm_s: float, acc_mm_s2: float) -> None:
         """Send lines through all poses without a halt between them; returns when the arm has settled at the last.
 

@@ -17,7 +17,6 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 from brushloop.drivers.camera.source import DEVICE, CameraTable, Capture, Picture, is_repeated
@@ -93,20 +92,9 @@ def is_late(gaps_ns: Sequence[int], latency_ns: int) -> bool:
     return gap_ns > max(3 * usual_ns, latency_ns) or gap_ns < BURST_SHARE * usual_ns
 
 
-# ---------------------------------------------------------------- the driver
-
 POLL_S = 0.005
 REOPEN_AFTER_S = 0.5
 JOIN_S = 5.0
-
-
-@dataclass(frozen=True, slots=True)
-class _Arrival:
-    """A frame that nobody has looked at yet."""
-
-    stamp: Stamp
-    exposed_after_ns: int
-    picture: Picture
 
 
 class OpenCvCamera:
@@ -116,7 +104,8 @@ class OpenCvCamera:
         self._table = table
         self._clock = clock
         self._on_notice = on_notice
-        self._newest: _Arrival | None = None
+        self._newest: tuple[Stamp, int, Picture] = Stamp(0, None, -1), -1, b""
+        """Stamp, earliest exposure and picture of the newest frame, at first of none; nobody has looked at it yet."""
         self._skipped: Counter[Fault] = Counter()
         """Frames that were passed over, by the thread or when somebody looked at them."""
         self._lost_ns: int | None = None
@@ -144,15 +133,15 @@ class OpenCvCamera:
         after_ns, until_s = after.host_ns, time.monotonic() + self._table.timeout_s
         skipped_before = self._skipped.copy()
         while True:
-            newest = self._newest
+            stamp, exposed_after_ns, picture = self._newest
             if self._closing.is_set():
                 raise ConnectionLost(DEVICE, "fresh", "closed")
-            if newest is not None and newest.exposed_after_ns >= after_ns:
-                image = await asyncio.to_thread(looked_at, newest.picture)
+            if exposed_after_ns >= after_ns:
+                image = await asyncio.to_thread(looked_at, picture)
                 if not isinstance(image, str):
-                    return Frame(newest.stamp, newest.exposed_after_ns, image)
+                    return Frame(stamp, exposed_after_ns, image)
                 self._skipped[image] += 1
-                after_ns = newest.exposed_after_ns + 1
+                after_ns = exposed_after_ns + 1
             elif self._ended is not None:
                 raise self._ended
             if time.monotonic() >= until_s:
@@ -227,5 +216,4 @@ class OpenCvCamera:
             if late or repeated:
                 self._skipped["late" if late else "frozen"] += 1
             else:
-                seq = self._newest.stamp.seq + 1 if self._newest is not None else 0
-                self._newest = _Arrival(Stamp(arrival_ns, None, seq), exposed_ns, picture)
+                self._newest = Stamp(arrival_ns, None, self._newest[0].seq + 1), exposed_ns, picture

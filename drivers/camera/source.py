@@ -57,8 +57,6 @@ class CameraTable(BaseModel, frozen=True, extra="forbid"):
     locked: Locked = Locked()
 
 
-# ---------------------------------------------------------------- where frames come from
-
 PROPERTIES = {
     "width": ("CAP_PROP_FRAME_WIDTH", "", 0.0),
     "height": ("CAP_PROP_FRAME_HEIGHT", "", 0.0),
@@ -161,8 +159,6 @@ def _is_loopback(table: CameraTable) -> bool:
     except (ValueError, http.client.HTTPException):
         return False  # FFmpeg knows more kinds of streams
 
-
-# ---------------------------------------------------------------- pictures
 
 Picture: TypeAlias = "bytes | NDArray[np.uint8]"
 """A JPEG, or an (h, w) or (h, w, 3) BGR image."""

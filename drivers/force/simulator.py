@@ -14,7 +14,6 @@ import math
 import random
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 from brushloop.drivers.force.sri_m8123 import BUS_OFF, COMMAND_ID, LOOPBACK_CHANNEL, START, STOP, Wrench, encode_round
 from brushloop.drivers.host import alongside
@@ -22,15 +21,11 @@ from brushloop.drivers.loopback import LoopbackServer
 
 BUS_ERROR = 0x04
 """Class of an error frame: the controller has a problem but is on the bus."""
+ERROR_FRAME = 0x20000000
+"""Flag of an error frame in its id, as in Linux `can/error.h`."""
 
-
-@dataclass(frozen=True, slots=True)
-class CanFrame:
-    """One frame on the bus, 11-bit id; an error frame where `error` is set."""
-
-    can_id: int
-    data: bytes
-    error: bool = False
+CanFrame = tuple[int, bytes]
+"""Id, of 11 bits but for the flag, and data of one frame on the bus."""
 
 
 class ForceBoard:
@@ -47,10 +42,10 @@ class ForceBoard:
         """Asked for the fault of each round."""
         self._last: Wrench = (0.0,) * 6
 
-    def obey(self, frame: CanFrame) -> None:
+    def obey(self, can_id: int, data: bytes) -> None:
         """Carry out a command frame from the bus; ignore other frames."""
-        if frame.can_id == COMMAND_ID and not frame.error and frame.data in (START, STOP):
-            self.streaming = frame.data == START
+        if can_id == COMMAND_ID and data in (START, STOP):
+            self.streaming = data == START
 
     def round(self) -> Iterator[CanFrame]:
         """The frames of the round that is due now; none while the board is stopped."""
@@ -61,15 +56,15 @@ class ForceBoard:
             return
         if fault in ("bus-off", "bus-error"):
             self.streaming = fault != "bus-off"
-            yield CanFrame(BUS_OFF if fault == "bus-off" else BUS_ERROR, bytes(8), error=True)
+            yield ERROR_FRAME | (BUS_OFF if fault == "bus-off" else BUS_ERROR), bytes(8)
             return
         if fault != "stuck":
             pairs = zip(self._force(), self._noise, strict=True)
             self._last = tuple(value + self._random.gauss(0.0, sigma) for value, sigma in pairs)
         wrench = tuple(math.nan if fault == "nan" and axis == 2 else value for axis, value in enumerate(self._last))
-        for place, (can_id, data) in enumerate(encode_round(wrench)):
+        for place, frame in enumerate(encode_round(wrench)):
             if fault != "no-second" or place != 1:
-                yield CanFrame(can_id, data)
+                yield frame
 
 
 FRAME_S = 0.0002
@@ -99,7 +94,7 @@ class SocketcandServer(LoopbackServer):
     async def _obey(self, reader: asyncio.StreamReader) -> None:
         """Give the board the next frame of the client."""
         _send, can_id, _length, *data = await _command(reader)
-        self.board.obey(CanFrame(int(can_id, 16), bytes(int(byte, 16) for byte in data)))
+        self.board.obey(int(can_id, 16), bytes(int(byte, 16) for byte in data))
 
     async def _send_rounds(self, writer: asyncio.StreamWriter) -> None:
         loop = asyncio.get_running_loop()
@@ -108,7 +103,7 @@ class SocketcandServer(LoopbackServer):
             # Real time, like that of an adapter's clock, whatever the rate of simulated time. It is read once: a board
             # sends its frames in one burst, however busy the computer is.
             at_s = time.time()
-            text = "".join(_ascii(frame, at_s + place * FRAME_S) for place, frame in enumerate(self.board.round()))
+            text = "".join(_ascii(*frame, at_s + place * FRAME_S) for place, frame in enumerate(self.board.round()))
             writer.write(text.encode())
             await writer.drain()  # a client that does not read is sent nothing more until it has caught up
             due_s = max(due_s + self._period_s, loop.time())
@@ -120,7 +115,7 @@ async def _command(reader: asyncio.StreamReader) -> list[str]:
     return (await reader.readuntil(b">")).decode("ascii").strip(" \r\n<>").split(" ")
 
 
-def _ascii(frame: CanFrame, at_s: float) -> str:
-    if frame.error:
-        return f"< error {frame.can_id:03X} {at_s:.6f} >"
-    return f"< frame {frame.can_id:03X} {at_s:.6f} {frame.data.hex().upper()} >"
+def _ascii(can_id: int, data: bytes, at_s: float) -> str:
+    if can_id & ERROR_FRAME:
+        return f"< error {can_id & ~ERROR_FRAME:03X} {at_s:.6f} >"
+    return f"< frame {can_id:03X} {at_s:.6f} {data.hex().upper()} >"

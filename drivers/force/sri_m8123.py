@@ -103,7 +103,6 @@ equal by chance, on a sensor that is slow or coarse."""
 STILL_N, STILL_NM = 0.05, 0.01
 """The largest standard deviation, in each axis, at which the sensor counts as still."""
 MIN_BIAS_ROUNDS = 10
-NO_BIAS: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 MOST_STALE_MS = 100.0
 """Longest silence allowed: at 20 mm/s the brush goes down 2 mm in this time without being felt."""
@@ -151,7 +150,7 @@ class SriM8123:
         self._listener: Callable[[ForceSample], None] | None = None
         self._averaged: list[Wrench] | None = None
         """Collects every round while an average is taken."""
-        self.bias_wrench = NO_BIAS
+        self.bias_wrench: Wrench = (0.0,) * 6
         """What is subtracted from every round; raw value = sample + bias."""
         self.assembler = RoundAssembler()
         """Counts the rounds that were dropped."""

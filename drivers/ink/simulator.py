@@ -20,8 +20,7 @@ RESERVOIR_ML = 100.0
 class InstrumentServer(LoopbackServer):
     """An instrument whose serial line is carried by a network: pyserial opens it by `socket://HOST:PORT`.
 
-    Its method `take` removes one request from a buffer, None while it is incomplete; `answer` carries it out and
-    returns the reply, None for silence.
+    Its method `take` reads one request; `answer` carries it out and returns the reply, None for silence.
     """
 
     def __init__(self, instrument: StationFirmware | PumpFirmware) -> None:
@@ -32,26 +31,21 @@ class InstrumentServer(LoopbackServer):
 
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer requests until the client disconnects."""
-        buffer = bytearray()
-        while data := await reader.read(4096):
-            buffer += data
-            while (request := self.instrument.take(buffer)) is not None:
-                self._meet(request, writer)
-
-    def _meet(self, request: bytes, writer: asyncio.StreamWriter) -> None:
-        fault = self.next_fault()
-        if fault == "unplug":
-            assert self._server is not None
-            self._server.close()
-            self.drop_clients()
-            return
-        reply = None if fault == "deaf" else self.instrument.answer(request)
-        if reply is None or fault == "mute":
-            return
-        if fault == "late":
-            asyncio.get_running_loop().call_later(LATE_S, self.write, writer, reply)
-        else:
-            self.write(writer, GARBAGE if fault == "garbage" else reply)
+        while True:
+            request = await self.instrument.take(reader)
+            fault = self.next_fault()
+            if fault == "unplug":
+                assert self._server is not None
+                self._server.close()
+                self.drop_clients()
+                return
+            reply = None if fault == "deaf" else self.instrument.answer(request)
+            if reply is None or fault == "mute":
+                continue
+            if fault == "late":
+                asyncio.get_running_loop().call_later(LATE_S, self.write, writer, reply)
+            else:
+                self.write(writer, GARBAGE if fault == "garbage" else reply)
 
 
 BRUSH_ML = 0.5
@@ -96,12 +90,9 @@ class StationFirmware:
         self.light = 0.0
         self._memory: tuple[bytes, bytes] = (b"", b"")
 
-    def take(self, buffer: bytearray) -> bytes | None:
-        """Take one line; None while it is incomplete."""
-        if b"\n" not in buffer:
-            return None
-        line, newline, buffer[:] = buffer.partition(b"\n")
-        return bytes(line + newline)
+    async def take(self, reader: asyncio.StreamReader) -> bytes:
+        """Read one line."""
+        return await reader.readuntil(b"\n")
 
     def answer(self, request: bytes) -> bytes | None:
         """The reply; a repeated line is answered from memory, a damaged one not at all."""
@@ -160,13 +151,9 @@ class PumpFirmware:
         self._ml_per_revolution = ml_per_revolution
         self._since_s = time.monotonic()
 
-    def take(self, buffer: bytearray) -> bytes | None:
-        """Take eight bytes, the length of every known request; None if there are fewer."""
-        if len(buffer) < REQUEST_BYTES:
-            return None
-        frame = bytes(buffer[:REQUEST_BYTES])
-        del buffer[:REQUEST_BYTES]
-        return frame
+    async def take(self, reader: asyncio.StreamReader) -> bytes:
+        """Read eight bytes, the length of every known request."""
+        return await reader.readexactly(REQUEST_BYTES)
 
     def answer(self, request: bytes) -> bytes | None:
         """The request again; None for a wrong CRC or another unit, as Modbus requires, and for what no driver sends."""

@@ -136,14 +136,14 @@ def _error(ident: object, code: int, message: str) -> bytes:
     return _reply(ident, error={"code": code, "message": message})
 
 
-OUTPUTS = {
-    "timestamp": 100,
-    "R1_actual_q": 1006,
-    "R1_robot_mode": 1014,
-    "R1_safety_mode": 1015,
-    "R1_actual_TCP_pose": 1021,
+OUTPUTS: dict[str, tuple[int, Callable[[Cabinet, float, Pose], Any]]] = {
+    "timestamp": (100, lambda _box, at_s, _tip: at_s),
+    "R1_actual_q": (1006, lambda box, _at_s, tip: list(box.motion.near_joints(tip))),
+    "R1_robot_mode": (1014, lambda box, _at_s, _tip: box.power.mode.value),
+    "R1_safety_mode": (1015, lambda box, _at_s, _tip: box.power.safety.value),
+    "R1_actual_TCP_pose": (1021, lambda box, _at_s, tip: to_wire(box.configured(tip))),
 }
-"""Identifier of each output that a client may subscribe to."""
+"""Identifier of each output that a client may subscribe to, and its value at a time with the tip there."""
 MAX_HZ = 500.0
 
 
@@ -159,7 +159,8 @@ class RtdeServer(LoopbackServer):
 
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Greet the client, then serve its topics until it disconnects."""
-        hello = {"protocol": "rtde", "version": 1, "input": {"set_recipe": SET_RECIPE}, "output": OUTPUTS}
+        idents = {name: ident for name, (ident, _) in OUTPUTS.items()}
+        hello = {"protocol": "rtde", "version": 1, "input": {"set_recipe": SET_RECIPE}, "output": idents}
         writer.write(json.dumps(hello, separators=(",", ":")).encode() + b"\n\n")
         decoder = Decoder()
         pushes: dict[int, asyncio.Task[None]] = {}
@@ -190,24 +191,12 @@ class RtdeServer(LoopbackServer):
                 fault = self.faults.meet(Device.TELEMETRY)
                 late_s = 0.0 if fault is None else fault.late_s
                 if fault is None or fault.kind != "mute":
-                    outputs = self._outputs(at_s, pose)
-                    sample = encode_sample(chanel, [outputs[name] for name in names])
+                    sample = encode_sample(chanel, [OUTPUTS[name][1](self._cabinet, at_s, pose) for name in names])
                     loop.call_later(late_s, self.write, writer, sample)
             before_s = now_s
             await writer.drain()  # a client that does not read is sent nothing more until it has caught up
             due = max(due + period_s, loop.time())
             await asyncio.sleep(due - loop.time())
-
-    def _outputs(self, at_s: float, tip: Pose) -> dict[str, Any]:
-        """Every output with the arm there."""
-        cabinet = self._cabinet
-        return {
-            "timestamp": at_s,
-            "R1_actual_q": list(cabinet.motion.near_joints(tip)),
-            "R1_robot_mode": cabinet.power.mode.value,
-            "R1_safety_mode": cabinet.power.safety.value,
-            "R1_actual_TCP_pose": to_wire(cabinet.configured(tip)),
-        }
 
 
 def topic_of(payload: bytes) -> tuple[int, float, list[str]]:

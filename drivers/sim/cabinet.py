@@ -184,44 +184,26 @@ class Cabinet:
     def move_line(self, p: Params) -> int:
         """Queue a line; a pose out of reach is accepted first and fails in planning, as on a controller."""
         target = from_wire(numbers("moveLine", p["pose"]))
-        if (code := self._admit(p)) != ReturnCode.OK:
-            return code
-        if self._solved(target, self.motion.near) is None:
-            return self._out_of_reach()
-        added = self.motion.add(
-            target,
-            p["v"] * 1e3,
-            p["a"] * 1e3,
-            self.now_s(),
-            p.get("duration", 0.0),
-            blend_mm=p.get("blend_radius", 0.0) * 1e3,
-            fix=self._fix,
-        )
-        return ReturnCode.OK if added else ReturnCode.REQUEST_IGNORED
-
-    def _admit(self, p: Params) -> int:
-        """Return code for queueing a move: OK if it may be queued."""
         if (code := self._may_move()) != ReturnCode.OK:
             return code
+        speed_m_s, acc_m_s2 = p["v"], p["a"]
         duration_s, blend_m = p.get("duration", 0.0), p.get("blend_radius", 0.0)
-        paced = p["a"] > 0.0 and p["v"] > 0.0 and 0.0 <= duration_s < math.inf
+        paced = acc_m_s2 > 0.0 and speed_m_s > 0.0 and 0.0 <= duration_s < math.inf
         if not paced or not (blend_m == 0.0 or BLEND_M[0] <= blend_m <= BLEND_M[1]):
             return -ReturnCode.INVALID_ARGUMENT
-        return ReturnCode.QUEUE_FULL if self.motion.size >= MOST_MOVES else ReturnCode.OK
-
-    def _out_of_reach(self) -> int:
-        """Accept a move that then proves to be out of reach: the arm stops, and a message for `Trace.peek` says why."""
-        self.stop(SOFT_STOP_M_S2, SOFT_STOP_M_S2)
-        stamp = max(int(self.now_s() * 1e9), self.messages[-1]["timestamp"] + 1 if self.messages else 1)
-        self.messages.append(
-            {"code": POSE_OUT_OF_REACH, "level": "ERROR", "source": ROBOT, "args": [], "timestamp": stamp}
-        )
-        return ReturnCode.OK
-
-    def queue_size(self) -> int:
-        """Number of moves that are not over."""
-        self.motion.advance(self.now_s())
-        return self.motion.size
+        if self.motion.size(self.now_s()) >= MOST_MOVES:
+            return ReturnCode.QUEUE_FULL
+        if self._solved(target, self.motion.near) is None:
+            # It is accepted, then proves to be out of reach: the arm stops, and a message for `Trace.peek` says why.
+            self.stop(SOFT_STOP_M_S2, SOFT_STOP_M_S2)
+            stamp = max(int(self.now_s() * 1e9), self.messages[-1]["timestamp"] + 1 if self.messages else 1)
+            self.messages.append(
+                {"code": POSE_OUT_OF_REACH, "level": "ERROR", "source": ROBOT, "args": [], "timestamp": stamp}
+            )
+            return ReturnCode.OK
+        pace = speed_m_s * 1e3, acc_m_s2 * 1e3
+        added = self.motion.add(target, *pace, self.now_s(), duration_s, blend_mm=blend_m * 1e3, fix=self._fix)
+        return ReturnCode.OK if added else ReturnCode.REQUEST_IGNORED
 
     def configure(self, name: str, value: object) -> int:
         """Set one of the cabinet's settings."""
@@ -249,7 +231,7 @@ def methods(cabinet: Cabinet) -> dict[str, Callable[[Params], Any]]:
         "MotionControl.setSpeedFraction": lambda p: cabinet.configure("speed_fraction", p["fraction"]),
         "MotionControl.getSpeedFraction": lambda _: cabinet.speed_fraction,
         "MotionControl.getExecId": lambda _: motion.exec_id(now_s()),
-        "MotionControl.getQueueSize": lambda _: cabinet.queue_size(),
+        "MotionControl.getQueueSize": lambda _: motion.size(now_s()),
         "RobotConfig.getRobotType": lambda _: "aubo_i5",
         "RobotConfig.getRobotSubType": lambda _: "aubo_i5_11",
         "RobotConfig.getControlBoxType": lambda _: LOOPBACK_CONTROL_BOX,

@@ -174,9 +174,9 @@ class MotionQueue:
         self._on_path = on_path
         self._next_id = 0
 
-    @property
-    def size(self) -> int:
+    def size(self, now_s: float) -> int:
         """Number of moves queued, running or held."""
+        self.advance(now_s)
         return len({piece.ident for piece in self._pieces})
 
     def add(
@@ -195,7 +195,7 @@ class MotionQueue:
         `target` is a pose of the configured tool centre point, and `fix` leads from there to the true tip.
         """
         self.advance(now_s)
-        start = self._last()
+        start = self._pieces[-1].pose(self._pieces[-1].stop) if self._pieces else self._rest
         configured = start if fix is None else pose_of(matrix_of(start) @ np.linalg.inv(fix))
         travel_mm, turn_deg = distance(configured, target)
         if travel_mm <= SAME_POSE_MM and turn_deg <= SAME_POSE_DEG:
@@ -204,7 +204,20 @@ class MotionQueue:
         path = line(start, end, travel_mm, math.radians(turn_deg))
         unit, blend_mm = (1e-3, 0.0) if path.angular else (1.0, blend_mm)
         speed = speed_mm_s * unit if duration_s == 0.0 else min(speed_mm_s * unit, path.length / duration_s)
-        self._append(path, speed, acc_mm_s2 * unit, now_s, blend_mm)
+        here = self._knots[-1] if self.held else self._at(now_s)
+        begin = self._pieces[-1].stop if self._pieces else here.along
+        acc = acc_mm_s2 * unit
+        piece = Piece(self._next_id, path, begin, begin, begin + path.length, speed, acc, blend_mm)
+        self._next_id += 1
+        rounded = self._rounded(piece, here.along)
+        if rounded is not None:
+            knots = self._knots if self.held else timetable(rounded, here)
+            if knots is not None:
+                self._pieces, self._knots = rounded, knots
+                return True
+        self._pieces.append(piece)  # it begins at rest: the moves before it stay as they are
+        if not self.held:
+            self._go_on([piece], now_s)
         return True
 
     def advance(self, now_s: float) -> None:
@@ -282,10 +295,6 @@ class MotionQueue:
         begun = bool(self._pieces) and knot.along > self._pieces[0].start
         return self._pieces[0].pose(knot.along) if begun else self._rest
 
-    def _last(self) -> Pose:
-        """Where the last accepted move ends."""
-        return self._pieces[-1].pose(self._pieces[-1].stop) if self._pieces else self._rest
-
     def _retire(self, along: float) -> None:
         """Report the pieces that end no farther than `along`."""
         while self._pieces and self._pieces[0].stop <= along:
@@ -295,22 +304,6 @@ class MotionQueue:
             self._rest = places[-1]
             for start, end in itertools.pairwise(places if piece.stop > piece.start else ()):
                 self._on_path(start, end)
-
-    def _append(self, path: Path, cap: float, acc: float, now_s: float, blend_mm: float = 0.0) -> None:
-        """Append a move at no more than this speed."""
-        here = self._knots[-1] if self.held else self._at(now_s)
-        start = self._pieces[-1].stop if self._pieces else here.along
-        piece = Piece(self._next_id, path, start, start, start + path.length, cap, acc, blend_mm)
-        self._next_id += 1
-        rounded = self._rounded(piece, here.along)
-        if rounded is not None:
-            knots = self._knots if self.held else timetable(rounded, here)
-            if knots is not None:
-                self._pieces, self._knots = rounded, knots
-                return
-        self._pieces.append(piece)  # it begins at rest: the moves before it stay as they are
-        if not self.held:
-            self._go_on([piece], now_s)
 
     def _go_on(self, pieces: Sequence[Piece], now_s: float) -> None:
         """Travel the pieces from the rest in which the timetable ends."""

@@ -248,19 +248,14 @@ async def serve(
         if write_rig is None:
             tell(*rig.labels(control))
         else:
-            _write_whole(write_rig, rig.toml())
+            part = write_rig.with_name(write_rig.name + ".part")  # a reader sees all of the file or nothing
+            try:
+                part.write_text(rig.toml(), encoding="utf-8")
+                part.replace(write_rig)
+            except OSError as error:
+                raise RigRefused(f"{write_rig}: cannot be written: {error.strerror}") from None
             tell(f"{write_rig} is written: brushloop doctor --config {write_rig}; Ctrl-C ends")
         if idle_exit_s > 0:
             idle = asyncio.create_task(rig.idle(idle_exit_s))
             idle.add_done_callback(lambda _: over.set())
         await over.wait()
-
-
-def _write_whole(path: Path, text: str) -> None:
-    """Write a file of which a reader sees all or nothing. Raises `RigRefused`."""
-    part = path.with_name(path.name + ".part")
-    try:
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
-    except OSError as error:
-        raise RigRefused(f"{path}: cannot be written: {error.strerror}") from None

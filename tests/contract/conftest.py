@@ -205,4 +205,4 @@ async def enabled(rig: RigConfig, arm: AuboArcs, request: pytest.FixtureRequest)
     except LimitExceeded as error:
         pytest.skip(f"no room to move: {error}")
     yield Enabled(arm, start, top)
-    await arm.move(start, speed_mm_s=SPEED_MM_S, acc_mm_s2=ACC_MM_S2)
+    await arm.follow([start], speed_mm_s=SPEED_MM_S, acc_mm_s2=ACC_MM_S2)

@@ -51,7 +51,7 @@ async def on_the_way_up(arm: Enabled) -> AsyncIterator[asyncio.Task[None]]:
     """A slow move that has risen by a tenth of its way; ended when the block ends."""
     moving = asyncio.Event()
     arm.robot.listen(lambda s: moving.set() if s.pose.z_mm > arm.start.z_mm + LIFT_MM / 10 else None)
-    move = asyncio.create_task(arm.robot.move(arm.top, **SLOWLY))
+    move = asyncio.create_task(arm.robot.follow([arm.top], **SLOWLY))
     try:
         async with asyncio.timeout(10.0):
             await moving.wait()
@@ -91,7 +91,7 @@ async def test_a_target_out_of_limits_is_refused_before_anything_is_sent(
     for field, value, speed_mm_s in wrong:
         target = inside if field == "speed" else dataclasses.replace(inside, **{field: value})
         with pytest.raises(LimitExceeded) as caught:
-            await arm.move(target, speed_mm_s=speed_mm_s, acc_mm_s2=ACC_MM_S2)
+            await arm.follow([target], speed_mm_s=speed_mm_s, acc_mm_s2=ACC_MM_S2)
         assert caught.value.field in (field.removesuffix("_mm"), "tilt")
     assert not [method for method in sent if not method.rpartition(".")[2].startswith("get")], "more than questions"
 
@@ -122,7 +122,7 @@ async def test_an_enabled_arm_has_not_moved_and_is_as_it_was_left(enabled: Enabl
     assert mode == "Running"
     assert_there(await assert_still(enabled.robot), enabled.start)
     await enabled.robot.confirm()
-    await enabled.robot.move(enabled.top, **GENTLY)
+    await enabled.robot.follow([enabled.top], **GENTLY)
     await enabled.robot.confirm()
     assert_there(await enabled.robot.take_up(), enabled.top)
 
@@ -130,7 +130,7 @@ async def test_an_enabled_arm_has_not_moved_and_is_as_it_was_left(enabled: Enabl
 @pytest.mark.moves
 async def test_a_move_arrives(enabled: Enabled):
     for target in (raised(enabled.start, LIFT_MM / 2), enabled.top, enabled.start):
-        await enabled.robot.move(target, **GENTLY)
+        await enabled.robot.follow([target], **GENTLY)
         assert_there(await assert_still(enabled.robot), target)
 
 
@@ -143,7 +143,7 @@ async def test_a_stop_in_mid_move_stops_short_and_a_later_move_works(enabled: En
             await move
     risen_mm = stopped.z_mm - enabled.start.z_mm
     assert 0.0 < risen_mm < LIFT_MM - 10 * POSITION_MM
-    await enabled.robot.move(enabled.start, **GENTLY)
+    await enabled.robot.follow([enabled.start], **GENTLY)
     assert_there(await enabled.robot.where(), enabled.start)
 
 
@@ -160,12 +160,12 @@ async def test_a_move_that_is_cancelled_stops_the_arm(enabled: Enabled):
 @pytest.mark.moves
 async def test_an_idle_arm_is_at_once_where_it_stands_and_a_stop_is_harmless_also_twice(enabled: Enabled):
     async with asyncio.timeout(1.0):
-        await enabled.robot.move(enabled.start, **GENTLY)
+        await enabled.robot.follow([enabled.start], **GENTLY)
     await enabled.robot.stop()
     await enabled.robot.stop()
     await asyncio.gather(enabled.robot.stop(), enabled.robot.stop())
     assert_there(await assert_still(enabled.robot), enabled.start)
-    await enabled.robot.move(raised(enabled.start, LIFT_MM / 2), **GENTLY)
+    await enabled.robot.follow([raised(enabled.start, LIFT_MM / 2)], **GENTLY)
 
 
 @pytest.mark.moves

@@ -143,7 +143,7 @@ async def test_a_frame_is_decoded_only_when_somebody_looks(
     monkeypatch.setattr(camera_module, "looked_at", lambda picture: (looks.append(picture), looked_at(picture))[1])
     jpegs = [jpeg_of(page()) for _ in range(5)]
     feed.show(*jpegs)
-    await until(lambda: camera._newest.picture is jpegs[-1], "the pictures")  # type: ignore[union-attr]
+    await until(lambda: camera._newest[2] is jpegs[-1], "the pictures")
     assert not looks
     await camera.fresh(Stamp(0))
     assert looks == jpegs[-1:]
@@ -160,7 +160,7 @@ async def test_a_stream_that_ends_is_opened_again_and_both_are_reported(
     sources.append(second)
     await until(lambda: len(feed.notices) == 2, "the stream to be opened")
     second.show(picture := page())
-    await until(lambda: camera._newest.picture is picture, "a picture")  # type: ignore[union-attr]
+    await until(lambda: camera._newest[2] is picture, "a picture")
     assert np.array_equal((await camera.fresh(Stamp(0))).image, picture)
     assert feed.notices[0] == "camera: the stream ended and is opened again"
     assert feed.notices[1].startswith("camera is back after")

@@ -19,7 +19,7 @@ import pytest
 from brushloop.drivers.devices import ForceSample
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected, Stale, Stuck
 from brushloop.drivers.force import sri_m8123
-from brushloop.drivers.force.simulator import CanFrame, ForceBoard
+from brushloop.drivers.force.simulator import ERROR_FRAME, CanFrame, ForceBoard
 from brushloop.drivers.force.sri_m8123 import ForceTable, RoundAssembler, SriM8123, Wrench, encode_round
 from brushloop.drivers.host import Clock
 from tests.waiting import until
@@ -42,7 +42,7 @@ class Bus:
         self._frames: deque[CanFrame] = deque()
 
     def send(self, message: can.Message, timeout: float) -> None:
-        self._board.obey(CanFrame(message.arbitration_id, bytes(message.data)))
+        self._board.obey(message.arbitration_id, bytes(message.data))
 
     def recv(self, _timeout: float) -> can.Message | None:
         if not self._frames:
@@ -51,8 +51,9 @@ class Bus:
             self._frames.extend(self._board.round())
         if not self._frames:
             return None
-        frame = self._frames.popleft()
-        return can.Message(self._at_s, frame.can_id, frame.error, False, frame.error, data=frame.data)
+        can_id, data = self._frames.popleft()
+        error = bool(can_id & ERROR_FRAME)
+        return can.Message(self._at_s, can_id & ~ERROR_FRAME, error, False, error, data=data)
 
     def shutdown(self) -> None:
         pass

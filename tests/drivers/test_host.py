@@ -80,14 +80,8 @@ async def test_over_the_terminal_of_a_serial_line_a_device_answers_until_its_cab
     """As in a lab: the loopback rig's lines are carried by a network, which pyserial opens by other code."""
     device, end = os.openpty()
     tty.setraw(end)  # or the terminal would echo, and translate line ends
-    firmware, buffer, loop = StationFirmware(), bytearray(), asyncio.get_running_loop()
-
-    def answer() -> None:
-        buffer.extend(os.read(device, 4096))
-        while (request := firmware.take(buffer)) is not None:
-            os.write(device, firmware.answer(request) or b"")
-
-    loop.add_reader(device, answer)
+    firmware, loop = StationFirmware(), asyncio.get_running_loop()
+    loop.add_reader(device, lambda: os.write(device, firmware.answer(os.read(device, 4096)) or b""))
     station = station_at(os.ttyname(end))
     assert (await station.connect()).simulated
     before_ml = firmware.well.ml

@@ -377,7 +377,7 @@ def test_a_press_with_another_clients_line_is_void_lifted_and_made_again_on_a_ne
 
     def tampered(params: dict[str, Any]) -> Any:
         into_paper = moment == "startMove" or from_wire(params["pose"]).z_mm < PAPER_Z_MM - 10.0
-        if into_paper and not sent and world.motion.held and world.motion.size:
+        if into_paper and not sent and world.motion.held and world.motion.size(world.clock.now_s()):
             sent.append(world.motion.add(UNDER, 200.0, 800.0, world.clock.now_s()))
         return carry_out(params)
 

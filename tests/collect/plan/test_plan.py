@@ -292,8 +292,8 @@ class MadeUpRobot:
         self.moved: list[Pose] = []
         self.queued: list[QueuedLine] = []
 
-    async def move(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
-        self.moved.append(target)
+    async def follow(self, poses: Sequence[Pose], *, speed_mm_s: float, acc_mm_s2: float) -> None:
+        self.moved += poses
 
     async def sequence(self, lines: Sequence[QueuedLine], *, acc_mm_s2: float) -> list[Pose]:
         self.queued += lines

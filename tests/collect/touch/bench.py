@@ -77,7 +77,8 @@ class Bench:
         return self.target.z_mm >= self.rig.config.motion.safe_z_mm
 
     # Robot
-    async def move(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
+    async def follow(self, poses: Sequence[Pose], *, speed_mm_s: float, acc_mm_s2: float) -> None:
+        [target] = poses
         self.limits.check("robot", target, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
         self.target = target
         self.sent.append(target)
@@ -87,7 +88,7 @@ class Bench:
 
     async def sequence(self, lines: Sequence[QueuedLine], *, acc_mm_s2: float) -> list[Pose]:
         for line in lines:
-            await self.move(line.target, speed_mm_s=line.speed_mm_s, acc_mm_s2=acc_mm_s2)
+            await self.follow([line.target], speed_mm_s=line.speed_mm_s, acc_mm_s2=acc_mm_s2)
         return [line.target for line in lines]
 
     async def where(self) -> Pose:

@@ -136,14 +136,14 @@ async def test_an_arm_that_was_stopped_or_failed_is_left_where_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
 ) -> None:
     bench = Bench(tmp_path)
-    move = bench.move
+    follow = bench.follow
 
-    async def held_up(target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
-        await move(target, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
-        if target.z_mm < 121.0:
+    async def held_up(poses: list[Pose], *, speed_mm_s: float, acc_mm_s2: float) -> None:
+        await follow(poses, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
+        if poses[-1].z_mm < 121.0:
             raise error
 
-    monkeypatch.setattr(bench, "move", held_up)
+    monkeypatch.setattr(bench, "follow", held_up)
     with pytest.raises(type(error)):
         await measured(bench, method="force")
     assert not bench.lifted

@@ -50,7 +50,7 @@ class Cabinet(ArcsServer):
     @property
     def queued(self) -> int:
         """Number of lines that it holds."""
-        return self.cabinet.queue_size()
+        return self.cabinet.motion.size(self.cabinet.now_s())
 
     @property
     def rests(self) -> bool:

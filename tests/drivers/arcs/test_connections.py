@@ -233,7 +233,7 @@ async def test_poses_are_pushed_at_the_frequency_that_was_asked_for(
 ):
     await pushed.enable()
     assert 40 <= len(await samples_of(pushed, 0.5)) <= 60
-    await pushed.move(NEAR, **QUICK)
+    await pushed.follow([NEAR], **QUICK)
     await asyncio.sleep(0.05)
     assert distance(pushed.latest().pose, cabinet.tool)[0] < 0.01
     assert not notices

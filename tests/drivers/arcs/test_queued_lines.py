@@ -242,7 +242,7 @@ async def test_whatever_happens_before_the_path_is_let_go_drops_it_and_leaves_th
     assert cabinet.tool.z_mm == HOME.z_mm
     assert await nothing_is_left(cabinet)
     if not arm._motion.lost:
-        await arm.move(TOP, speed_mm_s=100.0, acc_mm_s2=ACC)  # the hold is over, too
+        await arm.follow([TOP], speed_mm_s=100.0, acc_mm_s2=ACC)  # the hold is over, too
 
 
 async def is_stopped_although_no_answer_can_be_read(arm: AuboArcs, cabinet: Cabinet) -> None:
@@ -286,7 +286,7 @@ async def test_lines_that_a_dead_process_left_held_are_dropped_and_do_not_hold_u
     other = await enabled(make_arm)
     assert cabinet.tool.z_mm == HOME.z_mm
     assert await nothing_is_left(cabinet)
-    await other.move(TOP, speed_mm_s=100.0, acc_mm_s2=ACC)
+    await other.follow([TOP], speed_mm_s=100.0, acc_mm_s2=ACC)
 
 
 def does_not_hold(cabinet: Cabinet) -> None:
@@ -337,7 +337,7 @@ async def test_an_answer_that_cannot_be_read_once_the_path_was_let_go_does_not_s
     await arm.sequence(PRESS, acc_mm_s2=ACC)
     _, deep, top = list(cabinet.cabinet.world.motion.rests)[-3:]
     assert (deep.pose.z_mm, top.pose.z_mm) == pytest.approx((DEEP.z_mm, TOP.z_mm))
-    await arm.move(DEEP, speed_mm_s=100.0, acc_mm_s2=ACC)
+    await arm.follow([DEEP], speed_mm_s=100.0, acc_mm_s2=ACC)
 
 
 async def test_a_controller_that_never_answers_again_is_given_the_time_of_the_press(

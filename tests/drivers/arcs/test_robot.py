@@ -56,7 +56,7 @@ async def test_connecting_reports_who_answers_and_where_the_flange_is(
     assert identity.model.startswith("aubo_i5")
     assert arm.latest().pose.position_mm == pytest.approx((250.0, -230.0, 260.0 + 180.0)), "no tool is set yet"
     with pytest.raises(NotConnected, match="not enabled"):
-        await arm.move(NEAR, **QUICK)
+        await arm.follow([NEAR], **QUICK)
     assert cabinet.cabinet.power.mode == RobotMode.POWER_OFF
     await arm.close()
     await arm.close()
@@ -78,7 +78,7 @@ def test_a_line_is_timed_with_its_ramps_and_a_turn_on_the_spot_in_radians():
 async def test_a_safety_mode_that_nobody_knows_forbids_motion(arm: AuboArcs, cabinet: Cabinet, mode: object):
     cabinet.answers("RobotState.getSafetyModeType", mode)
     with pytest.raises(RobotNotSafe, match="Look at the pendant"):
-        await arm.move(NEAR, **QUICK)
+        await arm.follow([NEAR], **QUICK)
 
 
 async def test_a_cabinet_of_the_older_generation_is_named_as_such(
@@ -125,7 +125,7 @@ async def test_what_is_configured_is_set_in_the_wires_units_and_a_brush_askew_on
     assert (box.payload, box.collision_level) == ([0.4, [0.0, 0.001, 0.06], [0.0] * 3, [0.0] * 6], 8)
     assert box.tcp_offset == pytest.approx([0.004, -0.007, 0.18, math.radians(2.0), math.radians(-1.5), 0.0])
     assert (box.power.mode, box.world.tool()) == (RobotMode.RUNNING, before), "nothing has moved"
-    await arm.move(NEAR, **QUICK)
+    await arm.follow([NEAR], **QUICK)
     joints = box.motion.near_joints(cabinet.tool)
     flange = from_wire(box.fk({"q": [*joints]})[0])
     assert distance(flange, NEAR)[0] < 0.1
@@ -135,7 +135,7 @@ async def test_what_is_configured_is_set_in_the_wires_units_and_a_brush_askew_on
 async def test_reduced_mode_and_a_cabinet_without_operational_modes_are_allowed(make_arm: MakeArm, cabinet: Cabinet):
     cabinet.cabinet.operational_mode = "Disabled"
     cabinet.cabinet.power.safety = SafetyMode.REDUCED
-    await (await enabled(make_arm)).move(NEAR, **QUICK)
+    await (await enabled(make_arm)).follow([NEAR], **QUICK)
 
 
 @pytest.mark.parametrize(
@@ -159,8 +159,8 @@ async def test_what_the_controller_does_not_take_whatever_it_returns_keeps_the_p
 
 async def test_an_arm_that_does_not_arrive_is_said_to_be_where_it_rests(arm: AuboArcs):
     with pytest.raises(MotionFailed, match=r"rests .* mm and .* deg from the target.*pendant.*`brushloop collect plan"):
-        await arm.move(brush_pose(900.0, 0.0, 250.0), **QUICK)
-    await arm.move(NEAR, **QUICK)
+        await arm.follow([brush_pose(900.0, 0.0, 250.0)], **QUICK)
+    await arm.follow([NEAR], **QUICK)
 
 
 # ---------------------------------------------------------------- what another client does meanwhile
@@ -169,24 +169,24 @@ async def test_an_arm_that_does_not_arrive_is_said_to_be_where_it_rests(arm: Aub
 async def test_an_arm_that_was_moved_is_not_sent_anywhere_until_it_is_taken_up(
     arm: AuboArcs, other: Controller, cabinet: Cabinet
 ):
-    await arm.move(ABOVE, **QUICK)
+    await arm.follow([ABOVE], **QUICK)
     await arm.confirm()
     await other.move_line(ELSEWHERE, 200.0, 800.0)
     await until_settled(other.rest, ELSEWHERE, planned_s=2.0)
     sent = cabinet.taken
-    for refused in (arm.move(LOW, **QUICK), arm.follow([LOW, ABOVE], **QUICK), arm.confirm()):
+    for refused in (arm.follow([LOW], **QUICK), arm.follow([LOW, ABOVE], **QUICK), arm.confirm()):
         with pytest.raises(ArmMoved, match=r"109\.\d mm and 10\.0 deg from where it was left"):
             await refused
     assert cabinet.taken == sent
     assert distance(await arm.take_up(), ELSEWHERE)[0] < 0.05
-    await arm.move(LOW, **QUICK)
+    await arm.follow([LOW], **QUICK)
 
 
 async def test_an_arm_that_somebody_moves_right_now_is_not_fought(arm: AuboArcs, other: Controller, cabinet: Cabinet):
-    await arm.move(ABOVE, **QUICK)
+    await arm.follow([ABOVE], **QUICK)
     await other.move_line(LOW, 1.0, 800.0)
     sent = cabinet.taken
-    for refused in (arm.move(ELSEWHERE, **QUICK), arm.take_up(), arm.confirm()):
+    for refused in (arm.follow([ELSEWHERE], **QUICK), arm.take_up(), arm.confirm()):
         with pytest.raises(ArmMoved, match="Wait until the arm rests") as caught:
             await refused
         assert caught.value.moving
@@ -212,38 +212,38 @@ TAMPERED: list[tuple[str, dict[str, Any], str]] = [
 async def test_what_a_press_depends_on_is_read_back_before_each_way_down(
     arm: AuboArcs, other: Controller, cabinet: Cabinet, method: str, params: dict[str, Any], words: str
 ):
-    await arm.move(ABOVE, **QUICK)
+    await arm.follow([ABOVE], **QUICK)
     assert await other.ask(method, **params) == 0
     sent, before = cabinet.taken, cabinet.tool
-    for refused in (arm.move(LOW, **QUICK), arm.follow([ABOVE, LOW], **QUICK), arm.take_up()):
+    for refused in (arm.follow([LOW], **QUICK), arm.follow([ABOVE, LOW], **QUICK), arm.take_up()):
         with pytest.raises(SettingsChanged, match=words):
             await refused
     assert cabinet.taken == sent
     assert cabinet.tool == before
     await other.ask("RobotManage.setOperationalMode", mode="Automatic")
     await arm.enable()  # sets what is configured again; what is not is taken as it is
-    await arm.move(LOW, **QUICK)
+    await arm.follow([LOW], **QUICK)
     assert distance(cabinet.tool, LOW)[0] < 0.05
 
 
 async def test_a_safety_stop_is_reported_before_what_it_changes(arm: AuboArcs, other: Controller, cabinet: Cabinet):
-    await arm.move(ABOVE, **QUICK)
+    await arm.follow([ABOVE], **QUICK)
     await other.ask("RobotManage.setOperationalMode", mode="Manual")
     cabinet.cabinet.safety_stop()
     with pytest.raises(RobotNotSafe):
-        await arm.move(LOW, **QUICK)
+        await arm.follow([LOW], **QUICK)
 
 
 async def test_an_arm_without_power_is_not_as_it_was_left_and_enabling_it_powers_it_again(
     arm: AuboArcs, other: Controller
 ):
-    await arm.move(ABOVE, **QUICK)
+    await arm.follow([ABOVE], **QUICK)
     await other.ask("RobotManage.poweroff")  # takes a moment, in which a request for power is ignored
-    for refused in (arm.confirm(), arm.take_up(), arm.move(LOW, **QUICK)):
+    for refused in (arm.confirm(), arm.take_up(), arm.follow([LOW], **QUICK)):
         with pytest.raises(NotPowered):
             await refused
     await arm.enable()
-    await arm.move(LOW, **QUICK)
+    await arm.follow([LOW], **QUICK)
 
 
 @pytest.mark.parametrize("wrong", [{"v": 0.0}, {"v": math.nan}, {"blend_radius": 0.0005}, {"blend_radius": 2.0}])
@@ -300,7 +300,7 @@ async def test_a_controller_that_falls_silent_is_reported_as_an_arm_that_may_sti
     fault = {"device": "robot", "kind": kind, "phase": "travelling", "nth": 5, "count": ALWAYS}
     cabinet.faults.hang(Fault.model_validate(fault))
     with pytest.raises(DeviceTimeout) as caught:
-        await arm.move(FAR, **SLOW)
+        await arm.follow([FAR], **SLOW)
     [note] = caught.value.__notes__
     assert "The arm may still be moving. Use the emergency stop." in note
     if kind == "mute":
@@ -328,13 +328,13 @@ async def test_a_safety_stop_in_mid_move_is_named_with_its_condition_and_stays_u
     cabinet.faults.hang(Fault.model_validate({"device": "robot", "kind": kind, "phase": "travelling"}))
     watching = asyncio.create_task(cabinet.faults.watch(box.safety_stop))
     with pytest.raises(RobotNotSafe, match=f"safety mode is {mode}") as caught:
-        await arm.move(FAR, **SLOW)
+        await arm.follow([FAR], **SLOW)
     assert condition in caught.value.condition
     assert caught.value.remedy
     assert cabinet.rests
     left_mm = to_go_mm(cabinet)
     assert 100.0 < left_mm < 200.0
-    for attempt in (arm.move(NEAR, **QUICK), arm.enable()):
+    for attempt in (arm.follow([NEAR], **QUICK), arm.enable()):
         with pytest.raises(RobotNotSafe):
             await attempt
     if mode is SafetyMode.ROBOT_EMERGENCY_STOP:
@@ -346,7 +346,7 @@ async def test_a_safety_stop_in_mid_move_is_named_with_its_condition_and_stays_u
     await asyncio.sleep(0.1)
     assert to_go_mm(cabinet) == left_mm
     await arm.enable()
-    await arm.move(FAR, **QUICK)
+    await arm.follow([FAR], **QUICK)
     watching.cancel()
 
 
@@ -372,7 +372,7 @@ def loses_what_is_sent_to_stop(arm: AuboArcs, _: Cabinet) -> None:
     ids=["no id", "no safety mode", "no connection", "no answer to a stop"],
 )
 async def test_a_stop_gets_through_at_once_whatever_hangs(arm: AuboArcs, cabinet: Cabinet, act: Act):
-    move = asyncio.create_task(arm.move(FAR, **SLOW))
+    move = asyncio.create_task(arm.follow([FAR], **SLOW))
     await asyncio.sleep(0.2)
     act(arm, cabinet)
     pressed = asyncio.create_task(arm.stop())
@@ -387,7 +387,7 @@ async def test_a_stop_gets_through_at_once_whatever_hangs(arm: AuboArcs, cabinet
 async def test_nothing_moves_while_there_is_no_way_to_stop_it(arm: AuboArcs, cabinet: Cabinet):
     await cabinet.stop()
     with pytest.raises(ConnectionLost):
-        await arm.move(FAR, **SLOW)
+        await arm.follow([FAR], **SLOW)
     assert to_go_mm(cabinet) == pytest.approx(200.0)
 
 
@@ -409,7 +409,7 @@ async def test_a_line_that_is_still_on_its_way_is_stopped_too(
         return await send(method, params)
 
     monkeypatch.setattr(connection, "call", delayed)
-    move = asyncio.create_task(arm.move(FAR, **SLOW))
+    move = asyncio.create_task(arm.follow([FAR], **SLOW))
     await sent.wait()
     if delay_s < 1.0:
         await arm.stop()

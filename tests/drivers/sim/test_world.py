@@ -359,6 +359,6 @@ def test_a_path_held_anywhere_goes_on_along_itself(hold_s: float, acc: float):
     assert np.linalg.norm(walk[-1] - BEYOND.position_mm) < 1e-6
     assert speeds(walk).max() <= V * (1 + 1e-6)
     assert_on_the_corners_path(walk)
-    assert (cornered.exec_id(20.0), cornered.size) == (-1, 0)
+    assert (cornered.exec_id(20.0), cornered.size(20.0)) == (-1, 0)
     for (_, a), (b, _) in itertools.pairwise(travelled):
         assert distance(a, b)[0] < 1e-6
