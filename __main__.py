@@ -175,7 +175,7 @@ def sim(
     import asyncio
 
     from brushloop.drivers.loopback import RigRefused
-    from brushloop.drivers.sim.brush.spec import load_brush
+    from brushloop.drivers.sim.brush.brush_file import load_brush
     from brushloop.drivers.sim.config import SimConfig, View
     from brushloop.drivers.sim.rig import LoopbackRig, serve
 
@@ -193,6 +193,7 @@ def sim(
         seed=seed,
         rate=rate,
         brush=pressed.brush,
+        misfit=pressed.misfit,
         brush_name=pressed.name,
         head=pressed.quality,
         view=View(fps=fps) if pressed.camera is None else View(fps=fps, noise=pressed.camera.noise),

@@ -41,7 +41,7 @@ from brushloop.calibrate.loop import LoopRecord
 from brushloop.calibrate.presses import read_for_fit
 from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.writing.compare import HEADLINE, REFERENCE, SIMULATED, WrittenRecord
-from brushloop.drivers.sim.brush.spec import LIKE_TABLE_2, load_brush
+from brushloop.drivers.sim.brush.brush_file import LIKE_TABLE_2, load_brush
 from brushloop.model.fitted import FittedPress, Prior, learned
 from brushloop.model.generator import SHIPPED_GENERATOR
 from brushloop.model.presses import Presses, image_of

@@ -21,7 +21,7 @@ import brushloop.__main__
 from bench import pictures
 from brushloop.calibrate.commands import PathOrCommand
 from brushloop.collect.protocols.config import load_protocol
-from brushloop.drivers.sim.brush.spec import load_brush
+from brushloop.drivers.sim.brush.brush_file import load_brush
 from tests.blocks import DOCUMENTS, ROOT, Block, blocks_of
 
 TUTORIAL = ROOT / "docs" / "tutorial.md"

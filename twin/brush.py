@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from brushloop.drivers.sim.brush.brush import Brush, Descent
 from brushloop.drivers.sim.brush.footprint import Footprint
+from brushloop.drivers.sim.brush.misfit import Misfit
 from brushloop.drivers.sim.brush.spec import ALLOWED, BrushSpec
 from brushloop.model.presses import DepthTilt, Grid
 
@@ -121,8 +122,19 @@ def place_at(point: Vector) -> Place:
     return deeper, x, y
 
 
+def reached_mm(depth_mm: float, deeper_mm: float) -> float:
+    """How deep the bundle is pressed where the rig believes `depth_mm`."""
+    return max(depth_mm + deeper_mm, LEAST_MM)
+
+
 def draw(
-    spec: BrushSpec, place: Place, conditions: Sequence[DepthTilt], grid: Grid, repeats: int = 1, first_seed: int = 0
+    spec: BrushSpec,
+    place: Place,
+    conditions: Sequence[DepthTilt],
+    grid: Grid,
+    repeats: int = 1,
+    first_seed: int = 0,
+    misfit: Misfit | None = None,
 ) -> Images:
     """(conditions, repeats, len(y_mm), len(x_mm)) ink from 0 to 1 of a freshly dipped brush.
 
@@ -132,10 +144,12 @@ def draw(
     mechanics = replace(spec, seed=0, **{one.name: getattr(default, one.name) for one in (*INK, *SPREAD)})
     descents = _descents(mechanics, place[0], tuple(conditions))
     ink = np.empty((len(conditions), repeats, len(grid.y_mm), len(grid.x_mm)), np.float32)
-    for c, descent in enumerate(descents):
+    for c, (descent, (depth_mm, tilt_deg)) in enumerate(zip(descents, conditions, strict=True)):
         for r in range(repeats):
             seed = first_seed + 1000 * c + r
             mark = brush.print_descent(descent, ink_load=1.0, press_seed=seed, px_per_mm=PX_PER_MM)
+            if misfit is not None:
+                mark = misfit.bend(mark, reached_mm(depth_mm, place[0]), tilt_deg)
             ink[c, r] = _on_grid(mark, place, grid)
     return ink
 
@@ -145,7 +159,7 @@ def _descents(spec: BrushSpec, deeper_mm: float, conditions: tuple[DepthTilt, ..
     """The descents of a brush with every constant that does not affect the bundle's shape at its default."""
     brush, descents = Brush(spec), dict[DepthTilt, Descent]()
     for tilt in {tilt for _, tilt in conditions}:
-        reached = {depth: max(depth + deeper_mm, LEAST_MM) for depth, a in conditions if a == tilt}
+        reached = {depth: reached_mm(depth, deeper_mm) for depth, a in conditions if a == tilt}
         each = brush.descents(list(reached.values()), tilt)
         descents |= {(depth, tilt): each[reached_mm] for depth, reached_mm in reached.items()}
     return tuple(descents[condition] for condition in conditions)

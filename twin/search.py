@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from brushloop.calibrate.artefact import made_by
 from brushloop.calibrate.work import Store, key_of
+from brushloop.drivers.sim.brush.misfit import Misfit
 from brushloop.drivers.sim.brush.spec import BrushSpec
 from brushloop.model.presses import DepthTilt, Grid
 from brushloop.model.similarity import csim
@@ -248,6 +249,7 @@ def fit_spread(
     grid: Grid,
     workers: Executor,
     start: Sequence[float] = SPREAD_START,
+    misfit: Misfit | None = None,
 ) -> Spread:
     """Match the statistics of the captures, (n, len(y_mm), len(x_mm)) ink of each condition."""
     from scipy.optimize import least_squares  # slow to import
@@ -256,22 +258,34 @@ def fit_spread(
     # twice the relative standard error of a deviation with this many degrees of freedom: the simulated one has its own
     deviation = 2.0 / math.sqrt(2.0 * sum(len(one) - 1 for one in captured))
     sd = np.array([deviation] * 4 + [AGREEMENT_SD])
-    off = partial(_off_statistics, spec, place, tuple(repeats), grid, statistics(captured, grid), sd)
+    drawn = partial(drawn_repeats, spec, place, tuple(repeats), grid, misfit)
+    off = partial(_off_statistics, drawn, grid, statistics(captured, grid), sd)
     low, high = np.array([one.bounds for one in SPREAD]).T
     best = least_squares(
         off, start, jac=lambda point: derivatives(off, point, high, workers), bounds=(low, high), max_nfev=SPREAD_STEPS
     )
-    twin = draw(with_values(spec, SPREAD, best.x), place, tuple(repeats), grid, REPEATS, FIRST_SEED)
     jacobian = np.asarray(best.jac, np.float64)
     error = np.sqrt(np.diagonal(np.linalg.inv(jacobian.T @ jacobian)))
-    return Spread(tuple(map(float, best.x)), tuple(map(float, error)), agreement(captured), agreement(list(twin)))
+    return Spread(tuple(map(float, best.x)), tuple(map(float, error)), agreement(captured), agreement(drawn(best.x)))
+
+
+def drawn_repeats(
+    spec: BrushSpec,
+    place: Place,
+    conditions: Sequence[DepthTilt],
+    grid: Grid,
+    misfit: Misfit | None,
+    point: Vector,
+) -> list[Images]:
+    """Repeats of each condition by a brush with these constants of `SPREAD`."""
+    brush = with_values(spec, SPREAD, point)
+    return list(draw(brush, place, conditions, grid, REPEATS, FIRST_SEED, misfit))
 
 
 def _off_statistics(
-    spec: BrushSpec, place: Place, conditions: Sequence[DepthTilt], grid: Grid, seen: Vector, sd: Vector, point: Vector
+    drawn: Callable[[Vector], list[Images]], grid: Grid, seen: Vector, sd: Vector, point: Vector
 ) -> Vector:
-    drawn = draw(with_values(spec, SPREAD, point), place, conditions, grid, REPEATS, FIRST_SEED)
-    return np.concatenate([(statistics(list(drawn), grid) - seen) / sd, point / SPREAD_PRIOR_SD])
+    return np.concatenate([(statistics(drawn(point), grid) - seen) / sd, point / SPREAD_PRIOR_SD])
 
 
 def statistics(ink: Sequence[NDArray[np.floating]], grid: Grid) -> Vector:

@@ -4,7 +4,9 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-from brushloop.drivers.sim.brush.spec import BrushSpec, SoundHead
+from brushloop.drivers.sim.brush.brush_file import SoundHead
+from brushloop.drivers.sim.brush.misfit import Misfit
+from brushloop.drivers.sim.brush.spec import BrushSpec
 
 Place = tuple[float, float, float]
 """x, y, z in the base frame, in mm."""
@@ -153,6 +155,8 @@ class SimConfig:
     sensor_sign: Literal[1, -1] = 1
     """-1 for a sensor that reports the push of the tool on the paper instead of the paper's on the tool."""
     brush: BrushSpec = field(default_factory=BrushSpec)
+    misfit: Misfit | None = None
+    """How marks of the brush differ from those of its mechanics; None where they do not."""
     brush_name: str = ""
     """Name of the brush in recordings; if empty, "simulated bristle bundle" and its seed."""
     head: SoundHead | None = None

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Self
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from brushloop.drivers.arcs.controller import SafetyMode
-from brushloop.drivers.sim.brush.spec import complaint
+from brushloop.drivers.sim.brush.brush_file import complaint
 from brushloop.drivers.sim.world import World
 
 ON_PAPER_MM = 0.1

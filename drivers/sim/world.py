@@ -202,7 +202,7 @@ class World:
     def __init__(self, config: SimConfig, clock: SimClock | None = None) -> None:
         self.config = config
         self.clock = clock or SimClock(config.rate)
-        self.brush = Brush(config.brush)
+        self.brush = Brush(config.brush, config.misfit)
         self.paper = Paper(*config.table.sheet_mm)
         self.presses: list[Press] = []
         self.drags = 0

@@ -22,8 +22,11 @@ from brushloop.calibrate.compare import Alignment, Tone, field_grid
 from brushloop.calibrate.scores import Stat
 from brushloop.calibrate.stats import Summary
 from brushloop.collect.rig.config import QualityConfig
+from brushloop.drivers.loopback import RigRefused
 from brushloop.drivers.sim.brush.brush import Brush
-from brushloop.drivers.sim.brush.spec import ALLOWED, LIKE_TABLE_2, BrushSpec, CameraNoise, SoundHead, load_brush
+from brushloop.drivers.sim.brush.brush_file import LIKE_TABLE_2, CameraNoise, SoundHead, load_brush
+from brushloop.drivers.sim.brush.misfit import Misfit
+from brushloop.drivers.sim.brush.spec import ALLOWED, BrushSpec
 from brushloop.model.presses import Grid, Presses
 from brushloop.twin.brush import HERE, SHAPE, SPREAD, Constant, draw, with_values
 from brushloop.twin.run import (
@@ -147,9 +150,11 @@ def test_the_shape_is_found_with_hairs_that_stray_as_those_of_the_captures(monke
     brush = replace(BrushSpec(), strand_mm=0.5)
     captured = draw(brush, HERE, [condition], GRID, repeats=4)[0]
     presses = Presses(brush.radius_mm, brush.length_mm, GRID, np.array([condition] * 4), captured)
-    twin = fit_twin(presses, ONE_THREAD)
-    assert strays == [(1.0, BrushSpec().strand_mm), (0.5, pytest.approx(twin.spec.strand_mm, rel=0.2))]
-    assert twin.spec.strand_mm > BrushSpec().strand_mm
+    fit_twin(presses, ONE_THREAD)
+    coarse, fine = strays
+    assert coarse == (1.0, BrushSpec().strand_mm)
+    assert fine[0] == 0.5
+    assert fine[1] > BrushSpec().strand_mm
 
 
 # `brushloop twin`, on an imported session of shallow presses, with a short search
@@ -179,8 +184,8 @@ def test_a_session_gets_a_twin_and_a_run_that_was_broken_off_goes_on(
 
     cut: list[bool] = []
     in_this_process = partial(nullcontext, ONE_THREAD)
-    for name, value in {"workers": in_this_process, "VOTES": 1}.items():
-        monkeypatch.setattr(f"brushloop.twin.run.{name}", value)
+    for name, value in {"run.workers": in_this_process, "run.VOTES": 1, "misfit.VOTES": 1}.items():
+        monkeypatch.setattr(f"brushloop.twin.{name}", value)
     for name, value in {"COARSE_MM": (1.0,), "FINE_MM": 0.5, "search": counted, "INDIVIDUALS": range(2)}.items():
         monkeypatch.setattr(f"brushloop.twin.search.{name}", value)
     command = "twin", session, "--out", out
@@ -194,8 +199,12 @@ def test_a_session_gets_a_twin_and_a_run_that_was_broken_off_goes_on(
     unknown = "No condition has three captures", "The camera's noise was not measured"
     for words in ("friction", "a third of the conditions left out in turn", "next: brushloop sim --brush", *unknown):
         assert words in output
+    assert load_brush(out).misfit is not None
     assert load_brush(out).name == "simulated bristle bundle (twin of presses, simulated)"
     assert "exists: give --out FILE or --replace" in refused(*command)
+
+
+ALONG = ((0.2, *[0.0] * 5),) * 10
 
 
 def test_a_twin_is_read_back_and_what_is_not_determined_has_no_interval(tmp_path: Path) -> None:
@@ -204,19 +213,28 @@ def test_a_twin_is_read_back_and_what_is_not_determined_has_no_interval(tmp_path
         one: FittedValue(value=getattr(spec, one.name), low=None if one.name == "set_deg" else 0.1, high=0.4)
         for one in SHAPE
     }
-    fitted = Twin(spec, values, None, (HELD_OUT,), SoundHead(head_mm=2.2, misplaced_mm=4.0))
+    polynomial = (0.5, *[-0.1] * 5)
+    misfit = Misfit(
+        depths_mm=(11.0, 20.0), tilts_deg=(0.0, 10.0), tip=polynomial, heel=polynomial, half=ALONG, middle=ALONG
+    )
+    fitted = Twin(spec, values, None, (HELD_OUT,), SoundHead(head_mm=2.2, misplaced_mm=4.0), misfit, short=4.7)
     path = tmp_path / "twin.toml"
     path.write_text("\n".join(twin_toml(fitted, 'session "1"\n', 1.234)))
     found = load_brush(path)
-    assert (found.brush, found.camera, found.quality) == (
+    assert (found.brush, found.camera, found.quality, found.misfit) == (
         spec,
         CameraNoise(noise=1.23),
         SoundHead(head_mm=2.2, misplaced_mm=4.0),
+        misfit,
     )
     assert found.name == "simulated bristle bundle (twin of session ?1??, simulated)"
     lines = {line.split(" = ")[0]: line for line in path.read_text().splitlines()}
     assert lines["friction"].endswith("# 0.1 to 0.4; default 0.22")
     assert lines["set_deg"].endswith("# deg; not determined by these presses; default 8")
+    assert any("lie 4.7 points of CSIM below the ceiling" in line for line in lines)
+    path.write_text(path.read_text().replace("tip = [0.5", "tip = [500.0"))
+    with pytest.raises(RigRefused, match=r"misfit\.tip\.0: .* less than or equal to 50"):
+        load_brush(path)
 
 
 def still(sd: float, seed: int) -> np.ndarray:

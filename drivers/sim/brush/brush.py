@@ -34,6 +34,7 @@ from brushloop.drivers.sim.brush.mechanics import (
     pull_spine,
     rest_spine,
 )
+from brushloop.drivers.sim.brush.misfit import Misfit
 from brushloop.drivers.sim.brush.spec import BrushSpec, within
 
 LINKS = 48
@@ -52,10 +53,13 @@ REMEMBERED_STANCES = 8
 
 
 class Brush:
-    """One brush. Pressing has no memory: each press starts from the same wiped bundle."""
+    """One brush. Pressing has no memory: each press starts from the same wiped bundle.
 
-    def __init__(self, spec: BrushSpec) -> None:
-        self.spec = spec
+    A twin also has a misfit, with which its presses are bent; its drags and forces are those of its mechanics.
+    """
+
+    def __init__(self, spec: BrushSpec, misfit: Misfit | None = None) -> None:
+        self.spec, self.misfit = spec, misfit
         self._bundle = _bundle(spec)
         self._bristles = grow_bristles(spec, np.random.default_rng(spec.seed))
 
@@ -85,7 +89,8 @@ class Brush:
             rng = self._rng(press_seed, TROUBLE)
             trouble = draw_trouble(flaw, severity, self.spec.bristles, self.spec.length_mm, rng)
         spine = _spine(self.spec, float(depth_mm), float(tilt_deg))
-        return self.print_descent(spine, ink_load=ink_load, press_seed=press_seed, trouble=trouble)
+        mark = self.print_descent(spine, ink_load=ink_load, press_seed=press_seed, trouble=trouble)
+        return mark if self.misfit is None else self.misfit.bend(mark, depth_mm, tilt_deg)
 
     def descents(self, depths_mm: Sequence[float], tilt_deg: float) -> dict[float, Descent]:
         """The way down to each of the depths, all taken from one descent to the deepest, which is quicker than many.
@@ -113,7 +118,7 @@ class Brush:
         px_per_mm: float = PX_PER_MM,
         trouble: Trouble = FLAWLESS,
     ) -> Footprint:
-        """The mark that a descent leaves, as `press` prints it."""
+        """The mark that the mechanics leave after a descent, as `press` prints it."""
         tuft = wet_tuft(self._bundle, self._bristles, trouble, self._rng(press_seed, LIE))
         return print_footprint(descent, tuft, ink_load, px_per_mm, self._rng(press_seed, PAPER))
 

@@ -22,8 +22,8 @@ from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose, distance, from_wire
 from brushloop.drivers.loopback import RigRefused
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Flaw, Waypoint
+from brushloop.drivers.sim.brush.brush_file import LIKE_TABLE_2, load_brush
 from brushloop.drivers.sim.brush.footprint import PX_PER_MM, Footprint
-from brushloop.drivers.sim.brush.spec import LIKE_TABLE_2, load_brush
 from brushloop.drivers.sim.config import SimConfig, Table
 from brushloop.drivers.sim.kinematics import HOME, LIMITS_DEG, forward, inverse, pose_of
 from brushloop.drivers.sim.motion import MotionQueue
