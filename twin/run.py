@@ -41,7 +41,17 @@ from brushloop.sessions.recording import Recording
 from brushloop.sessions.terminal import Progress, unseen
 from brushloop.twin.brush import HERE, SHAPE, SPREAD, Constant, Images, Vector, draw, place_at, with_values
 from brushloop.twin.misfit import FIRST_SEED, VOTES, fit_misfit
-from brushloop.twin.search import FEWEST_REPEATS, Searches, Solution, Spread, Target, covariance, fit_spread, of_parts
+from brushloop.twin.search import (
+    FEWEST_REPEATS,
+    FINE_MM,
+    INDIVIDUAL,
+    Searches,
+    Spread,
+    Target,
+    covariance,
+    fit_spread,
+    of_parts,
+)
 
 MOST_WORKERS = 8
 MOST_SD = 0.7
@@ -164,28 +174,28 @@ def fit_twin(presses: Presses, pool: Executor, progress: Progress = unseen, stor
     """
     grid, groups = presses.grid, {condition: presses.ink[numbers] for condition, numbers in presses.conditions.items()}
     means = np.asarray([ink.mean(axis=0) for ink in groups.values()], np.float32)
-    size = BrushSpec(radius_mm=presses.radius_mm, length_mm=presses.length_mm, seed=0)
+    size = BrushSpec(radius_mm=presses.radius_mm, length_mm=presses.length_mm, seed=INDIVIDUAL)
     target = Target(size, tuple(groups), grid, means)
     parts = parts_of(target.conditions)
     searches = Searches(pool, store, progress, 1 + len(parts))
-    solution = searches.coarse(target)
+    point = searches.coarse(target)
     repeats = {condition: ink for condition, ink in groups.items() if len(ink) >= FEWEST_REPEATS}
     spread: Spread | None = None
     if repeats:
-        spread = fit_spread(target.brush(solution), place_at(solution.point), repeats, grid, pool)
+        spread = fit_spread(target.brush(point), place_at(point), repeats, grid, pool)
         # hairs that stray make every mark wider and its ends fainter: the shape is fitted to the captures with them
         target = replace(target, base=with_values(target.base, SPREAD, spread.point))
-    solution = searches.fine(target, solution)
-    variance = np.diagonal(covariance(target, solution, pool))
-    spec, place = target.brush(solution), place_at(solution.point)
+    point = searches.descend(target, point, FINE_MM)
+    variance = np.diagonal(covariance(target, point, pool))
+    spec, place = target.brush(point), place_at(point)
     misfit = fit_misfit(spec, place, groups, grid)
     if spread is not None:
         spread = fit_spread(spec, place, repeats, grid, pool, spread.point, misfit)
     predicted, points = list[Predicted](), list[Vector]()
     for part in parts:
         others = target.only([k for k in range(len(groups)) if k not in part])
-        without = searches.fine(others, searches.coarse(others))
-        points.append(without.point)
+        without = searches.descend(others, searches.coarse(others), FINE_MM)
+        points.append(without)
         predicted += _predicted(presses, [target.conditions[k] for k in part], without, target)
     held_out = tuple(held_out_scores(predicted, (TWIN, MECHANICS, BEZIER)))
     csim = {row.model: row.csim.avg for row in held_out}
@@ -193,7 +203,7 @@ def fit_twin(presses: Presses, pool: Executor, progress: Progress = unseen, stor
     errors = WIDER * np.sqrt(variance + of_parts(points))
     if short > OTHER_PHYSICS:
         errors = np.full_like(errors, np.inf)
-    found = [*zip(SHAPE, solution.point, errors, strict=False)]
+    found = [*zip(SHAPE, point, errors, strict=False)]
     if spread is not None:
         spec = with_values(spec, SPREAD, spread.point)
         found += [*zip(SPREAD, spread.point, spread.error, strict=True)]
@@ -201,11 +211,11 @@ def fit_twin(presses: Presses, pool: Executor, progress: Progress = unseen, stor
     return Twin(spec, values, spread, held_out, sound_head(spec, target.conditions, grid, misfit), misfit, short)
 
 
-def _predicted(presses: Presses, held: list[DepthTilt], there: Solution, target: Target) -> Iterator[Predicted]:
+def _predicted(presses: Presses, held: list[DepthTilt], there: Vector, target: Target) -> Iterator[Predicted]:
     """Yield the conditions `held` as predicted by the twin without them, and by a Bezier refitted to the others."""
     conditions = presses.conditions
     others = {condition: numbers for condition, numbers in conditions.items() if condition not in held}
-    brush, place = target.brush(there), place_at(there.point)
+    brush, place = target.brush(there), place_at(there)
     misfit = fit_misfit(brush, place, {at: presses.ink[numbers] for at, numbers in others.items()}, target.grid)
     bent, plain = (draw(brush, place, held, target.grid, VOTES, FIRST_SEED, one).mean(axis=1) for one in (misfit, None))
     bezier = refit_bezier(presses.pick([k for numbers in others.values() for k in numbers]))
@@ -266,7 +276,7 @@ def twin_toml(twin: Twin, session_id: str, noise_gray: float | None) -> Iterator
     yield from ("", "[brush]")
     yield f"radius_mm = {twin.spec.radius_mm:g}    # as recorded with the session"
     yield f"length_mm = {twin.spec.length_mm:g}    # as recorded with the session"
-    yield f"seed = {twin.spec.seed}    # the simulated brush nearest to the captures, of those tried"
+    yield f"seed = {twin.spec.seed}    # of the hairs, which are not fitted"
     for constant, fitted in twin.values.items():
         known = "not determined by these presses" if fitted.low is None else f"{fitted.low:.4g} to {fitted.high:.4g}"
         unit = f"{constant.unit}; " if constant.unit else ""

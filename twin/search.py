@@ -43,9 +43,8 @@ EVERY = 2
 NEAR_BOUND = 1e-3
 STARTS = {"trail_share": 0.25}
 """Values from which the search starts where the default is a bad place: under a full trail, its share has no effect."""
-INDIVIDUALS = range(1000, 1032)
-"""Seeds of the individual (its hairs and how they clump) that are tried. A captured brush has none of them: the brushes
-on which twins are measured have seeds below 1000."""
+INDIVIDUAL = 1000
+"""Seed of the twin's own hairs. Those of a captured brush are not known, and no brush of a bench has this seed."""
 MOST_TRIALS = 4
 """Brushes tried for each step: one that is not nearer to the captures costs little beside the derivatives."""
 FTOL = 3e-4
@@ -67,7 +66,7 @@ is better known than the four deviations, each of one number a mark: without one
 COARSE_MM = (1.2, 0.5)
 """Blurs of the first passes of the search."""
 FINE_MM = 0.3
-"""Blur of the pass after the individual has been chosen."""
+"""Blur of the last pass."""
 STEPS = 6
 """Largest number of steps of a pass, each with derivatives of its own."""
 
@@ -83,44 +82,36 @@ class Target:
     mean: Images
     """(conditions, len(y_mm), len(x_mm)) mean ink of each condition's captures."""
 
-    def brush(self, solution: Solution) -> BrushSpec:
-        """The brush of a search."""
-        return with_values(replace(self.base, seed=solution.seed), SHAPE, solution.point)
+    def brush(self, point: Vector) -> BrushSpec:
+        """The brush at a point of the search."""
+        return with_values(self.base, SHAPE, point)
 
     def only(self, kept: Sequence[int]) -> Target:
         """The same with some of the conditions."""
         return replace(self, conditions=tuple(self.conditions[k] for k in kept), mean=self.mean[list(kept)])
 
 
-@dataclass(frozen=True, slots=True)
-class Solution:
-    """Where a search stands: the point, and the seed of the individual."""
-
-    point: Vector
-    seed: int
-
-
-def start() -> Solution:
+def start() -> Vector:
     """The default brush, but with a trail faint enough for the search to see whether there is more of it or less."""
     scales = [one.scales(STARTS.get(one.name, one.default)) for one in SHAPE]
-    return Solution(np.array([*scales, 0.0, 0.0, 0.0]), INDIVIDUALS[0])
+    return np.array([*scales, 0.0, 0.0, 0.0])
 
 
-def off(target: Target, seed: int, blur_mm: float, point: Vector) -> Vector:
+def off(target: Target, blur_mm: float, point: Vector) -> Vector:
     """Residuals: differences of blurred pixels between brush and captures over `IMAGE_SD`, then those of the prior."""
-    still = replace(target.brush(Solution(point, seed)), **STILL)
+    still = replace(target.brush(point), **STILL)
     drawn = draw(still, place_at(point), target.conditions, target.grid)[:, 0]
     sigma = blur_mm / target.grid.px_mm
     apart = [cv2.GaussianBlur(image, (0, 0), sigma)[::EVERY, ::EVERY] for image in drawn - target.mean]
     return np.concatenate([np.asarray(apart, np.float64).ravel() / IMAGE_SD, point / PRIOR_SD])
 
 
-def search(target: Target, solution: Solution, workers: Executor, blur_mm: float) -> Solution:
-    """One pass, starting from `solution`."""
+def search(target: Target, point: Vector, workers: Executor, blur_mm: float) -> Vector:
+    """One pass, starting from `point`."""
     from scipy.optimize import least_squares  # slow to import
 
-    began = np.clip(solution.point, LEAST + NEAR_BOUND, MOST - NEAR_BOUND)
-    reached, residuals = [began], partial(off, target, solution.seed, blur_mm)
+    began = np.clip(point, LEAST + NEAR_BOUND, MOST - NEAR_BOUND)
+    reached, residuals = [began], partial(off, target, blur_mm)
 
     def slopes(moved: Vector) -> NDArray[np.float64]:
         reached.append(began + moved)
@@ -142,7 +133,7 @@ def search(target: Target, solution: Solution, workers: Executor, blur_mm: float
             gtol=None,
         )
         reached.append(began + np.asarray(best.x, np.float64))
-    return Solution(reached[-1], solution.seed)
+    return reached[-1]
 
 
 class _EnoughSteps(Exception):
@@ -158,13 +149,6 @@ def derivatives(
     return np.column_stack([(one - here) / by for one, by in zip(there, steps, strict=True)])
 
 
-def choose_individual(target: Target, solution: Solution, workers: Executor) -> Solution:
-    """The seed whose hairs, with these constants, come nearest to the captures."""
-    residuals = partial(off, target, blur_mm=FINE_MM, point=solution.point)
-    squares = [float(one @ one) for one in workers.map(residuals, INDIVIDUALS, chunksize=4)]
-    return Solution(solution.point, INDIVIDUALS[int(np.argmin(squares))])
-
-
 @dataclass(frozen=True, slots=True)
 class Searches:
     """The searches of one twin; passes that the store holds, as those of an interrupted run, are not repeated."""
@@ -176,40 +160,37 @@ class Searches:
     """Number of searches, each with a coarse and a fine part."""
     _done: Iterator[int] = field(default_factory=lambda: count(1))
 
-    def coarse(self, target: Target) -> Solution:
+    def coarse(self, target: Target) -> Vector:
         """From the default brush to where the detail decides."""
-        solution = self._pass(choose_individual, target, start())
+        point = start()
         for blur_mm in COARSE_MM:
-            solution = self._pass(search, target, solution, blur_mm)
-        return solution
+            point = self.descend(target, point, blur_mm)
+        return point
 
-    def fine(self, target: Target, solution: Solution) -> Solution:
-        """From there to the end, with the individual chosen anew."""
-        return self._pass(search, target, self._pass(choose_individual, target, solution), FINE_MM)
-
-    def _pass(self, work: Callable[..., Solution], target: Target, solution: Solution, *blur_mm: float) -> Solution:
+    def descend(self, target: Target, point: Vector, blur_mm: float) -> Vector:
+        """One pass from `point`; one that the store holds is not repeated."""
         place = target.grid.x_mm, target.grid.y_mm, target.mean
-        key = key_of("twin", made_by(), blur_mm, target.base, target.conditions, *place, solution.seed, solution.point)
+        key = key_of("twin", made_by(), blur_mm, target.base, target.conditions, *place, point)
         if self.store is not None and (kept := self.store.get(key)) is not None:
-            result = Solution(kept["point"], int(kept["seed"]))
+            reached = kept["point"]
         else:
-            result = work(target, solution, self.pool, *blur_mm)
+            reached = search(target, point, self.pool, blur_mm)
             if self.store is not None:
-                self.store.put(key, {"point": result.point, "seed": np.array(result.seed)})
-        self.progress("twin: passes of the search", next(self._done), self.many * (3 + len(COARSE_MM)))
-        return result
+                self.store.put(key, {"point": reached})
+        self.progress("twin: passes of the search", next(self._done), self.many * (1 + len(COARSE_MM)))
+        return reached
 
 
-def covariance(target: Target, solution: Solution, workers: Executor) -> NDArray[np.float64]:
+def covariance(target: Target, point: Vector, workers: Executor) -> NDArray[np.float64]:
     """Covariance (constants, constants) of the point in scales, clustered by condition.
 
     The sandwich of a least-squares fit: what each condition asks to be changed, the model's own errors included,
     spreads over the conditions. The prior counts as one more observation of each constant.
     """
-    evaluate = partial(off, target, solution.seed, FINE_MM)
-    jacobian = derivatives(evaluate, solution.point, MOST, workers)
-    residual = evaluate(solution.point)
-    count, constants = len(target.conditions), len(solution.point)
+    evaluate = partial(off, target, FINE_MM)
+    jacobian = derivatives(evaluate, point, MOST, workers)
+    residual = evaluate(point)
+    count, constants = len(target.conditions), len(point)
     of_cells = jacobian[:-constants].reshape(count, -1, constants)
     pulls = np.einsum("cij,ci->cj", of_cells, residual[:-constants].reshape(count, -1))
     pulls -= pulls.mean(axis=0)
@@ -221,8 +202,7 @@ def covariance(target: Target, solution: Solution, workers: Executor) -> NDArray
 def of_parts(points: Sequence[Vector]) -> Vector | float:
     """Variance (constants,) of the point, from the points (parts, constants) without one part of the conditions each.
 
-    The jackknife of groups. It includes what `covariance` cannot know: that another individual was chosen, or that the
-    search ended elsewhere.
+    The jackknife of groups. It includes what `covariance` cannot know: that the search ended elsewhere.
     """
     if len(points) < 2:
         return 0.0

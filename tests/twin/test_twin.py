@@ -28,7 +28,7 @@ from brushloop.drivers.sim.brush.brush_file import LIKE_TABLE_2, CameraNoise, So
 from brushloop.drivers.sim.brush.misfit import Misfit
 from brushloop.drivers.sim.brush.spec import ALLOWED, BrushSpec
 from brushloop.model.presses import Grid, Presses
-from brushloop.twin.brush import HERE, SHAPE, SPREAD, Constant, draw, with_values
+from brushloop.twin.brush import HERE, SHAPE, SPREAD, Constant, Vector, draw, with_values
 from brushloop.twin.run import (
     LEAST_MISPLACED_MM,
     PARTS,
@@ -41,7 +41,7 @@ from brushloop.twin.run import (
     twin_toml,
     workers,
 )
-from brushloop.twin.search import Solution, Target, choose_individual, fit_spread, of_parts, off, search, start
+from brushloop.twin.search import Target, fit_spread, of_parts, off, search, start
 from tests.command import refused, said
 from tests.photographed import imported_presses
 from tests.waiting import wait_until
@@ -108,15 +108,9 @@ def test_a_search_comes_nearer_to_a_brush_that_gives_ink_from_higher_over_the_pa
     target = Target(BASE, CONDITIONS, GRID, ink.mean(axis=1))
     before = start()
     after = search(target, before, ONE_THREAD, 0.5)
-    squares = [float((off(target, 0, 0.5, one.point) ** 2).sum()) for one in (before, after)]
+    squares = [float((off(target, 0.5, one) ** 2).sum()) for one in (before, after)]
     assert squares[1] < 0.5 * squares[0]
-    assert after.point[[one.name for one in SHAPE].index("film_mm")] > 0.2
-
-
-def test_the_individual_nearest_to_the_captures_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("brushloop.twin.search.INDIVIDUALS", range(4))
-    ink = draw(replace(BASE, seed=2), HERE, CONDITIONS, GRID)
-    assert choose_individual(Target(BASE, CONDITIONS, GRID, ink[:, 0]), start(), ONE_THREAD).seed == 2
+    assert after[[one.name for one in SHAPE].index("film_mm")] > 0.15
 
 
 def test_what_the_parts_disagree_on_is_not_determined() -> None:
@@ -140,12 +134,12 @@ def test_presses_that_differ_more_give_a_wider_spread_of_that_kind(name: str, va
 def test_the_shape_is_found_with_hairs_that_stray_as_those_of_the_captures(monkeypatch: pytest.MonkeyPatch) -> None:
     strays: list[tuple[float, float]] = []
 
-    def counted(target: Target, found: Solution, _workers: Executor, blur_mm: float) -> Solution:
+    def counted(target: Target, found: Vector, _workers: Executor, blur_mm: float) -> Vector:
         strays.append((blur_mm, target.base.strand_mm))
         return found  # how a search finds its way is tested above
 
-    for name, value in {"COARSE_MM": (1.0,), "FINE_MM": 0.5, "search": counted, "INDIVIDUALS": range(1)}.items():
-        monkeypatch.setattr(f"brushloop.twin.search.{name}", value)
+    for name, value in {"search.COARSE_MM": (1.0,), "run.FINE_MM": 0.5, "search.search": counted}.items():
+        monkeypatch.setattr(f"brushloop.twin.{name}", value)
     condition = (3.0, 0.0)
     brush = replace(BrushSpec(), strand_mm=0.5)
     captured = draw(brush, HERE, [condition], GRID, repeats=4)[0]
@@ -175,7 +169,7 @@ def test_a_session_gets_a_twin_and_a_run_that_was_broken_off_goes_on(
     session = imported_presses(tmp_path, PRESSED, (200, 320), (250, 100))
     out, searched = tmp_path / "twin.toml", list[float]()
 
-    def counted(_target: object, found: Solution, _workers: Executor, blur_mm: float) -> Solution:
+    def counted(_target: object, found: Vector, _workers: Executor, blur_mm: float) -> Vector:
         if len(searched) == 2 and not cut:
             cut.append(True)
             raise PowerCut
@@ -184,10 +178,9 @@ def test_a_session_gets_a_twin_and_a_run_that_was_broken_off_goes_on(
 
     cut: list[bool] = []
     in_this_process = partial(nullcontext, ONE_THREAD)
-    for name, value in {"run.workers": in_this_process, "run.VOTES": 1, "misfit.VOTES": 1}.items():
+    shorter = {"run.FINE_MM": 0.5, "run.VOTES": 1, "misfit.VOTES": 1, "search.COARSE_MM": (1.0,)}
+    for name, value in {"run.workers": in_this_process, "search.search": counted, **shorter}.items():
         monkeypatch.setattr(f"brushloop.twin.{name}", value)
-    for name, value in {"COARSE_MM": (1.0,), "FINE_MM": 0.5, "search": counted, "INDIVIDUALS": range(2)}.items():
-        monkeypatch.setattr(f"brushloop.twin.search.{name}", value)
     command = "twin", session, "--out", out
     with pytest.raises(PowerCut):
         said(*command)

@@ -27,7 +27,7 @@ INKED = 0.3
 """Density, as a share of the mark's greatest, from which a place counts as inked."""
 LEAST_HALF_MM = 0.1
 SHORTEST, LONGEST = 0.4, 1.0
-"""By which share of its length a mark's end may be drawn in or out."""
+"""Share of its length by which an end of a mark may be drawn in; and by which an end or an edge may be drawn out."""
 Number = Annotated[float, Field(ge=-50.0, le=50.0)]
 Polynomial = Annotated[tuple[Number, ...], Field(min_length=TERMS, max_length=TERMS)]
 """Coefficients, in mm, of 1, depth, tilt, their product and their squares, about their middles."""
@@ -103,8 +103,9 @@ class Misfit(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
         def across(share: Floats) -> tuple[Floats, Floats, Floats, Floats]:
             """Middle and half width at shares of the way along the mark, before and after."""
             begin, reach = (np.interp(share, SHARES, each) for each in (was.middle, was.half))
-            reach, sines = np.maximum(reach, LEAST_HALF_MM), waves(np.clip(share, 0.0, 1.0))
-            return begin, reach, begin + sines @ middle, np.maximum(reach + sines @ half, LEAST_HALF_MM)
+            sines, most = waves(np.clip(share, 0.0, 1.0)), LONGEST * long
+            aside, more = (np.clip(sines @ each, -most, most) for each in (middle, half))
+            return begin, np.maximum(reach, LEAST_HALF_MM), begin + aside, np.maximum(reach + more, LEAST_HALF_MM)
 
         *_, centre, reach = across(SHARES)
         edges = np.concatenate([centre - reach, centre + reach])
