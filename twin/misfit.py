@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.fit.fit import END_MM, regress
-from brushloop.drivers.sim.brush.misfit import MODES, SHARES, Misfit, Profile, command_terms, waves
+from brushloop.drivers.sim.brush.footprint import Footprint
+from brushloop.drivers.sim.brush.misfit import MODES, SHARES, Misfit, command_terms, profile, waves
 from brushloop.drivers.sim.brush.spec import BrushSpec
 from brushloop.model.presses import DepthTilt, Grid
 from brushloop.twin.brush import Place, Vector, draw, reached_mm
@@ -58,5 +59,6 @@ def fit_misfit(
 
 def _measured(ink: NDArray[np.floating], grid: Grid) -> Vector | None:
     """Ends, middle and half width of one mark, (130,) mm."""
-    profile = Profile.of(ink > 0.5, grid.x_mm, grid.y_mm)
-    return None if profile is None else np.concatenate([profile.ends, profile.middle, profile.half])
+    origin_px = 0.5 - float(grid.x_mm[0]) / grid.px_mm, 0.5 + float(grid.y_mm[0]) / grid.px_mm
+    measured = profile(Footprint(np.asarray(ink, np.float32), 1.0 / grid.px_mm, origin_px))
+    return None if measured is None else np.concatenate(measured)
