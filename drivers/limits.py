@@ -1,9 +1,7 @@
 """The limits that every target is checked against before the first motion and again in the driver."""
 
-from __future__ import annotations
-
 import math
-from typing import Annotated
+from typing import Annotated, Self
 
 from pydantic import BaseModel, Field, model_validator
 
@@ -39,7 +37,7 @@ class Limits(BaseModel, frozen=True, extra="forbid"):
     acc_mm_s2: Annotated[float, Field(gt=0.0, le=5000.0)] = 1000.0
 
     @model_validator(mode="after")
-    def _ordered(self) -> Limits:
+    def _ordered(self) -> Self:
         for name in ("x_mm", "y_mm", "z_mm"):
             low, high = getattr(self, name)
             if low >= high:

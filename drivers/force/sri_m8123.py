@@ -8,8 +8,6 @@ adapter and a bus of its own: the arm's internal bus is never touched. A thread 
 turns its frames into wrenches.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging
@@ -17,7 +15,7 @@ import statistics
 import struct
 import threading
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, Field, model_validator
 
@@ -129,7 +127,7 @@ class ForceTable(BaseModel, frozen=True, extra="forbid"):
     """How long to average with nothing touching, before each zero touch."""
 
     @model_validator(mode="after")
-    def _coherent(self) -> ForceTable:
+    def _coherent(self) -> Self:
         if (self.interface == "socketcand") != (self.host is not None and self.port is not None):
             raise ValueError("host and port belong to the interface socketcand, and to no other")
         most_ms = MOST_STALE_LOOPBACK_MS if self.channel == LOOPBACK_CHANNEL else MOST_STALE_MS

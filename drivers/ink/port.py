@@ -4,8 +4,6 @@ An exchange whose caller was cancelled still ends before the next begins: two re
 would destroy each other.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import math
@@ -51,7 +49,7 @@ class InkTable(BaseModel, ABC, frozen=True, extra="forbid"):
     max_per_minute_ml: Annotated[float, Field(gt=0.0, le=100.0)] = 5.0
 
     @abstractmethod
-    def device(self, clock: Clock) -> InkDevice:
+    def device(self, clock: Clock) -> "InkDevice":
         """The driver, not yet connected."""
 
     def doses_ml(self, dips: int) -> float | None:

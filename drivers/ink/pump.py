@@ -11,8 +11,6 @@ to writes are certain, so nothing is read: neither the pump's identity nor the l
 | exception | unit, 86, code, CRC (2, low first) |
 """
 
-from __future__ import annotations
-
 import asyncio
 import struct
 import time
@@ -91,7 +89,7 @@ class ModbusPumpConfig(InkTable, frozen=True):
     """Dose before every `every_dips`-th dip."""
     every_dips: Annotated[int, Field(ge=1, le=1000)] = 5
 
-    def device(self, clock: Clock) -> ModbusPump:
+    def device(self, clock: Clock) -> InkDevice:
         """The driver, not yet connected."""
         return ModbusPump(self, clock)
 

@@ -1,7 +1,5 @@
 """Serial instruments: the ink station's firmware, a Modbus pump, and the line and faults that both share."""
 
-from __future__ import annotations
-
 import asyncio
 import struct
 import time
@@ -15,37 +13,6 @@ from brushloop.drivers.loopback import LoopbackServer
 GARBAGE = b"\xff\x00*\n\x86\x01ok 1*0000\n"
 LATE_S = 0.3
 RESERVOIR_ML = 100.0
-
-
-class InstrumentServer(LoopbackServer):
-    """An instrument whose serial line is carried by a network: pyserial opens it by `socket://HOST:PORT`.
-
-    Its method `take` reads one request; `answer` carries it out and returns the reply, None for silence.
-    """
-
-    def __init__(self, instrument: StationFirmware | PumpFirmware) -> None:
-        super().__init__()
-        self.instrument = instrument
-        self.next_fault: Callable[[], str | None] = lambda: None
-        """Asked for the fault of each request."""
-
-    async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Answer requests until the client disconnects."""
-        while True:
-            request = await self.instrument.take(reader)
-            fault = self.next_fault()
-            if fault == "unplug":
-                assert self._server is not None
-                self._server.close()
-                self.drop_clients()
-                return
-            reply = None if fault == "deaf" else self.instrument.answer(request)
-            if reply is None or fault == "mute":
-                continue
-            if fault == "late":
-                asyncio.get_running_loop().call_later(LATE_S, self.write, writer, reply)
-            else:
-                self.write(writer, GARBAGE if fault == "garbage" else reply)
 
 
 BRUSH_ML = 0.5
@@ -173,3 +140,34 @@ class PumpFirmware:
         ml_per_s = (self.rpm if self.running else 0.0) / 60.0 * self._ml_per_revolution
         self.well.add(ml_per_s * (now_s - self._since_s))
         self._since_s = now_s
+
+
+class InstrumentServer(LoopbackServer):
+    """An instrument whose serial line is carried by a network: pyserial opens it by `socket://HOST:PORT`.
+
+    Its method `take` reads one request; `answer` carries it out and returns the reply, None for silence.
+    """
+
+    def __init__(self, instrument: StationFirmware | PumpFirmware) -> None:
+        super().__init__()
+        self.instrument = instrument
+        self.next_fault: Callable[[], str | None] = lambda: None
+        """Asked for the fault of each request."""
+
+    async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Answer requests until the client disconnects."""
+        while True:
+            request = await self.instrument.take(reader)
+            fault = self.next_fault()
+            if fault == "unplug":
+                assert self._server is not None
+                self._server.close()
+                self.drop_clients()
+                return
+            reply = None if fault == "deaf" else self.instrument.answer(request)
+            if reply is None or fault == "mute":
+                continue
+            if fault == "late":
+                asyncio.get_running_loop().call_later(LATE_S, self.write, writer, reply)
+            else:
+                self.write(writer, GARBAGE if fault == "garbage" else reply)

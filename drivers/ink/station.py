@@ -5,8 +5,6 @@ lost is sent again with the same number; the station answers a repeated line fro
 twice.
 """
 
-from __future__ import annotations
-
 import re
 from typing import Annotated, Literal
 
@@ -91,7 +89,7 @@ class InkStationConfig(InkTable, frozen=True):
     light: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
     """Set at the start of a run; if left out, the light stays as it is."""
 
-    def device(self, clock: Clock) -> InkStation:
+    def device(self, clock: Clock) -> InkDevice:
         """The driver, not yet connected."""
         return InkStation(self, clock)
 

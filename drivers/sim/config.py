@@ -156,7 +156,6 @@ class SimConfig:
     """-1 for a sensor that reports the push of the tool on the paper instead of the paper's on the tool."""
     brush: BrushSpec = field(default_factory=BrushSpec)
     misfit: Misfit | None = None
-    """How marks of the brush differ from those of its mechanics; None where they do not."""
     brush_name: str = ""
     """Name of the brush in recordings; if empty, "simulated bristle bundle" and its seed."""
     head: SoundHead | None = None

@@ -5,8 +5,6 @@ pass how fast it can be there. The path can be held and resumed, as a controller
 mm/s; in rad and rad/s where a path is angular.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections import deque
@@ -108,7 +106,7 @@ class Knot:
     along: float
     speed: float
 
-    def then(self, along: float, speed: float) -> Knot:
+    def then(self, along: float, speed: float) -> "Knot":
         """The knot that follows."""
         way = max(along - self.along, 0.0)
         return Knot(self.at_s + (2.0 * way / (self.speed + speed) if way else 0.0), along, speed)

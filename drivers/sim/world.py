@@ -50,14 +50,11 @@ TILTS_DEG = (0.0, 7.5, 15.0, 30.0)
 """Tilts for which the push is solved; between them it is interpolated."""
 GRAVITY_M_S2 = 9.81
 ALONG_RAD = 1e-6
-LEVEL = (0.0, 0.0, 1.0)
-Push = Callable[[float, float], float]
-"""The paper's push on a brush: the normal force in N by depth in mm and tilt in deg, 0 in the air."""
 
 
 @functools.lru_cache(maxsize=8)
-def push_on(spec: BrushSpec) -> Push:
-    """The paper's push on one brush.
+def push_on(spec: BrushSpec) -> Callable[[float, float], float]:
+    """The paper's push on one brush: the normal force in N by depth in mm and tilt in deg, 0 in the air.
 
     It comes from the same spine as the ink, on the way down, and takes some tenths of a second to find. Friction along
     the paper, the pull of the menisci and the hysteresis on the way up are left out: only the normal force remains.
@@ -76,7 +73,7 @@ def push_on(spec: BrushSpec) -> Push:
 
 def leaning_with(pose: Pose, normal: tuple[float, float, float]) -> Pose:
     """The pose in a frame whose z is the paper's normal, rotated from the base frame by the least angle."""
-    if normal == LEVEL:
+    if normal == (0.0, 0.0, 1.0):
         return pose
     nx, ny, nz = normal
     share = math.acos(nz) / math.hypot(nx, ny)  # of (ny, -nx, 0), the cross product of the normal and the level one
@@ -166,13 +163,11 @@ class Paper:
         self._coming.append((make, x_mm, y_mm, heading_deg))
 
     def lay(self, footprint: Footprint, x_mm: float, y_mm: float, heading_deg: float) -> None:
-        """Lay a footprint with its zero-touch point at (x, y) and its +x along the heading, on top of earlier ink.
-
-        Its scale is that of the sheet.
-        """
+        """The same with a footprint at hand, whose scale is that of the sheet."""
         self.lay_later(lambda: footprint, x_mm, y_mm, heading_deg)
 
     def _lay(self, footprint: Footprint, x_mm: float, y_mm: float, heading_deg: float) -> None:
+        """Lay a footprint with its zero-touch point at (x, y) and its +x along the heading, on top of earlier ink."""
         cos, sin = math.cos(math.radians(heading_deg)), math.sin(math.radians(heading_deg))
         # Rows run against y, so a counter-clockwise heading is clockwise in row and column.
         linear = np.array([[cos, sin], [-sin, cos]])

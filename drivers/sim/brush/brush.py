@@ -53,10 +53,7 @@ REMEMBERED_STANCES = 8
 
 
 class Brush:
-    """One brush. Pressing has no memory: each press starts from the same wiped bundle.
-
-    A twin also has a misfit, with which its presses are bent; its drags and forces are those of its mechanics.
-    """
+    """One brush, a twin with its misfit. Pressing has no memory: each press starts from the same wiped bundle."""
 
     def __init__(self, spec: BrushSpec, misfit: Misfit | None = None) -> None:
         self.spec, self.misfit = spec, misfit

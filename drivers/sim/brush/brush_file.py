@@ -59,7 +59,6 @@ class BrushFile(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     quality: SoundHead | None = None
     """Where its sound marks begin; None for the default of `rig.toml`."""
     misfit: Misfit | None = None
-    """How its marks differ from those of its mechanics; None where they do not."""
 
 
 def load_brush(path: Path, seed: int = BrushSpec().seed) -> BrushFile:

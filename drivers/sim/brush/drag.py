@@ -1,7 +1,5 @@
 """From a dragged brush to ink on paper: the contact patch trails the tip on a leash, and is printed at each moment."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence
@@ -53,48 +51,6 @@ class Moment:
     """Sideways distance that the commanded tip has travelled so far."""
     pulled: bool
     """True once the leash has come taut."""
-
-
-def follow(path: Sequence[Waypoint], stances: Stances, heading_rad: float) -> list[Moment]:
-    """Draw the patch along the path on its leash.
-
-    While the brush comes down, its tip slides away from the ferrule and takes the middle of the patch along. The patch
-    stays where it is until the leash is taut, then follows straight toward the commanded tip. It turns like a stick
-    that is pulled at its middle, over half its own length; pulled across, the hairs stand up and the patch is short.
-    """
-    x, y, depth = _samples(path)
-    pressed, pulled, half = stances.leash_mm(depth)
-    travel = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
-    px, py = float(x[0]), float(y[0])
-    heading, taut = heading_rad, False
-    moments: list[Moment] = []
-    for k in range(x.size):
-        slid = float(pressed[k] - (pressed[k - 1] if k else 0.0))
-        if k == 0 or depth[k] > depth[k - 1]:
-            px -= slid * math.cos(heading)
-            py -= slid * math.sin(heading)
-        dx, dy = float(x[k]) - px, float(y[k]) - py
-        short, askew = math.hypot(dx, dy) - float(pulled[k]), 0.0
-        if short > 0.0:
-            toward = math.atan2(dy, dx)
-            px += short * math.cos(toward)
-            py += short * math.sin(toward)
-            askew = math.remainder(toward - heading, math.tau) * math.exp(-short / max(float(half[k]), STEP_MM))
-            heading, taut = toward - askew, True
-        length = max(SHORTEST, abs(math.cos(askew)))
-        moments.append(Moment(px, py, heading, length, float(depth[k]), float(travel[k]), taut))
-    return moments
-
-
-def _samples(path: Sequence[Waypoint]) -> tuple[Vector, Vector, Vector]:
-    """x, y, depth (n,) of the commanded tip, at most `STEP_MM` apart, corners included."""
-    corners = np.array([(w.x_mm, w.y_mm, w.depth_mm) for w in path])
-    pieces = [corners[:1]]
-    for a, b in itertools.pairwise(corners):
-        count = max(1, math.ceil(float(np.linalg.norm(b - a)) / STEP_MM))
-        pieces.append(a + np.linspace(0.0, 1.0, count + 1)[1:, None] * (b - a))
-    points = np.concatenate(pieces)
-    return points[:, 0], points[:, 1], points[:, 2]
 
 
 INK_PER_MM = 0.005
@@ -153,6 +109,48 @@ def _half_mm(shape: SpineShape) -> float:
     """Half the length of the part of a spine that is near enough to the paper to wet it."""
     near = shape.x_mm[shape.squash_mm > -WET_MM]
     return 0.5 * float(near.max() - near.min()) if near.size else 0.0
+
+
+def follow(path: Sequence[Waypoint], stances: Stances, heading_rad: float) -> list[Moment]:
+    """Draw the patch along the path on its leash.
+
+    While the brush comes down, its tip slides away from the ferrule and takes the middle of the patch along. The patch
+    stays where it is until the leash is taut, then follows straight toward the commanded tip. It turns like a stick
+    that is pulled at its middle, over half its own length; pulled across, the hairs stand up and the patch is short.
+    """
+    x, y, depth = _samples(path)
+    pressed, pulled, half = stances.leash_mm(depth)
+    travel = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
+    px, py = float(x[0]), float(y[0])
+    heading, taut = heading_rad, False
+    moments: list[Moment] = []
+    for k in range(x.size):
+        slid = float(pressed[k] - (pressed[k - 1] if k else 0.0))
+        if k == 0 or depth[k] > depth[k - 1]:
+            px -= slid * math.cos(heading)
+            py -= slid * math.sin(heading)
+        dx, dy = float(x[k]) - px, float(y[k]) - py
+        short, askew = math.hypot(dx, dy) - float(pulled[k]), 0.0
+        if short > 0.0:
+            toward = math.atan2(dy, dx)
+            px += short * math.cos(toward)
+            py += short * math.sin(toward)
+            askew = math.remainder(toward - heading, math.tau) * math.exp(-short / max(float(half[k]), STEP_MM))
+            heading, taut = toward - askew, True
+        length = max(SHORTEST, abs(math.cos(askew)))
+        moments.append(Moment(px, py, heading, length, float(depth[k]), float(travel[k]), taut))
+    return moments
+
+
+def _samples(path: Sequence[Waypoint]) -> tuple[Vector, Vector, Vector]:
+    """x, y, depth (n,) of the commanded tip, at most `STEP_MM` apart, corners included."""
+    corners = np.array([(w.x_mm, w.y_mm, w.depth_mm) for w in path])
+    pieces = [corners[:1]]
+    for a, b in itertools.pairwise(corners):
+        count = max(1, math.ceil(float(np.linalg.norm(b - a)) / STEP_MM))
+        pieces.append(a + np.linspace(0.0, 1.0, count + 1)[1:, None] * (b - a))
+    points = np.concatenate(pieces)
+    return points[:, 0], points[:, 1], points[:, 2]
 
 
 def ink_left(ink_load: float, travel_mm: float) -> float:

@@ -29,8 +29,7 @@ Polynomial = Annotated[tuple[Number, ...], Field(min_length=TERMS, max_length=TE
 """Coefficients, in mm, of 1, depth, tilt, their product and their squares, about their middles."""
 Along = Annotated[tuple[Polynomial, ...], Field(min_length=MODES, max_length=MODES)]
 """One polynomial for each sine along the mark."""
-Depth = Annotated[float, Field(ge=0.1, le=120.0)]
-Tilt = Annotated[float, Field(ge=0.0, le=90.0)]
+Command = Annotated[float, Field(ge=0.0, le=120.0)]
 
 
 def profile(mark: Footprint) -> tuple[Vector, Vector, Vector] | None:
@@ -65,10 +64,10 @@ def waves(share: Vector) -> Vector:
 
 
 class Misfit(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
-    """How the marks of a brush differ from those of its mechanics."""
+    """How the marks of presses differ from those of the mechanics; drags and forces are those of the mechanics."""
 
-    depths_mm: tuple[Depth, Depth]
-    tilts_deg: tuple[Tilt, Tilt]
+    depths_mm: tuple[Command, Command]
+    tilts_deg: tuple[Command, Command]
     """The presses to which it was fitted; beyond them it is that of the nearest, and less in a shallower press."""
     tip: Polynomial
     heel: Polynomial
@@ -81,29 +80,21 @@ class Misfit(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
         if (measured := profile(mark)) is None:
             return mark
         terms = command_terms(np.clip(depth_mm, *self.depths_mm), np.clip(tilt_deg, *self.tilts_deg))
-        terms *= min(1.0, depth_mm / self.depths_mm[0])
-        was, middles, halves = measured
-        long = was[1] - was[0]
+        terms *= np.interp(depth_mm, (0.0, self.depths_mm[0]), (0.0, 1.0))
+        was, middle, half = measured
+        long, sines = was[1] - was[0], waves(SHARES)
         tip, heel = np.clip(np.array([self.tip, self.heel]) @ terms, -SHORTEST * long, LONGEST * long)
         ends = was + np.array([-tip, heel])
-
-        def across(x_mm: Vector) -> tuple[Vector, Vector, Vector, Vector]:
-            """Middle and half width at x of the stretched mark, before and after."""
-            share = (x_mm - ends[0]) / (ends[1] - ends[0])
-            middle, half = (_between(share, SHARES, each) for each in (middles, halves))
-            sines = waves(np.clip(share, 0.0, 1.0))
-            aside, more = (np.clip(sines @ (np.array(each) @ terms), -long, long) for each in (self.middle, self.half))
-            return middle, np.maximum(half, LEAST_HALF_MM), middle + aside, np.maximum(half + more, LEAST_HALF_MM)
-
-        *_, middle, half = across(ends[0] + SHARES * (ends[1] - ends[0]))
-        edges = np.concatenate([middle - half, middle + half])
+        aside, more = (np.clip(sines @ (np.array(along) @ terms), -long, long) for along in (self.middle, self.half))
+        bowed, wider = middle + aside, np.maximum(half + more, LEAST_HALF_MM)
+        edges = np.concatenate([bowed - wider, bowed + wider])
         (rows, columns), origin_px = frame_around(ends, edges, mark.px_per_mm, MARGIN_MM)
         x_mm = (np.arange(0.5, columns) - origin_px[0]) / mark.px_per_mm
         y_mm = (origin_px[1] - np.arange(0.5, rows)[:, None]) / mark.px_per_mm
-        old_middle, old_half, middle, half = across(x_mm)
-        from_x = was[0] + (x_mm - ends[0]) * long / (ends[1] - ends[0])
-        from_y = old_middle + (y_mm - middle) * old_half / half
-        column = np.broadcast_to(mark.origin_px[0] + from_x * mark.px_per_mm - 0.5, (rows, columns))
+        share = (x_mm - ends[0]) / (ends[1] - ends[0])
+        middle, half, bowed, wider = (_between(share, SHARES, each) for each in (middle, half, bowed, wider))
+        from_y = middle + (y_mm - bowed) * np.maximum(half, LEAST_HALF_MM) / wider
+        column = np.broadcast_to(mark.origin_px[0] + (was[0] + share * long) * mark.px_per_mm - 0.5, (rows, columns))
         row = mark.origin_px[1] - from_y * mark.px_per_mm - 0.5
         density = cv2.remap(mark.density, column.astype(np.float32), row.astype(np.float32), cv2.INTER_LINEAR)
         return Footprint(np.asarray(density, np.float32), mark.px_per_mm, origin_px)
