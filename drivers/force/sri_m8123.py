@@ -282,7 +282,7 @@ class SriM8123:
                 command(STOP)
             bus.shutdown()
 
-    def _take(self, message: can.Message) -> None:
+    def _take(self, message: "can.Message") -> None:
         if message.is_error_frame:
             self.bus_errors += 1
             if message.arbitration_id & BUS_OFF:
