@@ -45,7 +45,7 @@ from brushloop.drivers.sim.brush.brush_file import LIKE_TABLE_2, load_brush
 from brushloop.model.fitted import FittedPress, Prior, learned
 from brushloop.model.generator import SHIPPED_GENERATOR
 from brushloop.model.presses import Presses, image_of
-from brushloop.twin.run import TWIN, fit_twin, workers
+from brushloop.twin.run import MECHANICS, TWIN, fit_twin, workers
 
 BRUSHES = (*NAMED, *BRISTLE_SETS)
 POINTS = "CSIM points"
@@ -218,7 +218,8 @@ def twin(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
         with workers() as pool:
             fitted = fit_twin(presses, pool)
         csim = {row.model: row.csim.avg for row in fitted.held_out}
-        where = f"simulated; ceiling {csim[CEILING]:.2f}, Bezier refitted {csim[BEZIER]:.2f} %; {machine()}"
+        others = f"mechanics alone {csim[MECHANICS]:.2f}, Bezier refitted {csim[BEZIER]:.2f}"
+        where = f"simulated; ceiling {csim[CEILING]:.2f}, {others} %; {machine()}"
         gap = csim[CEILING] - csim[TWIN]
         results.append(at_most(f"twin.gap.{name}", gap, POINTS, TWIN_POINTS, len(presses), seed, where))
         if spread := fitted.spread:
