@@ -54,7 +54,7 @@ TERM_SCALE = (1.0, 1.0, 0.8, 0.8, 0.8, 0.8)
 CONSTANT = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
 OTHERS = (0.03, 0.07, 0.15, 0.3, 0.6, 1.2)
 OWN = (0.03, 0.05, 0.07, 0.1, 0.14, 0.2, 0.28, 0.4, 0.56, 0.8)
-EXPECTED = (0.3, 0.3, 0.1)
+EXPECTED = (0.3, 0.3, 0.03)
 """Scales of constant, other terms and a stroke's own deviation that are most plausible beforehand, mm for the first
 sine; each may well be e times larger or smaller."""
 END_MM = 1.5
