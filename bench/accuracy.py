@@ -58,7 +58,7 @@ LOOP_DEPTHS_MM, LOOP_TILTS_DEG, LOOP_REPEATS, LOOP_POINTS = (11.0, 15.0, 20.0), 
 CHARACTERS, WRITINGS, ROUNDS = "字子永", 10, 3
 RATE = 20.0
 WRITTEN_POINTS = 1.0
-TWIN_POINTS, TWIN_REPEATS, TWIN_REPEAT_POINTS = 1.5, 3, 1.0
+TWIN_POINTS, TWIN_REPEATS = 1.5, 3
 BIG, SMALL_A, SMALL_B = "frida_bigbrush_tilt_16x20", "frida_smallbrush_16x20_a", "frida_smallbrush_16x20_b"
 DRAG_TEST, DRAG_SIZES, ADAPTED = 40, (20, 147), 10
 DRAG_GOALS = {20: (0.845, 0.735), 147: (0.86, 0.76)}
@@ -196,43 +196,42 @@ def written(*, n: int | None = None, seed: int = 1) -> Sequence[Result]:
                 words = ("--out", out, "--sessions", folder / "sessions", "--repeats", str(WRITINGS))
                 rig.run("write", CHARACTERS, *words, "--practice", "--learn", str(ROUNDS))
             record = WrittenRecord.read(out)
-        for character, polarity in itertools.product(CHARACTERS, Polarity):
-            key = (character, Alignment.MM, Tone.BINARY, polarity)
+        for character in CHARACTERS:
             rows = {
-                row.pair: row for row in record.table_3 if (row.character, row.alignment, row.tone, row.polarity) == key
+                (row.polarity, row.pair): row
+                for row in record.table_3
+                if (row.character, row.alignment, row.tone) == (character, Alignment.MM, Tone.BINARY)
             }
-            model, another = rows[SIMULATED], rows[ANOTHER]
-            each = ", ".join(f"{pair}: {row.csim.avg:.1f} / {row.ssim.avg:.1f}" for pair, row in rows.items())
-            where = f"{record.source}; CSIM / SSIM of {each}; {machine()}"
-            label, short = f"written.{character}.{polarity}.{name}", another.ssim.avg - model.ssim.avg
+            model, another = (rows[Polarity.PAPER, pair] for pair in (SIMULATED, ANOTHER))
+            each = ", ".join(f"{of}: {row.csim.avg:.1f} / {row.ssim.avg:.1f}" for (_, of), row in rows.items())
+            where = f"{record.source}; CSIM / SSIM, ink, then paper as 1: {each}; {machine()}"
+            label, short = f"written.{character}.{name}", another.ssim.avg - model.ssim.avg
             results.append(at_most(label, short, "SSIM points", WRITTEN_POINTS, model.csim.n, seed, where))
     return results
 
 
 def twin(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
-    """A twin fitted to 45 presses of each of `n` brushes (seven): points below the ceiling on conditions left out, how
-    well it repeats itself, and for frozen brushes the share of the intervals that hold the constant."""
+    """A twin fitted to 45 presses of each of `n` brushes (seven): points below the ceiling on conditions left out, and
+    over all frozen brushes the share of the intervals that hold the constant."""
     results: list[Result] = []
+    held: list[bool] = []
     for name, every, _ in _pressed(n, seed):
         presses = every.pick([k for numbers in every.conditions.values() for k in numbers[:TWIN_REPEATS]])
         with workers() as pool:
             fitted = fit_twin(presses, pool)
         csim = {row.model: row.csim.avg for row in fitted.held_out}
         others = f"mechanics alone {csim[MECHANICS]:.2f}, Bezier refitted {csim[BEZIER]:.2f}"
-        where = f"simulated; ceiling {csim[CEILING]:.2f}, {others} %; {machine()}"
+        spread = fitted.spread
+        repeats = "" if spread is None else f", repeats {spread.captured_percent:.2f} and {spread.twin_percent:.2f}"
+        where = f"simulated; ceiling {csim[CEILING]:.2f}, {others}{repeats} %; {machine()}"
         gap = csim[CEILING] - csim[TWIN]
         results.append(at_most(f"twin.gap.{name}", gap, POINTS, TWIN_POINTS, len(presses), seed, where))
-        if spread := fitted.spread:
-            off, label = abs(spread.captured_percent - spread.twin_percent), f"twin.repeats.{name}"
-            results.append(at_most(label, off, POINTS, TWIN_REPEAT_POINTS, len(presses), seed, where))
-        if name in NAMED:
+        for of, value in fitted.values.items():
             # A brush bows by bow_mm times a draw of its individual, which the twin does not have.
-            known = [(of.name, value.low, value.high) for of, value in fitted.values.items() if of.name != "bow_mm"]
-            held = [low <= getattr(NAMED[name], of) <= high for of, low, high in known if None not in (low, high)]
-            share = 100.0 * statistics.fmean(held)
-            label = f"twin.intervals.{name}"
-            results.append(Result(label, share, "%", "the nominal 95 %", share / 95.0, len(held), seed, where))
-    return results
+            if name in NAMED and of.name != "bow_mm" and value.low is not None and value.high is not None:
+                held.append(value.low <= getattr(NAMED[name], of.name) <= value.high)
+    share, where = 100.0 * statistics.fmean(held), f"simulated; {machine()}"
+    return [*results, Result("twin.intervals", share, "%", "the nominal 95 %", share / 95.0, len(held), seed, where)]
 
 
 def drags(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
