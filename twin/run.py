@@ -87,10 +87,11 @@ def fitted_value(constant: Constant, scales: float, error: float) -> FittedValue
 
     It has no interval where the presses do not determine it; the prior then does.
     """
-    value, low, high = (constant.value(scales + way * NORMAL_95 * error) for way in (0.0, -1.0, 1.0))
-    least, most = constant.bounds
-    known = error < MOST_SD and least + 0.01 < scales < most - 0.01
-    return FittedValue(value=value, low=low if known else None, high=high if known else None)
+    value, (least, most) = constant.value(scales), constant.bounds
+    if error >= MOST_SD or not least + 0.01 < scales < most - 0.01:
+        return FittedValue(value=value, low=None, high=None)
+    low, high = (constant.value(scales + way * NORMAL_95 * error) for way in (-1.0, 1.0))
+    return FittedValue(value=value, low=low, high=high)
 
 
 @dataclass(frozen=True, slots=True)

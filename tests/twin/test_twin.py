@@ -119,6 +119,8 @@ def test_what_the_parts_disagree_on_is_not_determined() -> None:
     assert of_parts(points[:1]) == 0.0
     errors = np.sqrt(of_parts(points))
     assert [fitted_value(SHAPE[k], 1.0, float(errors[k])).low is not None for k in (0, 1)] == [True, False]
+    of_other_physics = fitted_value(SHAPE[0], 1.0, np.inf)
+    assert (of_other_physics.value, of_other_physics.low) == (SHAPE[0].value(1.0), None)
 
 
 @pytest.mark.parametrize(("name", "value", "least"), [("place_wander_mm", 0.4, 0.25), ("reach_wander_mm", 1.0, 0.2)])
