@@ -7,6 +7,7 @@ residuals of the fitted stroke model are, so that captures which repeat badly ar
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from brushloop.drivers.sim.brush.footprint import Footprint
 from brushloop.drivers.sim.brush.misfit import MODES, SHARES, Misfit, command_terms, profile, waves
 from brushloop.drivers.sim.brush.spec import BrushSpec
 from brushloop.model.presses import DepthTilt, Grid
-from brushloop.twin.brush import Place, Vector, draw, reached_mm
+from brushloop.twin.brush import STILL, Place, Vector, draw, reached_mm
 
 VOTES = 7
 """Presses of the twin that are averaged to one mark."""
@@ -30,7 +31,7 @@ def fit_misfit(
     spec: BrushSpec, place: Place, captured: Mapping[DepthTilt, NDArray[np.floating]], grid: Grid
 ) -> Misfit | None:
     """The misfit of the captures, (n, len(y_mm), len(x_mm)) ink of each condition; None where there is no ink."""
-    marks = draw(spec, place, tuple(captured), grid, VOTES, FIRST_SEED)
+    marks = draw(replace(spec, **STILL), place, tuple(captured), grid, VOTES, FIRST_SEED)
     apart, terms = list[Vector](), list[Vector]()
     for (depth_mm, tilt_deg), drawn, inks in zip(captured, marks, captured.values(), strict=True):
         expected = [one for one in (_measured(image, grid) for image in drawn) if one is not None]

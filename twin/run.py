@@ -39,7 +39,7 @@ from brushloop.model.presses import DepthTilt, Grid, Presses, image_of, refit_be
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.terminal import Progress, unseen
-from brushloop.twin.brush import HERE, SHAPE, SPREAD, Constant, Images, Vector, draw, place_at, with_values
+from brushloop.twin.brush import HERE, SHAPE, SPREAD, STILL, Constant, Images, Vector, draw, place_at, with_values
 from brushloop.twin.misfit import FIRST_SEED, VOTES, fit_misfit
 from brushloop.twin.search import (
     FEWEST_REPEATS,
@@ -213,10 +213,13 @@ def fit_twin(presses: Presses, pool: Executor, progress: Progress = unseen, stor
 
 
 def _predicted(presses: Presses, held: list[DepthTilt], there: Vector, target: Target) -> Iterator[Predicted]:
-    """Yield the conditions `held` as predicted by the twin without them, and by a Bezier refitted to the others."""
+    """Yield the conditions `held` as predicted by the twin without them, and by a Bezier refitted to the others.
+
+    The mean of marks that wander is shorter than the mean mark, so presses are predicted by a brush that does not.
+    """
     conditions = presses.conditions
     others = {condition: numbers for condition, numbers in conditions.items() if condition not in held}
-    brush, place = target.brush(there), place_at(there)
+    brush, place = replace(target.brush(there), **STILL), place_at(there)
     misfit = fit_misfit(brush, place, {at: presses.ink[numbers] for at, numbers in others.items()}, target.grid)
     bent, plain = (draw(brush, place, held, target.grid, VOTES, FIRST_SEED, one).mean(axis=1) for one in (misfit, None))
     bezier = refit_bezier(presses.pick([k for numbers in others.values() for k in numbers]))
