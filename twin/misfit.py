@@ -22,7 +22,7 @@ from brushloop.twin.brush import STILL, Place, Vector, draw, reached_mm
 VOTES = 7
 """Presses of the twin that are averaged to one mark."""
 FIRST_SEED = 900
-LITTLE = 0.3
+LITTLE = 3.0
 """Added to the squares of the sines, so that the edge of one capture is not followed everywhere."""
 DIGITS = 5
 
