@@ -4,6 +4,7 @@ paper: fitted through touches, and the poses above and below it."""
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,8 +21,9 @@ from brushloop.collect.touch.force import Contact, Reading, find_contact, touch_
 from brushloop.collect.touch.heights import Reach
 from brushloop.drivers.geometry import distance, lean
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.world import Push, push_on
+from brushloop.drivers.sim.world import push_on
 
+Push = Callable[[float, float], float]
 HINGE_NOISE_N = 0.002
 
 
