@@ -108,8 +108,6 @@ class Twin:
     """Where its marks begin; None if it leaves no ink."""
     misfit: Misfit | None = None
     """What its mechanics cannot express; None without ink."""
-    short: float = 0.0
-    """Points of CSIM by which the mechanics alone lie below the ceiling in conditions left out."""
 
 
 def twin(request: TwinRequest, progress: Progress = unseen) -> Written:
@@ -199,17 +197,15 @@ def fit_twin(presses: Presses, pool: Executor, progress: Progress = unseen, stor
         points.append(without)
         predicted += _predicted(presses, [target.conditions[k] for k in part], without, target)
     held_out = tuple(held_out_scores(predicted, (TWIN, MECHANICS, BEZIER)))
-    csim = {row.model: row.csim.avg for row in held_out}
-    short = csim.get(CEILING, 0.0) - csim.get(MECHANICS, 0.0)
     errors = WIDER * np.sqrt(variance + of_parts(points))
-    if short > OTHER_PHYSICS:
+    if mechanics_below(held_out) > OTHER_PHYSICS:
         errors = np.full_like(errors, np.inf)
     found = [*zip(SHAPE, point, errors, strict=False)]
     if spread is not None:
         spec = with_values(spec, SPREAD, spread.point)
         found += [*zip(SPREAD, spread.point, spread.error, strict=True)]
     values = {constant: fitted_value(constant, scales, error) for constant, scales, error in found}
-    return Twin(spec, values, spread, held_out, sound_head(spec, target.conditions, grid, misfit), misfit, short)
+    return Twin(spec, values, spread, held_out, sound_head(spec, target.conditions, grid, misfit), misfit)
 
 
 def _predicted(presses: Presses, held: list[DepthTilt], there: Vector, target: Target) -> Iterator[Predicted]:
@@ -228,6 +224,12 @@ def _predicted(presses: Presses, held: list[DepthTilt], there: Vector, target: T
         if bezier is not None:
             images[BEZIER] = image_of(bezier(*condition), target.grid)
         yield presses.ink[conditions[condition]], images
+
+
+def mechanics_below(held_out: Sequence[Stat]) -> float:
+    """Points of CSIM by which the mechanics alone lie below the ceiling in conditions left out; 0 if not known."""
+    csim = {row.model: row.csim.avg for row in held_out}
+    return csim[CEILING] - csim[MECHANICS] if {CEILING, MECHANICS} <= csim.keys() else 0.0
 
 
 def parts_of(conditions: Sequence[DepthTilt]) -> list[list[int]]:
@@ -285,8 +287,8 @@ def twin_toml(twin: Twin, session_id: str, noise_gray: float | None) -> Iterator
         known = "not determined by these presses" if fitted.low is None else f"{fitted.low:.4g} to {fitted.high:.4g}"
         unit = f"{constant.unit}; " if constant.unit else ""
         yield f"{constant.name} = {fitted.value:.6g}    # {unit}{known}; default {constant.default:.4g}"
-    if twin.short > OTHER_PHYSICS:
-        short = f"its mechanics alone lie {twin.short:.1f} points of CSIM below the ceiling"
+    if (points := mechanics_below(twin.held_out)) > OTHER_PHYSICS:
+        short = f"its mechanics alone lie {points:.1f} points of CSIM below the ceiling"
         yield f"# The brush obeys other physics ({short}): constants of shape and ink are no measurement."
     for row in twin.held_out:
         scores = f"CSIM {row.csim.avg:.2f} %, SSIM {row.ssim.avg:.2f} %, n = {row.csim.n}"

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from brushloop.calibrate.artefact import FittedValue
 from brushloop.calibrate.compare import Alignment, Tone, field_grid
 from brushloop.calibrate.scores import Stat
-from brushloop.calibrate.stats import Summary
+from brushloop.calibrate.stats import CEILING, Summary
 from brushloop.collect.rig.config import QualityConfig
 from brushloop.drivers.loopback import RigRefused
 from brushloop.drivers.sim.brush.brush import Brush
@@ -31,6 +31,7 @@ from brushloop.model.presses import Grid, Presses
 from brushloop.twin.brush import HERE, SHAPE, SPREAD, Constant, Vector, draw, with_values
 from brushloop.twin.run import (
     LEAST_MISPLACED_MM,
+    MECHANICS,
     PARTS,
     Twin,
     TwinStopped,
@@ -212,7 +213,11 @@ def test_a_twin_is_read_back_and_what_is_not_determined_has_no_interval(tmp_path
     misfit = Misfit(
         depths_mm=(11.0, 20.0), tilts_deg=(0.0, 10.0), tip=polynomial, heel=polynomial, half=ALONG, middle=ALONG
     )
-    fitted = Twin(spec, values, None, (HELD_OUT,), SoundHead(head_mm=2.2, misplaced_mm=4.0), misfit, short=4.7)
+    rows = {CEILING: 98.0, "twin": 95.1, MECHANICS: 93.3}
+    held_out = tuple(
+        HELD_OUT.model_copy(update={"model": row, "csim": Summary(45, csim)}) for row, csim in rows.items()
+    )
+    fitted = Twin(spec, values, None, held_out, SoundHead(head_mm=2.2, misplaced_mm=4.0), misfit)
     path = tmp_path / "twin.toml"
     path.write_text("\n".join(twin_toml(fitted, 'session "1"\n', 1.234)))
     found = load_brush(path)

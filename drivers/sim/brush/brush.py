@@ -53,7 +53,7 @@ REMEMBERED_STANCES = 8
 
 
 class Brush:
-    """One brush, a twin with its misfit. Pressing has no memory: each press starts from the same wiped bundle."""
+    """One brush; a twin also has a misfit. Pressing has no memory: each press starts from the same wiped bundle."""
 
     def __init__(self, spec: BrushSpec, misfit: Misfit | None = None) -> None:
         self.spec, self.misfit = spec, misfit
