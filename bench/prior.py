@@ -74,7 +74,7 @@ class MadeUp:
         u = grid.x_mm - widest
         share = np.where(u > 0.0, u / heel, u / tip)
         edge = np.where(np.abs(share) < 1.0, half * self.shape(np.clip(share, -1.0, 1.0)), -1.0)
-        return chance_within(edge, grid.y_mm, EDGE_MM)
+        return chance_within(edge, grid.y_mm[:, None], EDGE_MM)
 
 
 def made_up(family: str, number: int, seed: int = 0) -> MadeUp:

@@ -8,7 +8,8 @@ With h = H + h0, c = h / 15 mm, and CCD-BSM's own O3A, O4O3 and O3C at (h, alpha
     the heel and 1 at the tip).
 The widest place lies at lean H tan(alpha) + origin_mm + origin_gain h from the point where the tip touched, in the
 direction in which the ferrule leans; friction holds the tip back, so lean may be < 1.
-The two ends may differ from these lengths, and the edges from the profile, by what `FittedPress` calls residuals.
+The two ends may differ from these lengths, the half width from the profile, and the middle of the mark from the
+brush's axis, by what `FittedPress` calls residuals.
 The defaults are CCD-BSM as published.
 
 What the presses of a brush do not determine has the values that a prior expects: the mean and precision of the
@@ -42,7 +43,7 @@ DEPTH_MM = 15.0
 DEPTH_SPAN_MM, TILT_DEG = 4.5, 5.0
 TERMS = 6
 MODES = 10
-"""Number of sines along the mark by which each edge may differ from the profile."""
+"""Number of cosines along the mark of which the residuals of its half width and of its middle consist."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,15 +149,16 @@ class Sizes:
 class FittedPress:
     """A calibrated brush: `values` (17,) in the order of `PARAMETERS`, with residuals in mm.
 
-    `edges` (2, MODES, TERMS) are the residuals of the upper and the lower edge from the profile: sines along the mark,
-    each with the terms of `command_terms`. `ends` (2, TERMS) are those of the lengths of the tip's and the heel's side.
+    `across` (2, MODES, TERMS) are the residuals of the half width and of the middle, whose tip may lie beside the axis:
+    cosines along the mark, each with the terms of `command_terms`. `ends` (2, TERMS) are those of the lengths of the
+    tip's and the heel's side.
     `values` of shape (K, 1, 17) are those of a batch of K brushes, whose sizes and widths come as (K, ...).
     """
 
     radius_mm: float
     length_mm: float
     values: Floats = field(default_factory=published)
-    edges: Floats = field(default_factory=lambda: np.zeros((2, MODES, TERMS)))
+    across: Floats = field(default_factory=lambda: np.zeros((2, MODES, TERMS)))
     ends: Floats = field(default_factory=lambda: np.zeros((2, TERMS)))
 
     def sizes(self, depth_mm: Array, tilt_deg: Array, further_mm: Array = 0.0) -> Sizes:
@@ -200,17 +202,19 @@ class FittedPress:
         blunt = np.sqrt(1.0 - np.square(share) * np.square(np.square(share)))
         return width + core * blunt - np.maximum(np.abs(u) - long, 0.0)
 
-    def edges_at(self, depth_mm: Array, tilt_deg: Array, x_mm: Floats) -> Floats:
-        """Distances of the upper and the lower edge from the axis, (..., 2, N) mm, as `half_width`."""
+    def mark(self, depth_mm: Array, tilt_deg: Array, x_mm: Floats) -> tuple[Floats, Floats]:
+        """Half width, as `half_width`, and middle y of marks at x (N,), (..., N) mm each."""
         s = self.sizes(depth_mm, tilt_deg)
         share = (x_mm - (s.widest - s.tip)[..., None]) / (s.tip + s.heel)[..., None]
-        sines = np.einsum("smt,...t->...sm", self.edges, command_terms(depth_mm, tilt_deg))
-        return self.half_width(s, x_mm)[..., None, :] + sines @ np.swapaxes(modes(share), -1, -2)
+        weights = np.einsum("smt,...t->...sm", self.across, command_terms(depth_mm, tilt_deg))
+        further, middle = np.moveaxis(weights @ np.swapaxes(modes(share), -1, -2), -2, 0)
+        half = self.half_width(s, x_mm)
+        return half + np.where(half < 0.0, 0.0, further), middle
 
     def chance(self, depth_mm: float, tilt_deg: float, x_mm: Floats, y_mm: Floats, spread_mm: float) -> Floats:
         """The probability of ink (len(y_mm), len(x_mm)) if edges vary by `spread_mm`; y upward from the touch."""
-        edge_mm = np.where(y_mm[:, None] > 0.0, *self.edges_at(depth_mm, tilt_deg, x_mm))
-        return chance_within(edge_mm, y_mm, spread_mm)
+        half, middle = self.mark(depth_mm, tilt_deg, x_mm)
+        return chance_within(half, y_mm[:, None] - middle, spread_mm)
 
     def outline(self, depth_mm: Array, tilt_deg: Array, points: int = 97) -> Outline:
         """The boundaries through `points` points of each edge (an odd number), x from the point of touch, y upward."""
@@ -219,22 +223,23 @@ class FittedPress:
         # Points are denser at both ends, where the outline turns fastest.
         share = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, points))
         x = (s.widest - s.tip)[:, None] + share * (s.tip + s.heel)[:, None]
-        top, bottom = np.moveaxis(np.maximum(self.edges_at(depth, tilt, x), 0.0), 1, 0)
-        return closed(np.stack([x, -bottom], axis=-1), np.stack([x, top], axis=-1)[:, ::-1])
+        half, middle = self.mark(depth, tilt, x)
+        half = np.maximum(half, 0.0)
+        return closed(np.stack([x, middle - half], axis=-1), np.stack([x, middle + half], axis=-1)[:, ::-1])
 
 
-def chance_within(edge_mm: Floats, y_mm: Floats, spread_mm: float) -> Floats:
-    """The probability of ink (len(y_mm), N) within an edge, whose distance from the axis varies by `spread_mm`.
+def chance_within(half_mm: Floats, off_mm: Floats, spread_mm: float) -> Floats:
+    """The probability of ink `off_mm` from the middle of a mark, whose half width varies by `spread_mm`.
 
-    `edge_mm` is (N,), or (len(y_mm), N) where it is not the same on both sides; the spread is the scale of a logistic.
+    The spread is the scale of a logistic.
     """
-    inside = edge_mm - np.abs(y_mm)[:, None]
+    inside = half_mm - np.abs(off_mm)
     return 1.0 / (1.0 + np.exp(-np.clip(inside / spread_mm, -30.0, 30.0)))
 
 
 def modes(share: Floats) -> Floats:
-    """sin(k pi share) for k = 1 .. MODES, (..., MODES); share runs from 0 at the tip to 1 at the heel."""
-    return np.sin(np.pi * np.clip(share, 0.0, 1.0)[..., None] * np.arange(1, MODES + 1))
+    """cos(k pi share) for k = 0 .. MODES - 1, (..., MODES); share runs from 0 at the tip to 1 at the heel."""
+    return np.cos(np.pi * np.clip(share, 0.0, 1.0)[..., None] * np.arange(MODES))
 
 
 def command_terms(depth_mm: Array, tilt_deg: Array) -> Floats:
@@ -252,5 +257,5 @@ def fitted_model(press: FittedPress, label: str = "CCD-BSM fitted") -> StrokeMod
         outline.points[..., 0] -= (depth * np.tan(np.radians(tilt)))[:, None, None]
         return outline
 
-    definition = "CCD-BSM's lengths with gains, powers, profile and edges fitted to captured strokes."
+    definition = "CCD-BSM's lengths with gains, powers, profile and middle fitted to captured strokes."
     return StrokeModel(NAME, label, definition, profile, fitted=True)

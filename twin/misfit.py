@@ -23,7 +23,7 @@ VOTES = 7
 """Presses of the twin that are averaged to one mark."""
 FIRST_SEED = 900
 LITTLE = 3.0
-"""Added to the squares of the sines, so that the edge of one capture is not followed everywhere."""
+"""Added to the squares of the cosines, so that the edge of one capture is not followed everywhere."""
 DIGITS = 5
 
 
@@ -42,11 +42,11 @@ def fit_misfit(
     if not apart:
         return None
     ends, middle, half = np.split(np.array(apart), [2, 2 + len(SHARES)], axis=1)
-    each, falling = np.array(terms), 1.0 / np.arange(1, MODES + 1)
-    tip, heel = (END_MM * regress(end[:, None] / END_MM, each, np.ones(1))[0] for end in (-ends[:, 0], ends[:, 1]))
+    each, falling = np.array(terms), 1.0 / np.arange(MODES).clip(1)
+    tip, heel = (regress(end[:, None], each, np.array([END_MM]))[0] for end in (-ends[:, 0], ends[:, 1]))
     along = waves(SHARES)
-    to_sines = np.linalg.solve(along.T @ along + LITTLE * np.eye(MODES), along.T)
-    half, middle = (regress(edges @ to_sines.T, each, falling) for edges in (half, middle))
+    to_cosines = np.linalg.solve(along.T @ along + LITTLE * np.eye(MODES), along.T)
+    half, middle = (regress(edges @ to_cosines.T, each, falling) for edges in (half, middle))
     depths_mm, tilts_deg = ([reached_mm(depth, place[0]) for depth, _ in captured], [tilt for _, tilt in captured])
     return Misfit(
         depths_mm=(min(depths_mm), max(depths_mm)),

@@ -57,7 +57,7 @@ class BrushFit(SessionFit):
     mm_per_px: float
     parameters: dict[str, float]
     """They describe a mark together; on its own none is comparable between brushes. See docs/brushfit.md."""
-    edges_mm: tuple[tuple[tuple[float, ...], ...], ...]
+    across_mm: tuple[tuple[tuple[float, ...], ...], ...]
     ends_mm: tuple[tuple[float, ...], ...]
     csim_percent: dict[str, float]
     """Leave-condition-out CSIM by model."""
@@ -65,7 +65,7 @@ class BrushFit(SessionFit):
     def press(self) -> FittedPress:
         """The fitted brush."""
         values = np.array([self.parameters[name] for name in NAMES])
-        return FittedPress(self.radius_mm, self.length_mm, values, np.array(self.edges_mm), np.array(self.ends_mm))
+        return FittedPress(self.radius_mm, self.length_mm, values, np.array(self.across_mm), np.array(self.ends_mm))
 
     @classmethod
     def model_of(cls, fit: Path | None, session: OpenSession) -> tuple[StrokeModel, BrushFit | None]:
@@ -82,7 +82,7 @@ class BrushFit(SessionFit):
     @model_validator(mode="after")
     def _whole(self) -> Self:
         shapes = (2, MODES, TERMS), (2, TERMS)
-        own_shapes = np.array(self.edges_mm).shape, np.array(self.ends_mm).shape
+        own_shapes = np.array(self.across_mm).shape, np.array(self.ends_mm).shape
         if set(self.parameters) != set(NAMES) or own_shapes != shapes:
             raise ValueError(f"parameters: expected {', '.join(NAMES)}, with edges and ends of shapes {shapes}")
         return self
@@ -201,7 +201,7 @@ def fit_press_session(request: FitRequest, progress: Progress = unseen, opened: 
         cells=tuple(presses.conditions),
         mm_per_px=MM_PER_PX,
         parameters=dict(zip(NAMES, press.values.tolist(), strict=True)),
-        edges_mm=press.edges.tolist(),
+        across_mm=press.across.tolist(),
         ends_mm=press.ends.tolist(),
         csim_percent={row.model: row.csim.avg for row in held_out},
     )
@@ -282,10 +282,10 @@ def _fitted(press: FittedPress, depth_mm: float, tilt_deg: float, x_mm: Floats) 
     """Length and width of the mark that is predicted, mm; NaN where there is none."""
     try:
         sizes = press.sizes(depth_mm, tilt_deg)
-        width = np.maximum(press.edges_at(depth_mm, tilt_deg, x_mm), 0.0).sum(axis=0).max()
+        half, _ = press.mark(depth_mm, tilt_deg, x_mm)
     except DomainError:
         return math.nan, math.nan
-    return float(sizes.tip + sizes.heel), float(width)
+    return float(sizes.tip + sizes.heel), 2.0 * max(0.0, float(half.max()))
 
 
 def _trust(result: FitResult) -> Iterator[Point]:

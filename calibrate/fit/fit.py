@@ -3,12 +3,12 @@
 No press repeats exactly: width, place and lengths differ from press to press, each by one amount along the whole mark.
 The fit allows for these differences (`STRAYS`): each stroke may have its own, at the cost that their spread says.
 
-What the parameters cannot express are residuals of the edges and ends, by empirical Bayes. Each stroke is compared with
-the fitted parameters: how much further its tip and its heel reach, and by which sines each of its edges differs from
-the profile. Over the strokes, each of these numbers is a polynomial in depth and tilt plus the stroke's own deviation.
-The scales of the polynomial's constant, of its other terms and of the deviations are those with the greatest marginal
-likelihood on a grid (D. MacKay, "Bayesian interpolation", 1992), with a weak prior on each scale. So the fit smooths
-strokes that repeat badly and follows strokes that repeat well.
+What the parameters cannot express are residuals, by empirical Bayes. Each stroke is compared with the fitted
+parameters: how much further its tip and its heel reach, and by which cosines its half width differs from the profile
+and its middle from the axis. Over the strokes, each number is a polynomial in depth and tilt plus the stroke's own
+deviation. The scales of the polynomial's constant, of its other terms and of the deviations are those with the greatest
+marginal likelihood on a grid (D. MacKay, "Bayesian interpolation", 1992), with a weak prior on each scale. So the fit
+smooths strokes that repeat badly and follows strokes that repeat well.
 """
 
 from __future__ import annotations
@@ -38,8 +38,10 @@ from brushloop.model.fitted import (
 )
 from brushloop.model.presses import DepthTilt, Grid, Presses
 
-SPREAD_MM = 0.15
+SPREAD_MM = 0.25
 """Variation of an edge from press to press (scale of a logistic)."""
+PRIOR_PX = 0.5
+"""Pixels of wrong ink that cost as much as a parameter one standard deviation off the prior."""
 ALL = tuple(range(len(NAMES)))
 SCALE = tuple(NAMES.index(name) for name in ("lam", "heel_gain", "tip_gain", "origin_mm"))
 """Size and place of the marks."""
@@ -56,12 +58,14 @@ OTHERS = (0.03, 0.07, 0.15, 0.3, 0.6, 1.2)
 OWN = (0.03, 0.05, 0.07, 0.1, 0.14, 0.2, 0.28, 0.4, 0.56, 0.8)
 EXPECTED = (0.3, 0.3, 0.03)
 """Scales of constant, other terms and a stroke's own deviation that are most plausible beforehand, mm for the first
-sine; each may well be e times larger or smaller."""
+cosine; each may well be e times larger or smaller."""
 END_MM = 1.5
 """Plausible error of a length; the scales of the ends are in units of it."""
-END_NOISE = 4.0
-"""Variance of a pixel times the number of pixels whose errors are correlated, where an end is sought."""
+END_PX = 1.8
+"""Pixels of wrong ink that cost as much as an end that is 1 mm off."""
 END_STEP_MM, END_ROUNDS = 0.05, 4
+LEAST_MM = 0.3
+"""Width from which a column of ink has a middle."""
 
 
 def fit_presses(
@@ -105,7 +109,7 @@ class Drawn:
     @classmethod
     def of(cls, width: Floats, widths: Floats, y_mm: Floats) -> Drawn:
         """The mark of half width (N,) with these derivatives."""
-        ink = chance_within(width, y_mm, SPREAD_MM)
+        ink = chance_within(width, y_mm[:, None], SPREAD_MM)
         return cls(ink, ink * (1.0 - ink) / SPREAD_MM, widths)
 
     def square(self) -> Floats:
@@ -127,8 +131,8 @@ def draw(press: FittedPress, conditions: Floats, grid: Grid, free: Sequence[int]
 
 
 def _minimise(press: FittedPress, free: Sequence[int], presses: Presses, prior: Prior) -> tuple[FittedPress, float]:
-    """Levenberg-Marquardt from `press`, and the cost where it ends; a parameter one standard deviation off the prior
-    costs as much as a pixel of wrong ink."""
+    """Levenberg-Marquardt from `press`, and the cost where it ends."""
+    precision = PRIOR_PX * prior.precision
     inks = {condition: presses.ink[numbers] for condition, numbers in presses.conditions.items()}
     at = list(free)
     low, high = (np.array([getattr(PARAMETERS[k], end) for k in at]) for end in ("low", "high"))
@@ -141,9 +145,9 @@ def _minimise(press: FittedPress, free: Sequence[int], presses: Presses, prior: 
     def equations(vector: Floats) -> Equations:
         trial = at_values(vector)
         square, gradient, cost = _normal(trial, at, inks, presses.grid)
-        pull = prior.precision @ prior.off(trial.values)
+        pull = precision @ prior.off(trial.values)
         cost += 0.5 * float(prior.off(trial.values) @ pull)
-        square += prior.precision[np.ix_(at, at)]
+        square += precision[np.ix_(at, at)]
         gradient += pull[at]
         # A parameter that is pulled beyond its bound stays there: the step of the others must not count on it.
         held = ((vector <= low) & (gradient > 0.0)) | ((vector >= high) & (gradient < 0.0))
@@ -195,16 +199,14 @@ def _normal(
 
 
 def fit_residual(press: FittedPress, presses: Presses) -> FittedPress:
-    """The brush with the residuals of its ends and edges; `press` has none."""
+    """The brush with its residuals; `press` has none."""
     (depths, tilts), inks, grid = presses.commands.T, presses.ink, presses.grid
     terms = command_terms(depths, tilts)
     ends = _ends(press, depths, tilts, inks, grid)
-    sides = _sines(press, press.sizes(depths, tilts, ends), inks, grid)
-    falling = 1.0 / np.arange(1, MODES + 1)
-    # Half the sum of the edges is a mark's width, half the difference a bow: each has scales of its own.
-    width, bow = (regress(0.5 * (sides[:, 0] + way * sides[:, 1]), terms, falling) for way in (1.0, -1.0))
-    lengths = [END_MM * regress(ends[:, [k]] / END_MM, terms, np.ones(1))[0] for k in range(2)]
-    return replace(press, edges=np.array([width + bow, width - bow]), ends=np.array(lengths))
+    falling = 1.0 / np.arange(MODES).clip(1)
+    seen = _across(press, press.sizes(depths, tilts, ends), inks, grid)
+    lengths = [regress(ends[:, [k]], terms, np.array([END_MM]))[0] for k in range(2)]
+    return replace(press, across=np.array([regress(each, terms, falling) for each in seen]), ends=np.array(lengths))
 
 
 def regress(seen: Floats, terms: Floats, scale: Floats) -> Floats:
@@ -232,29 +234,27 @@ def _ends(press: FittedPress, depths_mm: Floats, tilts_deg: Floats, inks: Floats
     def width(further: Floats) -> Floats:
         return press.half_width(press.sizes(depths_mm, tilts_deg, further), grid.x_mm)
 
-    sizes = press.sizes(depths_mm, tilts_deg)
-    reach = np.stack([sizes.tip, sizes.heel], axis=-1)
-    weight = END_NOISE / END_MM**2
-    ends = np.zeros_like(reach)
+    ends = np.zeros((len(inks), 2))
     for _ in range(END_ROUNDS):
         here = width(ends)
         by_end = np.stack([(width(ends + END_STEP_MM * way) - here) / END_STEP_MM for way in np.eye(2)], axis=1)
         for k, ink in enumerate(inks):
             drawn = Drawn.of(here[k], by_end[k], grid.y_mm)
-            pull = drawn.pull((ink - drawn.ink)[None])[0] - weight * ends[k]
-            step = np.asarray(np.linalg.solve(drawn.square() + weight * np.eye(2), pull), np.float64)
-            ends[k] = np.clip(ends[k] + np.clip(step, -0.7, 0.7), -0.5 * reach[k], reach[k])
+            pull = drawn.pull((ink - drawn.ink)[None])[0] - END_PX * ends[k]
+            step = np.asarray(np.linalg.solve(drawn.square() + END_PX * np.eye(2), pull), np.float64)
+            ends[k] += step.clip(-0.7, 0.7)
     return ends
 
 
-def _sines(press: FittedPress, sizes: Sizes, inks: Floats, grid: Grid) -> Floats:
-    """The sines (strokes, 2, MODES) by which strokes' upper and lower edges differ from the profile, mm."""
+def _across(press: FittedPress, sizes: Sizes, inks: Floats, grid: Grid) -> Floats:
+    """The cosines by which half widths differ from the profile, and middles from the axis, (2, strokes, MODES)."""
     share = (grid.x_mm - (sizes.widest - sizes.tip)[:, None]) / (sizes.tip + sizes.heel)[:, None]
-    waves = modes(share)  # 0 beyond the ends
-    width = np.maximum(press.half_width(sizes, grid.x_mm), 0.0)
-    above = grid.y_mm > 0.0
-    edges = [inks[:, rows].sum(axis=1) * grid.px_mm - width for rows in (above, ~above)]
-    little = 0.005 * ((share > 0.0) & (share < 1.0)).sum(axis=1)[:, None, None] * np.eye(MODES)
-    across = waves.swapaxes(1, 2)
-    sines = np.asarray(np.linalg.solve(across @ waves + little, across @ np.stack(edges, axis=-1)), np.float64)
-    return sines.swapaxes(1, 2)
+    across = inks.sum(axis=1) * grid.px_mm
+    inked = (share > 0.0) & (share < 1.0) & (across > LEAST_MM)
+    half = 0.5 * across - press.half_width(sizes, grid.x_mm)
+    middle = np.einsum("nyx,y->nx", inks, grid.y_mm) * grid.px_mm / np.maximum(across, LEAST_MM)
+    waves = modes(share) * inked[..., None]
+    along = waves.swapaxes(1, 2)
+    little = 0.005 * inked.sum(axis=1)[:, None, None] * np.eye(MODES)
+    seen = along @ np.stack([half, middle], axis=-1)
+    return np.moveaxis(np.asarray(np.linalg.solve(along @ waves + little, seen), np.float64), -1, 0)

@@ -63,7 +63,7 @@ class Refit:
 def refit(job: Refit) -> Arrays:
     """The numbers of the fitted brush."""
     press = fit_presses(job.presses, prior=job.prior, start=job.start)
-    return {"values": press.values, "edges": press.edges, "ends": press.ends}
+    return {"values": press.values, "across": press.across, "ends": press.ends}
 
 
 def refits(

@@ -1,7 +1,7 @@
 """What the mechanics of a twin cannot express: how its marks differ from those of the brush that it imitates.
 
 A mark has a tip and a heel, and at each share of the way from one to the other a middle and a half width across. Both
-ends, and the sines of which middle and half width consist, differ from those of the mechanics by polynomials in depth
+ends, and the cosines of which middle and half width consist, differ from those of the mechanics by polynomials in depth
 and tilt. The printed mark is stretched until it agrees, so that its ink stays as it was printed.
 """
 
@@ -28,7 +28,7 @@ Number = Annotated[float, Field(ge=-50.0, le=50.0)]
 Polynomial = Annotated[tuple[Number, ...], Field(min_length=TERMS, max_length=TERMS)]
 """Coefficients, in mm, of 1, depth, tilt, their product and their squares, about their middles."""
 Along = Annotated[tuple[Polynomial, ...], Field(min_length=MODES, max_length=MODES)]
-"""One polynomial for each sine along the mark."""
+"""One polynomial for each cosine along the mark."""
 Command = Annotated[float, Field(ge=0.0, le=120.0)]
 
 
@@ -59,8 +59,8 @@ def command_terms(depth_mm: float, tilt_deg: float) -> Vector:
 
 
 def waves(share: Vector) -> Vector:
-    """sin(k pi share) for k = 1 .. MODES, (len(share), MODES)."""
-    return np.sin(np.pi * share[:, None] * np.arange(1, MODES + 1))
+    """cos(k pi share) for k = 0 .. MODES - 1, (len(share), MODES)."""
+    return np.cos(np.pi * share[:, None] * np.arange(MODES))
 
 
 class Misfit(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
@@ -82,10 +82,10 @@ class Misfit(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
         terms = command_terms(np.clip(depth_mm, *self.depths_mm), np.clip(tilt_deg, *self.tilts_deg))
         terms *= np.interp(depth_mm, (0.0, self.depths_mm[0]), (0.0, 1.0))
         was, middle, half = measured
-        long, sines = was[1] - was[0], waves(SHARES)
+        long, cosines = was[1] - was[0], waves(SHARES)
         tip, heel = np.clip(np.array([self.tip, self.heel]) @ terms, -SHORTEST * long, LONGEST * long)
         ends = was + np.array([-tip, heel])
-        aside, more = (np.clip(sines @ (np.array(along) @ terms), -long, long) for along in (self.middle, self.half))
+        aside, more = (np.clip(cosines @ (np.array(along) @ terms), -long, long) for along in (self.middle, self.half))
         bowed, wider = middle + aside, np.maximum(half + more, LEAST_HALF_MM)
         edges = np.concatenate([bowed - wider, bowed + wider])
         (rows, columns), origin_px = frame_around(ends, edges, mark.px_per_mm, MARGIN_MM)
