@@ -80,9 +80,9 @@ def fit(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
 
 
 def few(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
-    """The same from one press of each of the first 5 and 9 conditions of the fixed design: mean and worst of `n` (3)
+    """The same from one press of each of the first 5 and 9 conditions of the fixed design: mean and worst of `n` (12)
     draws of these presses, over all other conditions."""
-    draws, results = rounds_of(n, 3), list[Result]()
+    draws, results = rounds_of(n, 12), list[Result]()
     for name, presses, prior in _pressed(None, seed):
         cells = presses.conditions
         for size, goal in FEW_POINTS.items():

@@ -42,8 +42,8 @@ DEPTH_MM = 15.0
 """Depth at which powers and edges are centred: the middle of the paper's range."""
 DEPTH_SPAN_MM, TILT_DEG = 4.5, 5.0
 TERMS = 6
-MODES = 10
-"""Number of cosines along the mark of which the residuals of its half width and of its middle consist."""
+MODES = 12
+"""Number of polynomials along the mark of which the residuals of its half width and of its middle consist."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +150,7 @@ class FittedPress:
     """A calibrated brush: `values` (17,) in the order of `PARAMETERS`, with residuals in mm.
 
     `across` (2, MODES, TERMS) are the residuals of the half width and of the middle, whose tip may lie beside the axis:
-    cosines along the mark, each with the terms of `command_terms`. `ends` (2, TERMS) are those of the lengths of the
+    `modes` along the mark, each with the terms of `command_terms`. `ends` (2, TERMS) are those of the lengths of the
     tip's and the heel's side.
     `values` of shape (K, 1, 17) are those of a batch of K brushes, whose sizes and widths come as (K, ...).
     """
@@ -238,8 +238,8 @@ def chance_within(half_mm: Floats, off_mm: Floats, spread_mm: float) -> Floats:
 
 
 def modes(share: Floats) -> Floats:
-    """cos(k pi share) for k = 0 .. MODES - 1, (..., MODES); share runs from 0 at the tip to 1 at the heel."""
-    return np.cos(np.pi * np.clip(share, 0.0, 1.0)[..., None] * np.arange(MODES))
+    """Chebyshev polynomials of 1 - 2 share (..., MODES), finest at both ends; share is 0 at the tip, 1 at the heel."""
+    return np.cos(np.arccos(1.0 - 2.0 * np.clip(share, 0.0, 1.0))[..., None] * np.arange(MODES))
 
 
 def command_terms(depth_mm: Array, tilt_deg: Array) -> Floats:

@@ -22,8 +22,8 @@ from brushloop.twin.brush import STILL, Place, Vector, draw, reached_mm
 VOTES = 7
 """Presses of the twin that are averaged to one mark."""
 FIRST_SEED = 900
-LITTLE = 3.0
-"""Added to the squares of the cosines, so that the edge of one capture is not followed everywhere."""
+LITTLE = 0.3
+"""Added to the squares of the modes, so that the edge of one capture is not followed everywhere."""
 DIGITS = 5
 
 
@@ -45,8 +45,8 @@ def fit_misfit(
     each, falling = np.array(terms), 1.0 / np.arange(MODES).clip(1)
     tip, heel = (regress(end[:, None], each, np.array([END_MM]))[0] for end in (-ends[:, 0], ends[:, 1]))
     along = waves(SHARES)
-    to_cosines = np.linalg.solve(along.T @ along + LITTLE * np.eye(MODES), along.T)
-    half, middle = (regress(edges @ to_cosines.T, each, falling) for edges in (half, middle))
+    to_modes = np.linalg.solve(along.T @ along + LITTLE * np.eye(MODES), along.T)
+    half, middle = (regress(edges @ to_modes.T, each, falling) for edges in (half, middle))
     depths_mm, tilts_deg = ([reached_mm(depth, place[0]) for depth, _ in captured], [tilt for _, tilt in captured])
     return Misfit(
         depths_mm=(min(depths_mm), max(depths_mm)),

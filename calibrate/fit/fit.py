@@ -4,9 +4,9 @@ No press repeats exactly: width, place and lengths differ from press to press, e
 The fit allows for these differences (`STRAYS`): each stroke may have its own, at the cost that their spread says.
 
 What the parameters cannot express are residuals, by empirical Bayes. Each stroke is compared with the fitted
-parameters: how much further its tip and its heel reach, and by which cosines its half width differs from the profile
-and its middle from the axis. Over the strokes, each number is a polynomial in depth and tilt plus the stroke's own
-deviation. The scales of the polynomial's constant, of its other terms and of the deviations are those with the greatest
+parameters: how much further its tip and its heel reach, and by which polynomials along the mark its half width differs
+from the profile and its middle from the axis. Over the strokes, each number is a polynomial in depth and tilt plus the
+stroke's own deviation. The scales of its constant, of its other terms and of the deviations are those with the greatest
 marginal likelihood on a grid (D. MacKay, "Bayesian interpolation", 1992), with a weak prior on each scale. So the fit
 smooths strokes that repeat badly and follows strokes that repeat well.
 """
@@ -58,7 +58,7 @@ OTHERS = (0.03, 0.07, 0.15, 0.3, 0.6, 1.2)
 OWN = (0.03, 0.05, 0.07, 0.1, 0.14, 0.2, 0.28, 0.4, 0.56, 0.8)
 EXPECTED = (0.3, 0.3, 0.03)
 """Scales of constant, other terms and a stroke's own deviation that are most plausible beforehand, mm for the first
-cosine; each may well be e times larger or smaller."""
+of `modes`; each may well be e times larger or smaller."""
 END_MM = 1.5
 """Plausible error of a length; the scales of the ends are in units of it."""
 END_PX = 1.8
@@ -247,7 +247,7 @@ def _ends(press: FittedPress, depths_mm: Floats, tilts_deg: Floats, inks: Floats
 
 
 def _across(press: FittedPress, sizes: Sizes, inks: Floats, grid: Grid) -> Floats:
-    """The cosines by which half widths differ from the profile, and middles from the axis, (2, strokes, MODES)."""
+    """By which `modes` half widths differ from the profile, and middles from the axis, (2, strokes, MODES)."""
     share = (grid.x_mm - (sizes.widest - sizes.tip)[:, None]) / (sizes.tip + sizes.heel)[:, None]
     across = inks.sum(axis=1) * grid.px_mm
     inked = (share > 0.0) & (share < 1.0) & (across > LEAST_MM)

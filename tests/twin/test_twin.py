@@ -25,7 +25,7 @@ from brushloop.collect.rig.config import QualityConfig
 from brushloop.drivers.loopback import RigRefused
 from brushloop.drivers.sim.brush.brush import Brush
 from brushloop.drivers.sim.brush.brush_file import LIKE_TABLE_2, CameraNoise, SoundHead, load_brush
-from brushloop.drivers.sim.brush.misfit import Misfit
+from brushloop.drivers.sim.brush.misfit import MODES, Misfit
 from brushloop.drivers.sim.brush.spec import ALLOWED, BrushSpec
 from brushloop.model.presses import Grid, Presses
 from brushloop.twin.brush import HERE, SHAPE, SPREAD, Constant, Vector, draw, with_values
@@ -200,7 +200,7 @@ def test_a_session_gets_a_twin_and_a_run_that_was_broken_off_goes_on(
     assert "exists: give --out FILE or --replace" in refused(*command)
 
 
-ALONG = ((0.2, *[0.0] * 5),) * 10
+ALONG = ((0.2, *[0.0] * 5),) * MODES
 
 
 def test_a_twin_is_read_back_and_what_is_not_determined_has_no_interval(tmp_path: Path) -> None:

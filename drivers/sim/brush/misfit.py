@@ -1,8 +1,8 @@
 """What the mechanics of a twin cannot express: how its marks differ from those of the brush that it imitates.
 
-A mark has a tip and a heel, and at each share of the way from one to the other a middle and a half width across. Both
-ends, and the cosines of which middle and half width consist, differ from those of the mechanics by polynomials in depth
-and tilt. The printed mark is stretched until it agrees, so that its ink stays as it was printed.
+A mark has a tip and a heel, and at each share of the way from one to the other a middle and a half width across. These
+differ from the mechanics: the ends by polynomials in depth and tilt, middle and half width by polynomials along the
+mark with such coefficients. The printed mark is stretched until it agrees, so that its ink stays as it was printed.
 """
 
 from typing import Annotated
@@ -16,7 +16,7 @@ from brushloop.drivers.sim.brush.mechanics import Vector
 
 SHARES = (np.arange(64) + 0.5) / 64
 """Where a mark is measured, from 0 at its tip to 1 at its heel."""
-TERMS, MODES = 6, 10
+TERMS, MODES = 6, 12
 DEPTH_MM, DEPTH_SPAN_MM, TILT_DEG = 15.0, 4.5, 5.0
 """The middles of the paper's depths and tilts; the depths reach `DEPTH_SPAN_MM` from there, the tilts `TILT_DEG`."""
 INKED = 0.4
@@ -28,7 +28,7 @@ Number = Annotated[float, Field(ge=-50.0, le=50.0)]
 Polynomial = Annotated[tuple[Number, ...], Field(min_length=TERMS, max_length=TERMS)]
 """Coefficients, in mm, of 1, depth, tilt, their product and their squares, about their middles."""
 Along = Annotated[tuple[Polynomial, ...], Field(min_length=MODES, max_length=MODES)]
-"""One polynomial for each cosine along the mark."""
+"""One for each polynomial of `waves`."""
 Command = Annotated[float, Field(ge=0.0, le=120.0)]
 
 
@@ -59,8 +59,8 @@ def command_terms(depth_mm: float, tilt_deg: float) -> Vector:
 
 
 def waves(share: Vector) -> Vector:
-    """cos(k pi share) for k = 0 .. MODES - 1, (len(share), MODES)."""
-    return np.cos(np.pi * share[:, None] * np.arange(MODES))
+    """Chebyshev polynomials of 1 - 2 share, (len(share), MODES): they resolve the ends better than the middle."""
+    return np.cos(np.arccos(1.0 - 2.0 * share)[:, None] * np.arange(MODES))
 
 
 class Misfit(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
@@ -82,10 +82,10 @@ class Misfit(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
         terms = command_terms(np.clip(depth_mm, *self.depths_mm), np.clip(tilt_deg, *self.tilts_deg))
         terms *= np.interp(depth_mm, (0.0, self.depths_mm[0]), (0.0, 1.0))
         was, middle, half = measured
-        long, cosines = was[1] - was[0], waves(SHARES)
+        long, along = was[1] - was[0], waves(SHARES)
         tip, heel = np.clip(np.array([self.tip, self.heel]) @ terms, -SHORTEST * long, LONGEST * long)
         ends = was + np.array([-tip, heel])
-        aside, more = (np.clip(cosines @ (np.array(along) @ terms), -long, long) for along in (self.middle, self.half))
+        aside, more = (np.clip(along @ (np.array(each) @ terms), -long, long) for each in (self.middle, self.half))
         bowed, wider = middle + aside, np.maximum(half + more, LEAST_HALF_MM)
         edges = np.concatenate([bowed - wider, bowed + wider])
         (rows, columns), origin_px = frame_around(ends, edges, mark.px_per_mm, MARGIN_MM)
