@@ -209,7 +209,7 @@ class FittedPress:
         weights = np.einsum("smt,...t->...sm", self.across, command_terms(depth_mm, tilt_deg))
         further, middle = np.moveaxis(weights @ np.swapaxes(modes(share), -1, -2), -2, 0)
         half = self.half_width(s, x_mm)
-        return half + np.where(half < 0.0, 0.0, further), middle
+        return half + np.where(half < -1e-9, 0.0, further), middle  # at an end, half is 0 but for rounding
 
     def chance(self, depth_mm: float, tilt_deg: float, x_mm: Floats, y_mm: Floats, spread_mm: float) -> Floats:
         """The probability of ink (len(y_mm), len(x_mm)) if edges vary by `spread_mm`; y upward from the touch."""

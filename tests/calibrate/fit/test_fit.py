@@ -125,6 +125,14 @@ def test_a_tip_beside_the_axis_and_a_width_that_the_profile_does_not_have_are_fo
     assert fitted < 0.3 * alone
 
 
+def test_a_blunt_end_is_blunt_at_every_depth_so_that_images_change_smoothly() -> None:
+    brush = replace(a_brush(core_mm=0.0), across=np.zeros_like(a_brush().across))
+    brush.across[0, 0, 0] = 0.3
+    depths = np.linspace(11.0, 20.0, 200)
+    outlines = brush.outline(depths, np.full(200, 5.0)).points
+    assert outlines[:, 0, 0, 1] == pytest.approx(-0.3)
+
+
 def test_held_out_conditions_are_scored_beside_the_ceiling_which_one_press_of_each_does_not_show() -> None:
     strokes = presses(a_brush(), CONDITIONS * 2, noise=0.05)
     rows = {row.model: row for row in leave_condition_out(strokes, fit_presses(strokes))[0]}
