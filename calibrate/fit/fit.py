@@ -40,8 +40,6 @@ from brushloop.model.presses import DepthTilt, Grid, Presses
 
 SPREAD_MM = 0.25
 """Variation of an edge from press to press (scale of a logistic)."""
-PRIOR_PX = 0.5
-"""Pixels of wrong ink that cost as much as a parameter one standard deviation off the prior."""
 ALL = tuple(range(len(NAMES)))
 SCALE = tuple(NAMES.index(name) for name in ("lam", "heel_gain", "tip_gain", "origin_mm"))
 """Size and place of the marks."""
@@ -131,8 +129,8 @@ def draw(press: FittedPress, conditions: Floats, grid: Grid, free: Sequence[int]
 
 
 def _minimise(press: FittedPress, free: Sequence[int], presses: Presses, prior: Prior) -> tuple[FittedPress, float]:
-    """Levenberg-Marquardt from `press`, and the cost where it ends."""
-    precision = PRIOR_PX * prior.precision
+    """Levenberg-Marquardt from `press`, and the cost where it ends; a parameter one standard deviation off the prior
+    costs as much as a pixel of wrong ink."""
     inks = {condition: presses.ink[numbers] for condition, numbers in presses.conditions.items()}
     at = list(free)
     low, high = (np.array([getattr(PARAMETERS[k], end) for k in at]) for end in ("low", "high"))
@@ -145,9 +143,9 @@ def _minimise(press: FittedPress, free: Sequence[int], presses: Presses, prior: 
     def equations(vector: Floats) -> Equations:
         trial = at_values(vector)
         square, gradient, cost = _normal(trial, at, inks, presses.grid)
-        pull = precision @ prior.off(trial.values)
+        pull = prior.precision @ prior.off(trial.values)
         cost += 0.5 * float(prior.off(trial.values) @ pull)
-        square += precision[np.ix_(at, at)]
+        square += prior.precision[np.ix_(at, at)]
         gradient += pull[at]
         # A parameter that is pulled beyond its bound stays there: the step of the others must not count on it.
         held = ((vector <= low) & (gradient > 0.0)) | ((vector >= high) & (gradient < 0.0))
