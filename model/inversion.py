@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.model.damped import Equations, descend
+from brushloop.model.damped import Equations, Lowest, descend
 from brushloop.model.raster import PX_MM, SIZE_PX, coverage
 from brushloop.model.strokes import StrokeModel
 
@@ -42,6 +42,9 @@ EDGE_INK = 0.3
 """With more ink than this in a pixel on the image's edge, the mark may continue beyond it."""
 MIN_INK_MM2 = 0.5
 """An image with less ink than this has no mark."""
+ASIDE_DEG, RIVAL = 10.0, 3.0
+"""A fit that starts this far aside in tilt, and ends with at most so many times the squares of the residuals, may be
+the true one: models err by as much between conditions. Standard deviations are then no smaller than its distance."""
 _FAINT = 0.25  # fainter pixels count as blank in moments: noise far from the mark would outweigh the mark itself
 _LEAST_NOISE = 1e-6  # error of the rasteriser in a pixel: a clean image is no more accurate than this
 _STEP = np.array([2.0, 4.0, 2.0, 2.0])  # longest step of a parameter
@@ -101,11 +104,6 @@ class Recovered:
     def tilt_deg(self) -> Floats:
         """alpha, (B,)."""
         return self.values[:, 1]
-
-    def interval(self, name: str, z: float = 1.96) -> tuple[Floats, Floats]:
-        """Ends of the interval of a parameter, (B,) each; z = 1.96 covers 95 % of a normal distribution."""
-        k = PARAMETERS.index(name)
-        return self.values[:, k] - z * self.sigma[:, k], self.values[:, k] + z * self.sigma[:, k]
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,17 +245,12 @@ class _Fit:
     def run(self) -> tuple[Floats, Floats, float, set[Flag]]:
         """Values (4,), standard deviations (4,), root mean square residual, and flags."""
         free = len(self._step)
-        lowest = descend(
-            self._equations,
-            self._clipped(self._start[:free]),
-            rounds=_ROUNDS,
-            most=1.0,
-            scale=self._step,
-            gain=1e-9,
-            feasible=self._clipped,
-        )
+        lowest, *rivals = sorted(map(self._descend, (0.0, -ASIDE_DEG, ASIDE_DEG)), key=lambda end: end.at.cost)
         residual, jacobian = self._linear(lowest.vector)
         sd = np.sqrt(self._variances(residual, jacobian))
+        for rival in rivals:
+            if 2.0 * (rival.at.cost - lowest.at.cost) < self._degrees * math.log(RIVAL):
+                sd = np.maximum(sd, np.abs(rival.vector - lowest.vector))
         values, sigma = np.append(lowest.vector, self._start[free:]), np.append(sd, np.zeros(4 - free))
         at_limit = (lowest.vector <= self._low) | (lowest.vector >= self._high)
         flags = set[Flag]()
@@ -270,6 +263,12 @@ class _Fit:
         if (np.abs(self._step * left) > np.maximum(_STILL[:free], _NEAR * sd)).any():
             flags.add(Flag.DID_NOT_CONVERGE)
         return values, sigma, math.sqrt(float(np.mean(np.square(residual)))), flags
+
+    def _descend(self, aside_deg: float) -> Lowest:
+        start = self._clipped((self._start + np.array([0.0, aside_deg, 0.0, 0.0]))[: len(self._step)])
+        return descend(
+            self._equations, start, rounds=_ROUNDS, most=1.0, scale=self._step, gain=1e-9, feasible=self._clipped
+        )
 
     def _equations(self, vector: Floats) -> Equations:
         """-log likelihood at some values, and its derivatives in steps of `_STEP`."""
