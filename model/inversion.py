@@ -13,8 +13,7 @@ Intervals allow for residuals that are arbitrarily correlated within squares of 
 them: the sandwich (J'J)^-1 M (J'J)^-1 with M the sum over squares of (J'r)(J'r)' (K.-Y. Liang and S. Zeger, 1986). That
 is for captures, where the model is wrong by more than noise. A mark lies on about ten squares, and so few often show
 less variance than there is: a variance is at least that of the posterior with independent pixels, s^2 (J'J)^-1 without
-a prior, which holds for a sensor's noise. They do not include errors of the brush's R, of lambda, or of the scale:
-these shift every press of a session alike.
+a prior, which holds for a sensor's noise. Errors of R, lambda and scale, which shift every press alike, come on top.
 """
 
 from __future__ import annotations
@@ -245,7 +244,10 @@ class _Fit:
     def run(self) -> tuple[Floats, Floats, float, set[Flag]]:
         """Values (4,), standard deviations (4,), root mean square residual, and flags."""
         free = len(self._step)
-        lowest, *rivals = sorted(map(self._descend, (0.0, -ASIDE_DEG, ASIDE_DEG)), key=lambda end: end.at.cost)
+        aside = np.outer((0.0, -ASIDE_DEG, ASIDE_DEG), (0.0, 1.0, 0.0, 0.0))
+        starts = np.unique(self._clipped((self._start + aside)[:, :free]), axis=0)
+        near, *rivals = sorted((self._descend(start, 1e-6) for start in starts), key=lambda end: end.at.cost)
+        lowest = self._descend(near.vector, 1e-9)
         residual, jacobian = self._linear(lowest.vector)
         sd = np.sqrt(self._variances(residual, jacobian))
         for rival in rivals:
@@ -264,10 +266,9 @@ class _Fit:
             flags.add(Flag.DID_NOT_CONVERGE)
         return values, sigma, math.sqrt(float(np.mean(np.square(residual)))), flags
 
-    def _descend(self, aside_deg: float) -> Lowest:
-        start = self._clipped((self._start + np.array([0.0, aside_deg, 0.0, 0.0]))[: len(self._step)])
+    def _descend(self, start: Floats, gain: float) -> Lowest:
         return descend(
-            self._equations, start, rounds=_ROUNDS, most=1.0, scale=self._step, gain=1e-9, feasible=self._clipped
+            self._equations, start, rounds=_ROUNDS, most=1.0, scale=self._step, gain=gain, feasible=self._clipped
         )
 
     def _equations(self, vector: Floats) -> Equations:
