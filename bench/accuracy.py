@@ -39,7 +39,7 @@ from brushloop.calibrate.fit.fit import fit_presses
 from brushloop.calibrate.fit.heldout import BEZIER, FITTED, Refit, held_out_scores, leave_condition_out, refit
 from brushloop.calibrate.loop import LoopRecord
 from brushloop.calibrate.presses import read_for_fit
-from brushloop.calibrate.stats import CEILING
+from brushloop.calibrate.stats import CEILING, NORMAL_95
 from brushloop.calibrate.writing.compare import ANOTHER, SIMULATED, WrittenRecord
 from brushloop.drivers.sim.brush.brush_file import LIKE_TABLE_2, load_brush
 from brushloop.model.fitted import FittedPress, Prior, learned
@@ -53,7 +53,7 @@ REPEATS = 4
 """Presses of each of the paper's 15 conditions."""
 FULL_POINTS, FEW_POINTS = 0.8, {5: 1.8, 9: 1.3}
 FITTED_CELLS = 9
-LEAST_HELD, MOST_HELD, NORMAL_95 = 90.0, 99.0, 1.96
+LEAST_HELD, MOST_HELD = 90.0, 99.0
 LOOP_DEPTHS_MM, LOOP_TILTS_DEG, LOOP_REPEATS, LOOP_POINTS = (11.0, 15.0, 20.0), (0.0, 5.0, 10.0), 3, 1.0
 CHARACTERS, WRITINGS, ROUNDS = "字子永", 10, 3
 RATE = 20.0

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.harness import Result, at_most, interleave, machine, rounds_of
+from brushloop.calibrate.stats import NORMAL_95
 from brushloop.model.ccdbsm import Brush, ccdbsm
 from brushloop.model.inversion import PARAMETERS, Inverter
 from brushloop.model.raster import PX_MM, SIZE_PX, coverage
@@ -110,7 +111,7 @@ def inversion(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     ]
     for name, true in truth.items():
         k = PARAMETERS.index(name)
-        share = 100.0 * float((np.abs(seen.values[:, k] - true) <= 1.96 * seen.sigma[:, k]).mean())
+        share = 100.0 * float((np.abs(seen.values[:, k] - true) <= NORMAL_95 * seen.sigma[:, k]).mean())
         label = f"inversion.noisy {'H' if name == 'depth_mm' else 'alpha'} in interval"
         results.append(Result(label, share, "%", "the nominal 95 %", share / 95.0, count, seed, machine()))
     return results

@@ -24,7 +24,7 @@ from brushloop.calibrate.files import check_target, write_whole
 from brushloop.calibrate.fit.command import BrushFit
 from brushloop.calibrate.presses import Press, Refused, beside_touch, cut, read_presses
 from brushloop.calibrate.session import OpenSession, open_session
-from brushloop.calibrate.stats import Floats, student_95
+from brushloop.calibrate.stats import NORMAL_95, Floats, student_95
 from brushloop.model.inversion import Flag, Inverter, Range
 from brushloop.sessions.disk import csv_text
 from brushloop.sessions.records import Condition
@@ -47,7 +47,6 @@ USELESS = frozenset({Flag.BLANK, Flag.DID_NOT_CONVERGE, Flag.CUT})
 """Flags that exclude a stroke: it is listed with the reason and not pressed again."""
 LEAST_CONDITIONS = 3
 """With fewer other conditions, the model error is unknown."""
-NORMAL_95 = 1.96
 
 
 @dataclass(frozen=True, slots=True)

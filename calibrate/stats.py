@@ -25,6 +25,8 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Interval = tuple[float, float]
 """Ends of a 95 % interval."""
+NORMAL_95 = 1.96
+"""Half width of a 95 % interval in standard deviations that are known."""
 SEED = 0
 MIN_GROUPS = 3
 """Fewest groups whose differences tell an interval."""

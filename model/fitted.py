@@ -144,6 +144,10 @@ class Sizes:
     heel: Floats
     half: Floats
 
+    def share(self, x_mm: Floats) -> Floats:
+        """How far x (N,) from the point of touch lies along the marks (..., N): 0 at the tip, 1 at the heel."""
+        return (x_mm - (self.widest - self.tip)[..., None]) / (self.tip + self.heel)[..., None]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedPress:
@@ -151,8 +155,7 @@ class FittedPress:
 
     `across` (2, MODES, TERMS) are the residuals of the half width and of the middle, whose tip may lie beside the axis:
     `modes` along the mark, each with the terms of `command_terms`. `ends` (2, TERMS) are those of the lengths of the
-    tip's and the heel's side.
-    `values` of shape (K, 1, 17) are those of a batch of K brushes, whose sizes and widths come as (K, ...).
+    tip's and the heel's side. `values` (K, 1, 17) are those of K brushes, whose sizes and widths come as (K, ...).
     """
 
     radius_mm: float
@@ -205,9 +208,8 @@ class FittedPress:
     def mark(self, depth_mm: Array, tilt_deg: Array, x_mm: Floats) -> tuple[Floats, Floats]:
         """Half width, as `half_width`, and middle y of marks at x (N,), (..., N) mm each."""
         s = self.sizes(depth_mm, tilt_deg)
-        share = (x_mm - (s.widest - s.tip)[..., None]) / (s.tip + s.heel)[..., None]
         weights = np.einsum("smt,...t->...sm", self.across, command_terms(depth_mm, tilt_deg))
-        further, middle = np.moveaxis(weights @ np.swapaxes(modes(share), -1, -2), -2, 0)
+        further, middle = np.moveaxis(weights @ np.swapaxes(modes(s.share(x_mm)), -1, -2), -2, 0)
         half = self.half_width(s, x_mm)
         return half + np.where(half < -1e-9, 0.0, further), middle  # at an end, half is 0 but for rounding
 
@@ -229,10 +231,7 @@ class FittedPress:
 
 
 def chance_within(half_mm: Floats, off_mm: Floats, spread_mm: float) -> Floats:
-    """The probability of ink `off_mm` from the middle of a mark, whose half width varies by `spread_mm`.
-
-    The spread is the scale of a logistic.
-    """
+    """The probability of ink `off_mm` from the middle of a mark; `spread_mm` is the logistic scale of its edges."""
     inside = half_mm - np.abs(off_mm)
     return 1.0 / (1.0 + np.exp(-np.clip(inside / spread_mm, -30.0, 30.0)))
 

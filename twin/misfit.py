@@ -46,7 +46,7 @@ def fit_misfit(
     tip, heel = (regress(end[:, None], each, np.array([END_MM]))[0] for end in (-ends[:, 0], ends[:, 1]))
     along = waves(SHARES)
     to_modes = np.linalg.solve(along.T @ along + LITTLE * np.eye(MODES), along.T)
-    half, middle = (regress(edges @ to_modes.T, each, falling) for edges in (half, middle))
+    half, middle = (regress(seen @ to_modes.T, each, falling) for seen in (half, middle))
     depths_mm, tilts_deg = ([reached_mm(depth, place[0]) for depth, _ in captured], [tilt for _, tilt in captured])
     return Misfit(
         depths_mm=(min(depths_mm), max(depths_mm)),

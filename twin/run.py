@@ -30,7 +30,7 @@ from brushloop.calibrate.fit.heldout import BEZIER, Predicted, held_out_scores
 from brushloop.calibrate.presses import read_for_fit
 from brushloop.calibrate.report import source_note
 from brushloop.calibrate.scores import Stat
-from brushloop.calibrate.stats import CEILING
+from brushloop.calibrate.stats import CEILING, NORMAL_95
 from brushloop.calibrate.work import Store
 from brushloop.drivers.sim.brush.brush_file import SoundHead
 from brushloop.drivers.sim.brush.misfit import Misfit
@@ -56,7 +56,6 @@ from brushloop.twin.search import (
 MOST_WORKERS = 8
 MOST_SD = 0.7
 """Standard error, in scales, above which the presses count as not determining a constant."""
-NORMAL_95 = 1.96
 WIDER = 3.5
 """Factor on the standard errors of mechanics and ink: constants that have nearly the same effect are known less well
 than the derivatives at one point say. It was chosen on two brushes whose twins are not measured by the benches."""

@@ -84,7 +84,7 @@ class BrushFit(SessionFit):
         shapes = (2, MODES, TERMS), (2, TERMS)
         own_shapes = np.array(self.across_mm).shape, np.array(self.ends_mm).shape
         if set(self.parameters) != set(NAMES) or own_shapes != shapes:
-            raise ValueError(f"parameters: expected {', '.join(NAMES)}, with edges and ends of shapes {shapes}")
+            raise ValueError(f"parameters: expected {', '.join(NAMES)}, with across_mm and ends_mm of shapes {shapes}")
         return self
 
 

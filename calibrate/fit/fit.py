@@ -246,7 +246,7 @@ def _ends(press: FittedPress, depths_mm: Floats, tilts_deg: Floats, inks: Floats
 
 def _across(press: FittedPress, sizes: Sizes, inks: Floats, grid: Grid) -> Floats:
     """By which `modes` half widths differ from the profile, and middles from the axis, (2, strokes, MODES)."""
-    share = (grid.x_mm - (sizes.widest - sizes.tip)[:, None]) / (sizes.tip + sizes.heel)[:, None]
+    share = sizes.share(grid.x_mm)
     across = inks.sum(axis=1) * grid.px_mm
     inked = (share > 0.0) & (share < 1.0) & (across > LEAST_MM)
     half = 0.5 * across - press.half_width(sizes, grid.x_mm)

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from brushloop.calibrate.stats import NORMAL_95
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.inversion import PARAMETERS, Flag, Inverter, Range
 from brushloop.model.outline import Outline
@@ -37,7 +38,7 @@ def anchored(count: int, seed: int, tilts: tuple[float, float] = (0.0, 10.0)):
 
 def inside(recovered, name: str, true: np.ndarray) -> float:
     k = PARAMETERS.index(name)
-    return float((np.abs(recovered.values[:, k] - true) <= 1.96 * recovered.sigma[:, k]).mean())
+    return float((np.abs(recovered.values[:, k] - true) <= NORMAL_95 * recovered.sigma[:, k]).mean())
 
 
 @settings(max_examples=25, deadline=None)

@@ -64,9 +64,9 @@ def test_a_brush_of_the_family_is_found_again() -> None:
         assert np.abs(seen - wanted).mean() < 0.05
 
 
-@pytest.mark.parametrize(("seed", "most_mm"), [(27, 0.3), (43, 0.2)])
-def test_a_brush_far_from_all_known_ones_does_not_end_the_fit_far_from_its_marks(seed: int, most_mm: float) -> None:
-    """One ended 1.2 mm from the left-out condition from the prior alone, the other .22 mm with size and place first."""
+@pytest.mark.parametrize("seed", [221, 63])
+def test_a_brush_far_from_all_known_ones_does_not_end_the_fit_far_from_its_marks(seed: int) -> None:
+    """One ended .31 mm from the left-out condition from the prior alone, the other .39 mm with size and place first."""
     conditions = [(h, a) for h in (11.0, 13.0, 15.0, 17.0, 20.0) for a in (0.0, 5.0, 10.0)]
     known, rng = learned(), np.random.default_rng(seed)
     far = spreads() * np.linalg.cholesky(np.linalg.inv(known.precision)) @ rng.normal(size=len(NAMES))
@@ -74,7 +74,7 @@ def test_a_brush_far_from_all_known_ones_does_not_end_the_fit_far_from_its_marks
     truth = FittedPress(6.0, 48.0, np.clip(known.values + 1.5 * far, low, high))
     fit = fit_presses(presses(truth, conditions[:-1], noise=0.2, seed=seed), residual=False)
     seen, wanted = (np.maximum(b.mark(*conditions[-1], GRID.x_mm)[0], 0.0) for b in (fit, truth))
-    assert np.abs(seen - wanted).mean() < most_mm
+    assert np.abs(seen - wanted).mean() < 0.2
 
 
 def test_sizes_of_marks_are_those_of_the_brush_with_intervals_that_narrow() -> None:
@@ -97,7 +97,8 @@ def test_too_few_conditions_give_no_interval_and_one_no_held_out_scores(tmp_path
     assert (fitted.held_out, fitted.sizes) == ([], {})
 
 
-def test_products_of_the_jacobian_are_those_of_the_whole_image() -> None:
+def test_products_of_the_jacobian_are_those_of_the_whole_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("brushloop.calibrate.fit.fit.STEP", 1e-5)  # so short that both derivatives agree
     brush = a_brush()
     [_, drawn] = draw(brush, np.array([(11.0, 0.0), (15.0, 5.0)]), GRID)
     columns = []
@@ -109,7 +110,7 @@ def test_products_of_the_jacobian_are_those_of_the_whole_image() -> None:
         columns.append((images[0] - images[1]).ravel() / 2e-6)
     jacobian, residual = np.array(columns), np.random.default_rng(0).normal(size=drawn.ink.shape)
     assert drawn.ink == pytest.approx(brush.chance(15.0, 5.0, GRID.x_mm, GRID.y_mm, SPREAD_MM))
-    assert drawn.square() == pytest.approx(jacobian @ jacobian.T, rel=2e-2, abs=0.1)
+    assert drawn.square() == pytest.approx(jacobian @ jacobian.T, rel=2e-2, abs=2e-2)
     assert drawn.pull(residual[None])[0] == pytest.approx(jacobian @ residual.ravel(), rel=2e-2, abs=2e-2)
 
 
