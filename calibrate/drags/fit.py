@@ -54,7 +54,7 @@ REACH_MM = 6.0
 SPREADS = (2.2, 2.2, 2.2, 2.2, 5.0)
 """Width of the kernel in standard deviations of each of `COMMANDS` of the training strokes; the tilt matters little on
 real ink within 5 deg."""
-RIDGE = 1.0
+RIDGE = 2.0
 SESSION_MM = {"drift_x_mm": 1.0, "drift_y_mm": 1.0, "half_mm": 0.4, "leash_mm": 2.0}
 """How far place, half width and leash change from one session to another of the same brush (standard deviation)."""
 GROWTH_MM = {"half_per_mm": 0.5, "leash_per_mm": 2.0, "drift_x_per_mm": 0.5, "drift_y_per_mm": 0.5}
@@ -275,10 +275,12 @@ def adapt_drags(drags: Drags, prior: DragArtefact, strokes: int) -> DragArtefact
 def different(commands: Floats, count: int) -> Indices:
     """`count` rows of (B, 5) commands that are as different as possible, the most ordinary one first.
 
-    With strokes of one kind, the model's error for that kind would look like a change of the brush's place.
+    With strokes of one kind, the model's error for that kind would look like a change of the brush's place. So would an
+    error of one part of the page, with strokes made one after the other: their order counts as one more command.
     """
-    spread = commands.std(axis=0)
-    places = (commands - commands.mean(axis=0)) / np.where(spread > 1e-9, spread, np.inf)
+    ordered = np.column_stack([commands, np.arange(len(commands))])
+    spread = ordered.std(axis=0)
+    places = (ordered - ordered.mean(axis=0)) / np.where(spread > 1e-9, spread, np.inf)
     return np.array(farthest_first(places, int(np.linalg.norm(places, axis=1).argmin()), count))
 
 
