@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Generator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.sessions.disk import check_writable, read_bounded
+from brushloop.sessions.disk import check_writable, read_bounded, replacing
 
 if TYPE_CHECKING:
     import numpy as np
@@ -43,24 +42,6 @@ def check_target(path: Path, *endings: str) -> None:
     if path.is_dir():
         raise CalibrationError(str(path), "is a folder")
     check_writable(path.parent)
-
-
-@contextmanager
-def replacing(path: Path) -> Generator[Path]:
-    """Give a temporary file to write to, which then becomes `path`: a reader sees the old file or the new one.
-
-    The temporary file is removed on failure.
-    """
-    part = path.with_name(path.name + ".part")
-    try:
-        yield part
-        part.replace(path)
-    except OSError as error:
-        if error.errno is not None and not error.filename:
-            error.filename = str(path)  # a full disk does not say which file it had no room for
-        raise
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def write_whole(path: Path, text: str) -> None:

@@ -17,11 +17,10 @@ import numpy as np
 
 from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.compare import KEYS, Alignment, Key, Pixels, Tone, similarity
-from brushloop.calibrate.files import replacing
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.stats import CEILING, Floats, Integers, Summary, summarise
 from brushloop.model.presses import DepthTilt
-from brushloop.sessions.disk import csv_text
+from brushloop.sessions.disk import csv_text, replacing
 from brushloop.sessions.records import Condition
 
 MEASURES = ("csim", "ssim")

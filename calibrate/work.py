@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.files import replacing
+from brushloop.sessions.disk import replacing
 from brushloop.sessions.errors import in_one_line
 
 J = TypeVar("J")

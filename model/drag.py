@@ -97,15 +97,13 @@ class DragModel:
     drift_y_per_mm: float = 0.0
     land_mm: float = 0.0
     """Distance ahead of the tip, along the path's first direction, at which the footprint lands."""
-    back_mm: float = 0.0
-    """How far the mark extends behind the landing point."""
     front: float = 0.3
     """Share of the final gap between footprint and tip that is inked while the brush lifts off."""
     front_width: float = 0.5
     """Half width at that end, as a share of the last footprint's."""
 
     def vector(self) -> Floats:
-        """The parameters in order, (14,)."""
+        """The parameters in order, (13,)."""
         return np.array(astuple(self), np.float64)
 
     @staticmethod
@@ -115,7 +113,7 @@ class DragModel:
 
     @staticmethod
     def of(vector: Floats) -> DragModel:
-        """The model of a (14,) vector."""
+        """The model of a (13,) vector."""
         return DragModel(*(float(value) for value in vector))
 
 
@@ -195,12 +193,12 @@ class Trails:
 def lagging(paths: Sequence[Floats], vector: Floats) -> Trails:
     """The trails of a lagging disc, one for each path of (n, 3) nodes x, y, depth of the tip, n >= 2.
 
-    A trail has n + 2 discs; the first and the last are the mark's ends behind the landing and ahead of the lift-off.
+    A trail has n + 1 discs; the last one is the mark's end ahead of the lift-off.
     """
     from brushloop.model.drag_kernel import follow  # numba takes a fifth of a second to import
 
     ends = np.cumsum([0, *(len(path) for path in paths)])
-    starts = ends + 2 * np.arange(len(ends))
+    starts = ends + np.arange(len(ends))
     out = np.empty((int(starts[-1]), 3))
     follow(np.ascontiguousarray(np.concatenate(paths)), ends, vector, out, starts)
     return Trails(out, starts, np.arange(len(ends)))

@@ -38,17 +38,14 @@ def follow(path, ends, p, out, starts):
                     keep = math.exp(-ds / leash)
                     x = path[k, 0] - lag_x - (path[k - 1, 0] - x - lag_x) * keep
                     y = path[k, 1] - lag_y - (path[k - 1, 1] - y - lag_y) * keep
-            n = at + 1 + k - first
+            n = at + k - first
             out[n, 0] = x + p[6] + p[8] * depth
             out[n, 1] = y + p[7] + p[9] * depth
             out[n, 2] = p[0] + p[1] * depth + p[2] * depth * depth
-        out[at, 0] = out[at + 1, 0] - p[11] * ux
-        out[at, 1] = out[at + 1, 1] - p[11] * uy
-        out[at, 2] = out[at + 1, 2]
         n = starts[i + 1] - 1
-        out[n, 0] = out[n - 1, 0] + p[12] * (path[last, 0] - x)
-        out[n, 1] = out[n - 1, 1] + p[12] * (path[last, 1] - y)
-        out[n, 2] = out[n - 1, 2] * p[13]
+        out[n, 0] = out[n - 1, 0] + p[11] * (path[last, 0] - x)
+        out[n, 1] = out[n - 1, 1] + p[11] * (path[last, 1] - y)
+        out[n, 2] = out[n - 1, 2] * p[12]
 
 
 @_compile

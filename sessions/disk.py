@@ -98,6 +98,24 @@ def write_durably(path: Path, data: bytes) -> None:
 
 
 @contextmanager
+def replacing(path: Path) -> Generator[Path]:
+    """Give a temporary file to write to, which then becomes `path`: a reader sees the old file or the new one.
+
+    The temporary file is removed on failure.
+    """
+    part = path.with_name(path.name + ".part")
+    try:
+        yield part
+        part.replace(path)
+    except OSError as error:
+        if error.errno is not None and not error.filename:
+            error.filename = str(path)  # a full disk does not say which file it had no room for
+        raise
+    finally:
+        part.unlink(missing_ok=True)
+
+
+@contextmanager
 def staged_folder(out: Path) -> Generator[Path]:
     """Yield a folder beside `out` to write into; it is renamed to `out` at the end, and removed after an exception.
 

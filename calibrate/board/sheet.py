@@ -20,7 +20,8 @@ from brushloop.calibrate.board.lens import Floats, Gray
 from brushloop.calibrate.board.spec import MM_PER_INCH, PAGES_MM, Rectangle, check_pdf
 from brushloop.calibrate.commands import SheetRequest
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.files import Written, replacing, write_whole
+from brushloop.calibrate.files import Written, write_whole
+from brushloop.sessions.disk import replacing
 from brushloop.sessions.terminal import Progress, unseen
 
 ROWS, COLUMNS = "ABCDEFGH", 8

@@ -40,9 +40,7 @@ INK_ABOVE = 0.4
 strokes that half is .39 to .43, and scores change by .003 at most between these."""
 EDGE_MM = SPREAD_MM * float(np.log(INK_ABOVE / (1.0 - INK_ABOVE)))
 """Signed distance at which the probability of ink is `INK_ABOVE`."""
-FREEDOM = dict(
-    zip(DragModel.names(), (2.0, 0.2, 0.01, 3.0, 1.0, 4.0, 1.5, 1.5, 0.2, 0.2, 3.0, 3.0, 0.5, 0.5), strict=True)
-)
+FREEDOM = dict(zip(DragModel.names(), (2.0, 0.2, 0.01, 3.0, 1.0, 4.0, 1.5, 1.5, 0.2, 0.2, 3.0, 0.5, 0.5), strict=True))
 """Standard deviations of the prior: a parameter this far from its start costs as much as a pixel of wrong ink."""
 FIT_MM = 0.8
 """Scale of the images that the parameters are fitted to: finer ones do not change the fit."""
@@ -123,7 +121,6 @@ class Kept(Frozen):
 
     commands: Annotated[list[tuple[Number, Number, Number, Number, Number]], Field(max_length=MOST_STROKES)]
     """`COMMANDS` of each stroke."""
-    mm_per_px: float
     left_mm: Number
     """Centre of the first column; the stroke starts at x = 0."""
     top_mm: Number
@@ -142,7 +139,6 @@ class Kept(Frozen):
             raise CalibrationError(drags.session.header.session_id, what)
         return Kept(
             commands=np.round(drags.commands[used], 6).tolist(),
-            mm_per_px=MM_PER_PX,
             left_mm=round(float(drawings.x_mm[0]), 6),
             top_mm=round(float(drawings.y_mm[0]), 6),
             ink=data,

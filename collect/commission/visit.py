@@ -25,7 +25,6 @@ import pydantic.dataclasses
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
-from brushloop.calibrate.files import replacing
 from brushloop.collect.errors import ConfigError, NotAccepted, StepError
 from brushloop.collect.operator import Asker, Choice, Prompt
 from brushloop.collect.rig.check import Check, unmeasured
@@ -34,7 +33,7 @@ from brushloop.collect.rig.config_file import Config, read_text, refusal
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.host import Clock
 from brushloop.drivers.limits import Finite
-from brushloop.sessions.disk import fsync_folder, number, sync
+from brushloop.sessions.disk import fsync_folder, number, replacing, sync
 
 MAX_BYTES = 1024 * 1024
 ENDING, ASIDE = ".taught.json", "aside."
