@@ -138,7 +138,7 @@ class Cabinet:
     def _fix(self) -> Matrix | None:
         """From the configured tool centre point to the true tip; None if they are the same."""
         fix = np.linalg.inv(self._tool) @ self.motion.tool
-        return None if np.allclose(fix, np.eye(4), rtol=0.0, atol=1e-9) else fix
+        return None if np.abs(fix - np.eye(4)).max() < 1e-9 else fix
 
     def configured(self, tip: Pose) -> Pose:
         """Where the controller takes the tip to be, at the configured tool centre point, when the true one is there."""
