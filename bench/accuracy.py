@@ -35,6 +35,7 @@ from bench.brushes import (
 from bench.harness import BenchError, Result, at_most, brushloop, machine, rounds_of
 from bench.prior import NOT_BRISTLE
 from brushloop.calibrate.compare import TABLE_2, Alignment, Polarity, Tone
+from brushloop.calibrate.errors import StrokesLeftOut
 from brushloop.calibrate.fit.fit import fit_presses
 from brushloop.calibrate.fit.heldout import BEZIER, FITTED, Refit, held_out_scores, leave_condition_out, refit
 from brushloop.calibrate.loop import LoopRecord
@@ -61,7 +62,7 @@ WRITTEN_POINTS = 1.0
 TWIN_POINTS, TWIN_REPEATS = 1.5, 3
 BIG, SMALL_A, SMALL_B = "frida_bigbrush_tilt_16x20", "frida_smallbrush_16x20_a", "frida_smallbrush_16x20_b"
 DRAG_TEST, DRAG_SIZES, ADAPTED = 40, (20, 147), 10
-PARTLY = (0, 3)  # a stroke that its photograph cuts is left out
+PARTLY = (0, StrokesLeftOut.exit_code)  # photographs cut some strokes
 DRAG_GOALS = {20: (0.845, 0.735), 147: (0.86, 0.76)}
 SESSION_GOAL = (0.845, 0.725)
 WITHIN_POINTS = {"max": 4.0, "min": 4.0, "avg": 2.0}
